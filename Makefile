@@ -1,0 +1,53 @@
+PYTHON ?= python3.11
+ARGS ?=
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help venv train evaluate test test-all check format wheel clean
+
+help: ## show this list
+	@echo "make TARGET [ARGS='...']"
+	@sed -n 's/^\([a-z-]*\):.*## /  \1@/p' $(MAKEFILE_LIST) | while IFS=@ read -r target text; do \
+		printf '  %-10s %s\n' $$target "$$text"; done
+
+venv: $(INSTALLED) ## make .venv with the tested versions (PYTHON=... picks the Python)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { \
+		echo "$(PYTHON) was not found; install Python 3.11, or name yours: make PYTHON=/path/to/python" >&2; exit 2; }
+	@echo "Installing coil-rl, PyTorch and the developer tools into .venv (a few minutes the first time) ..."
+	@$(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+train: $(INSTALLED) ## train an agent with a guide's advice, e.g. ARGS='seed=1'
+	$(BIN)/coil-train method=coil $(ARGS)
+
+evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
+	$(BIN)/coil-evaluate $(ARGS)
+
+test: $(INSTALLED) ## run the fast tests
+	$(BIN)/python -m pytest -q $(ARGS)
+
+test-all: $(INSTALLED) ## run all tests, also the slow ones
+	$(BIN)/python -m pytest -q -m '' $(ARGS)
+
+check: $(INSTALLED) ## lint, formatting, types and import directions
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy -p coil_rl
+	$(BIN)/lint-imports --no-logo
+
+format: $(INSTALLED) ## format the code and mend what lint can mend
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+# Files left in build/ by an earlier version would end up in the wheel.
+wheel: $(INSTALLED) ## build a wheel into dist/
+	rm -rf build
+	$(BIN)/python -m build --wheel --no-isolation
+
+clean: ## remove build products and caches; .venv and outputs/ stay
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -path ./.venv -prune -o -type d -name __pycache__ -exec rm -rf {} +

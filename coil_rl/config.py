@@ -1,0 +1,71 @@
+"""The root of every program's configuration, typed, so that a misspelt top-level key fails at once."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, OmegaConf
+
+# Two runs started within a microsecond of each other still get folders of their own.
+OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
+
+
+@dataclass
+class Budget:
+    """How much experience a run collects, and how much of it between two updates."""
+
+    frames: int = 1
+    cars: int = MISSING
+    steps: int = 1
+
+
+@dataclass
+class Evaluation:
+    """How a policy is judged."""
+
+    env: dict[str, Any] = field(default_factory=dict)
+    repeats: int = 5
+    policy: str = "last"
+    gif: bool = True
+
+
+@dataclass
+class Common:
+    """What every program that drives has."""
+
+    preset: dict[str, Any] = MISSING
+    track: dict[str, Any] = MISSING
+    env: dict[str, Any] = MISSING
+    guide: dict[str, Any] = MISSING
+    method: dict[str, Any] = MISSING
+    budget: Budget = field(default_factory=Budget)
+    evaluation: Evaluation = field(default_factory=Evaluation)
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 2
+    run_dir: str = MISSING
+
+
+@dataclass
+class Train(Common):
+    """Configuration of `coil-train`."""
+
+    learner: dict[str, Any] = MISSING
+    logger: dict[str, Any] | None = None
+    experiment: str | None = None
+    watch: dict[str, Any] = field(default_factory=dict)
+    checkpoint_every: int = 10
+
+
+@dataclass
+class Evaluate(Common):
+    """Configuration of `coil-evaluate`."""
+
+    run: str | None = None
+
+
+ConfigStore.instance().store(name="schema", node=Train)
+ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)

@@ -1,0 +1,6 @@
+"""Guides: controllers that advise an agent. Each is a TensorDictModule that writes an action."""
+
+from coil_rl.guides.simple import ConstantGuide, RandomGuide, ZeroGuide
+from coil_rl.guides.spline import SplineGuide
+
+__all__ = ["ConstantGuide", "RandomGuide", "SplineGuide", "ZeroGuide"]

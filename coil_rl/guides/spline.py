@@ -1,0 +1,132 @@
+"""The paper's safety policy (appendix A.1): steer along the middle of the cones in sight."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any, Literal
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+
+from coil_rl.envs.splines import least_squares_parabola, smoothing_spline
+
+PAIR_DISTANCE = 4.0
+TARGET_SPACING = 1.0
+TARGET_REACHED = 0.625
+HALF_FIELD_OF_VIEW = math.radians(60)
+FAR = 1e6
+
+
+class SplineSteering(nn.Module):
+    """Steering from cones: a smooth path through the midpoints of left-right pairs, and pursuit of a target on it.
+
+    It knows the cones in sight and the steering in force, never the map and never its own past.
+
+    Args:
+        spline: of the path, "cubic" (smoothing) or "quadratic" (least-squares parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        gain: the advice is this fraction of equation 103.
+        sharpness: power of the distance in equation 103.
+        max_steering: degrees of an action of 1.
+        cones: only the nearest so many cones of a side are paired.
+        midpoints: room for so many midpoints.
+        targets: room for so many targets along the path.
+    """
+
+    reduce: Tensor
+
+    def __init__(
+        self,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 1.0,
+        gain: float = 1.0,
+        sharpness: float = 1.8,
+        max_steering: float = 80.0,
+        cones: int = 8,
+        midpoints: int = 24,
+        targets: int = 12,
+    ) -> None:
+        super().__init__()
+        if spline not in ("cubic", "quadratic"):
+            raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
+        self.fit = least_squares_parabola if spline == "quadratic" else partial(smoothing_spline, smoothing=smoothing)
+        self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
+        self.cones, self.midpoints, self.targets = cones, midpoints, targets
+
+    def forward(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
+        """Advise a steering.
+
+        Args:
+            cones: [B, 2, K, 2] m in the car's frame, nearest first, left side first.
+            cone_count: [B, 2].
+            steering: [B, 1], the steering in force, kept where there is nothing to steer for.
+
+        Returns:
+            [B, 1], fraction of `max_steering`.
+        """
+        points, count = self._midpoints(cones, cone_count)
+        target, found = self._target(points, count)
+        x, y = target
+        distance = torch.hypot(x, y).clamp(min=TARGET_REACHED)
+        degrees = torch.atan2(y, x) * (180 / math.pi)
+        advice = (degrees * distance**-self.sharpness).atan() * (2 * self.max_steering / math.pi)
+        advice = advice.clamp(-self.max_steering, self.max_steering) * (self.gain / self.max_steering)
+        return torch.where(found, advice, steering.squeeze(-1)).unsqueeze(-1)
+
+    def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """Midpoints of close left-right pairs, nearest first: [2, M, B] m, and how many there are [B]."""
+        near = cones[:, :, : self.cones].permute(3, 2, 1, 0)
+        slot = torch.arange(near.shape[1], device=cones.device).unsqueeze(-1)
+        real = (slot.unsqueeze(-1) < count.t()).to(near.dtype)
+        left, right = near[:, :, 0].unsqueeze(2), near[:, :, 1].unsqueeze(1)
+        gap = (left - right).square_().sum(0)
+        close = ((gap < PAIR_DISTANCE**2) * real[:, 0].unsqueeze(1) * real[:, 1]).flatten(0, 1)
+        middle = (left + right).mul_(0.5).flatten(1, 2)
+        # Pack the close pairs together before sorting: there are few of them among all pairs.
+        place = torch.where(close > 0, close.cumsum(0) - 1, self.midpoints).clamp_(max=self.midpoints).long()
+        room = middle.new_full((2, self.midpoints + 1, middle.shape[-1]), FAR)
+        points = room.scatter_(1, place.expand_as(middle), middle)[:, :-1]
+        order = points.square().sum(0).t().contiguous().argsort(dim=1, stable=True).t()
+        total = close.sum(0).clamp_(max=self.midpoints).long()
+        return points.gather(1, order.expand_as(points)), total
+
+    def _target(self, points: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest target that is ahead and not reached: [2, B] m, and whether there is one [B]."""
+        path = self.fit(points, count)
+        knots = path.values
+        length = (knots[:, 1:] - knots[:, :-1]).square().sum(0).sqrt().sum(0)
+        steps = (length / TARGET_SPACING).round().clamp(1, self.targets - 1)
+        number = torch.arange(self.targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
+        x, y = path.sample(path.length * (number / steps).clamp(max=1))
+        square = x * x + y * y
+        ahead = (x >= 0) & (x * x >= square * math.cos(HALF_FIELD_OF_VIEW) ** 2)
+        wanted = ahead & (square > TARGET_REACHED**2) & (count >= 2)
+        best = square.masked_fill(~wanted, math.inf).min(0, keepdim=True)
+        target = torch.stack([x, y]).gather(1, best.indices.expand(2, -1, -1)).squeeze(1)
+        return target, best.values.squeeze(0) < math.inf
+
+
+class SplineGuide(TensorDictModule):
+    """`SplineSteering` as a guide: reads `cones`, `cone_count` and `steering`, writes `action`.
+
+    Args:
+        in_keys: where to read the three.
+        out_keys: where to write the advice.
+        kwargs: see `SplineSteering`.
+
+    Example:
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> env = ConeTrackEnv(shipped_tracks("test"), num_cars=4)
+        >>> env.rollout(5, SplineGuide(), break_when_any_done=False)["action"].shape
+        torch.Size([4, 5, 1])
+    """
+
+    def __init__(
+        self,
+        in_keys: tuple[str, ...] = ("cones", "cone_count", "steering"),
+        out_keys: tuple[str, ...] = ("action",),
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(SplineSteering(**kwargs), in_keys=list(in_keys), out_keys=list(out_keys))

@@ -1,0 +1,5 @@
+"""What turns batches of experience into better policies."""
+
+from coil_rl.learners.ppo import PPO
+
+__all__ = ["PPO"]

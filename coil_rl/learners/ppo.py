@@ -1,0 +1,143 @@
+"""Proximal policy optimisation with clipped ratios (paper equation 92; Schulman et al. 2017).
+
+A batch of rollouts gets advantages from a critic (generalised advantage estimation); the policy then takes several
+passes over the batch in minibatches, held near the policy that collected it by clipping the probability ratio.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from coil_rl import networks
+from coil_rl.schedules import Schedule, schedule
+
+
+class PPO:
+    """The PPO learner: networks, loss and optimiser.
+
+    Args:
+        env: for the shapes of what is observed and done.
+        in_keys: what policy and critic observe. COIL is PPO with `guide_action` among them.
+        hidden: widths of the hidden layers of both networks.
+        action_scale: standard deviation of the policy at the start.
+        learning_rate: of Adam, a number or a schedule over the run.
+        gamma: discount.
+        gae_lambda: lambda of generalised advantage estimation.
+        clip: how far the probability ratio may move the objective.
+        epochs: passes over each batch.
+        minibatches: parts of each pass.
+        entropy: weight of the entropy bonus, a number or a schedule.
+        critic: weight of the critic's loss.
+        max_grad_norm: gradients are scaled down to this norm.
+        seed: of the order of minibatches.
+
+    Example:
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> from coil_rl.rollout import Rollout
+        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
+        >>> ppo = PPO(env)
+        >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
+    """
+
+    def __init__(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[str] = ("observation",),
+        *,
+        hidden: Sequence[int] = (64, 64),
+        action_scale: float = 0.5,
+        learning_rate: float | Schedule = 3e-4,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip: float = 0.2,
+        epochs: int = 10,
+        minibatches: int = 16,
+        entropy: float | Schedule = 0.0,
+        critic: float = 0.5,
+        max_grad_norm: float = 0.5,
+        seed: int = 0,
+    ) -> None:
+        for name, value in {"hidden": min(hidden, default=1), "epochs": epochs, "minibatches": minibatches}.items():
+            if value < 1:
+                raise ValueError(f"{name}={value} must be at least 1")
+        self.policy = networks.actor(env, in_keys, hidden, action_scale)
+        self.critic = networks.critic(env, in_keys, hidden)
+        self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
+        self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
+        self.advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=self.critic)
+        self.loss = ClipPPOLoss(
+            self.policy,
+            self.critic,
+            clip_epsilon=clip,
+            entropy_bonus=self.entropy(0) > 0,
+            entropy_coeff=self.entropy(0),
+            critic_coeff=critic,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+        )
+        self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
+        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.keys = [*in_keys, "action", "action_log_prob", "reward", "done", "terminated"]
+
+    def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
+        """Learn from a batch of rollouts.
+
+        Args:
+            batch: [B, T] with the observed entries, `action`, `action_log_prob` and, under `next`, the observed
+                entries, `reward`, `done` and `terminated`. A truncated episode counts as going on.
+            progress: share of the run that is over, for the schedules.
+
+        Returns:
+            Means over the update of each loss, the approximate KL divergence and the share of clipped ratios.
+        """
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate(progress)
+        if self.loss.entropy_bonus:
+            self.loss.entropy_coeff.fill_(self.entropy(progress))
+        with torch.no_grad():
+            self.advantage(batch)
+        flat = batch.exclude("next").reshape(-1)
+        sums: dict[str, Tensor] = {}
+        size = len(flat) // self.minibatches
+        for _ in range(self.epochs):
+            order = torch.randperm(len(flat), generator=self.generator).to(flat.device)
+            for rows in order[: size * self.minibatches].split(size):
+                losses = self.loss(flat[rows])
+                total = losses["loss_objective"] + losses["loss_critic"]
+                if self.loss.entropy_bonus:
+                    total = total + losses["loss_entropy"]
+                self.optimiser.zero_grad()
+                total.backward()
+                torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+                self.optimiser.step()
+                for key, value in losses.items():
+                    sums[key] = sums.get(key, 0) + value.detach().mean()
+        steps = self.epochs * self.minibatches
+        return {key: float(value) / steps for key, value in sums.items()} | {
+            "learning_rate": self.learning_rate(progress)
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything an update depends on besides the batch."""
+        return {
+            "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Take over a state of `state_dict`."""
+        self.policy.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])

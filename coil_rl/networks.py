@@ -1,0 +1,109 @@
+"""Actors and critics, built from an env's specs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict.nn import TensorDictModule
+from torch import Tensor, nn
+from torch.distributions import Categorical as CategoricalDistribution
+from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.envs import EnvBase
+from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
+
+
+class Network(nn.Module):
+    """A tanh network over some of an env's entries, flattened beyond the batch and joined, with PPO's orthogonal start.
+
+    Args:
+        env: for its specs.
+        in_keys: the entries.
+        hidden: widths of the hidden layers.
+        outputs: width of the last layer.
+        gain: size of the last layer's weights.
+
+    Raises:
+        KeyError: if the env has no such entry, naming those it has.
+    """
+
+    def __init__(self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], outputs: int, gain: float) -> None:
+        super().__init__()
+        spec, batch = env.observation_spec, len(env.batch_size)
+        known = [key for key in spec.keys(True, True) if isinstance(key, str)]
+        missing = [key for key in in_keys if key not in known]
+        if missing:
+            raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(known)}")
+        shapes = [spec[key].shape[batch:] for key in in_keys]
+        self.event_dims = [len(shape) for shape in shapes]
+        width = sum(shape.numel() for shape in shapes)
+        self.layers = MLP(width, outputs, num_cells=list(hidden), activation_class=nn.Tanh, device=env.device)
+        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
+        for layer in linear:
+            nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[*batch, ...] each to [*batch, outputs]."""
+        flat = [
+            x.unsqueeze(-1) if dims == 0 else x.flatten(-dims) for x, dims in zip(inputs, self.event_dims, strict=True)
+        ]
+        out: Tensor = self.layers(torch.cat(flat, -1) if len(flat) > 1 else flat[0])
+        return out
+
+
+class NormalHead(nn.Module):
+    """A network's output as the mean of a normal distribution whose spread is a parameter, the same in every state."""
+
+    def __init__(self, network: Network, size: int, scale: float) -> None:
+        super().__init__()
+        self.network = network
+        self.log_scale = nn.Parameter(torch.full((size,), math.log(scale), device=network.layers[-1].weight.device))
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation, [*batch, A] each."""
+        loc = self.network(*inputs)
+        return loc, self.log_scale.exp().expand_as(loc)
+
+
+def actor(
+    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5
+) -> ProbabilisticActor:
+    """A stochastic policy for the env's action: a squashed normal where actions are bounded, else a normal or a choice.
+
+    Its deterministic action is the mode. The standard deviation does not depend on the state.
+
+    Args:
+        env: for its specs.
+        in_keys: what the agent observes.
+        hidden: widths of the hidden layers.
+        scale: standard deviation at the start, before squashing.
+
+    Returns:
+        A module that writes `action` and `action_log_prob`.
+    """
+    spec = env.action_spec
+    discrete = isinstance(spec, (Categorical, OneHot))
+    size = spec.space.n if discrete else spec.shape[-1]
+    network = Network(env, in_keys, hidden, size, gain=0.01)
+    common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
+    if discrete:
+        module = TensorDictModule(network, list(in_keys), ["logits"])
+        kind = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
+        return ProbabilisticActor(module, ["logits"], distribution_class=kind, **common)
+    module = TensorDictModule(NormalHead(network, size, scale), list(in_keys), ["loc", "scale"])
+    return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
+
+
+def _distribution(spec: TensorSpec) -> dict[str, object]:
+    if not isinstance(spec, Bounded):
+        return {"distribution_class": IndependentNormal}
+    event = tuple(0 for _ in spec.shape[:-1])
+    bounds = {"low": spec.space.low[event], "high": spec.space.high[event]}
+    return {"distribution_class": TanhNormal, "distribution_kwargs": bounds | {"tanh_loc": False}}
+
+
+def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> ValueOperator:
+    """A state-value network over the same entries; writes `state_value` [*batch, 1]."""
+    return ValueOperator(Network(env, in_keys, hidden, 1, gain=1.0), in_keys=list(in_keys))

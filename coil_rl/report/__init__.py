@@ -1,0 +1,7 @@
+"""Tables and pictures from finished runs."""
+
+from coil_rl.report.curve import draw_learning_curves
+from coil_rl.report.lines import animate_lines, draw_lines
+from coil_rl.report.table import markdown_table, write_csv
+
+__all__ = ["animate_lines", "draw_learning_curves", "draw_lines", "markdown_table", "write_csv"]

@@ -1,0 +1,78 @@
+"""Collects experience: steps an env with a policy and remembers where it stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+
+class Rollout:
+    """Batches of consecutive steps of every row of an env, resetting each row that is done.
+
+    Args:
+        env: batched env.
+        policy: writes the action; it samples.
+        steps: T, length of a batch.
+        keys: entries to keep, under `next` too where they exist there; all of them by default.
+
+    Example:
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> from coil_rl.guides import SplineGuide
+        >>> Rollout(ConeTrackEnv(shipped_tracks("train"), 8), SplineGuide(), steps=4).collect().shape
+        torch.Size([8, 4])
+    """
+
+    def __init__(
+        self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
+    ) -> None:
+        self.env, self.policy, self.steps = env, policy, steps
+        self.keys = None if keys is None else [*keys, *(("next", *_tuple(key)) for key in keys)]
+        self.carrier: TensorDictBase | None = None
+
+    @property
+    def frames(self) -> int:
+        """Frames in a batch, B * T."""
+        return self.env.batch_size.numel() * self.steps
+
+    @torch.no_grad()
+    def collect(self) -> TensorDictBase:
+        """The next batch, [B, T]."""
+        carrier = self.env.reset() if self.carrier is None else self.carrier
+        batch = []
+        with set_exploration_type(ExplorationType.RANDOM):
+            for _ in range(self.steps):
+                step, carrier = self.env.step_and_maybe_reset(self.policy(carrier))
+                batch.append(step if self.keys is None else step.select(*self.keys, strict=False))
+        self.carrier = carrier
+        return torch.stack(batch, dim=len(self.env.batch_size))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the env and the collection stand."""
+        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
+        return {
+            "env": env.state_dict(),
+            "transforms": self.env.state_dict() if env is not self.env else {},
+            "carrier": None if self.carrier is None else self.carrier.to_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a state of `state_dict`."""
+        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
+        env.load_state_dict(state["env"])
+        if env is not self.env:
+            self.env.load_state_dict(state["transforms"])
+        carrier = state["carrier"]
+        if carrier is not None:
+            carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
+        self.carrier = carrier
+
+
+def _tuple(key: NestedKey) -> tuple[str, ...]:
+    return (key,) if isinstance(key, str) else key

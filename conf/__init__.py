@@ -1,0 +1,1 @@
+"""Hydra configuration: every choice a person makes is a YAML file here."""

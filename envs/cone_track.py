@@ -1,0 +1,389 @@
+"""The cone world of the paper (section 4.1) as a batched TorchRL env.
+
+Every car of the batch drives on a closed track between two rings of cones at constant speed and chooses its steering.
+It sees the cones ahead, is paid for laps, new cones and staying alive, and pays for jerky steering and crashes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, Literal, NamedTuple
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coil_rl.envs.sight import SAMPLES, View, boundary_samples, encode, to_car, to_world, view
+from coil_rl.envs.splines import quadratic_spline, smoothing_spline
+from coil_rl.envs.track import Track
+from coil_rl.envs.track_map import TrackMap
+
+HISTORY = 20
+REWARD_TERMS = ("finish", "crash", "cone", "smooth", "alive")
+
+
+class Reward(NamedTuple):
+    """Weights of the reward (paper 4.1.1).
+
+    Attributes:
+        finish: paid for a completed lap.
+        second: paid per second of its lap time.
+        crash: paid instead of everything else in the step of a crash.
+        cone: paid for each side on which a cone comes into sight.
+        smooth: paid per unit of |a - mean of the last 20 actions|.
+        alive: paid every step.
+    """
+
+    finish: float = 70.0
+    second: float = -0.8
+    crash: float = -100.0
+    cone: float = 2.5
+    smooth: float = -0.1
+    alive: float = 0.001
+
+
+class ConeTrackEnv(EnvBase):
+    """Cars on tracks between cones.
+
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
+    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action now in force,
+    `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
+    laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `clearance` m (to the nearest crash),
+    `smoothness` |a - a_avg|, `pose` [B, 3] (m, m, radians) and the terms of the reward, one entry each. All state is
+    in buffers, so `state_dict()` is the whole of it.
+
+    Args:
+        tracks: where to drive.
+        num_cars: B.
+        rate: control steps per second.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        cone_bonus: "first_sighting" pays a cone once a lap, "every_sighting" whenever it was not in view a step ago.
+        reward: weights, see `Reward`.
+        laps: completed laps that end an episode.
+        time_limit: s, then an episode is truncated.
+        held_steps: for so many first steps of an episode the steering is held at 0.
+        assignment: "random" draws a track at each reset, "cyclic" keeps car i on track i mod len(tracks).
+        kept_cones: K.
+        speed: m/s.
+        car_length: m.
+        max_steering: degrees of an action of 1.
+        seed: of the draw of tracks.
+        device: where everything lives.
+        dtype: of everything that is not a count.
+
+    Raises:
+        ValueError: for a value outside its range, naming it.
+
+    Example:
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=8)
+        >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
+        torch.Size([8, 3, 20])
+    """
+
+    track: Tensor
+    pose: Tensor
+    history: Tensor
+    steps: Tensor
+    lap: Tensor
+    clock: Tensor
+    on_line: Tensor
+    known: Tensor
+    samples: Tensor
+    sampled: Tensor
+    start_cones: Tensor
+    start_count: Tensor
+    start_observation: Tensor
+    start_samples: Tensor
+    start_sampled: Tensor
+
+    def __init__(
+        self,
+        tracks: Sequence[Track],
+        num_cars: int = 64,
+        *,
+        rate: float = 24.0,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        cone_bonus: Literal["first_sighting", "every_sighting"] = "first_sighting",
+        reward: dict[str, float] | None = None,
+        laps: int = 2,
+        time_limit: float = 200.0,
+        held_steps: int = 0,
+        assignment: Literal["random", "cyclic"] = "random",
+        kept_cones: int = 16,
+        speed: float = 2.0,
+        car_length: float = 2.0,
+        max_steering: float = 80.0,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        _check_choice("spline", spline, ("cubic", "quadratic"))
+        _check_choice("cone_bonus", cone_bonus, ("first_sighting", "every_sighting"))
+        _check_choice("assignment", assignment, ("random", "cyclic"))
+        positive = {
+            "num_cars": num_cars, "rate": rate, "laps": laps, "time_limit": time_limit, "kept_cones": kept_cones,
+            "speed": speed, "car_length": car_length, "max_steering": max_steering,
+        }  # fmt: skip
+        for name, value in positive.items():
+            if not value > 0:
+                raise ValueError(f"{name}={value} must be more than 0")
+        unknown = set(reward or {}) - set(Reward._fields)
+        if unknown:
+            raise ValueError(f"reward has no weight {sorted(unknown)}; it has {', '.join(Reward._fields)}")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
+        self.dtype_ = dtype
+        self.rate, self.laps, self.held_steps, self.assignment = rate, laps, held_steps, assignment
+        self.max_steps = round(time_limit * rate)
+        self.weights = Reward(**(reward or {}))
+        self.every_sighting = cone_bonus == "every_sighting"
+        self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
+        self.max_steering = math.radians(max_steering)
+        self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
+        self.map = TrackMap(tracks, dtype=dtype).to(self.device)
+        self.generator = torch.Generator()
+        self._declare_specs()
+        self._allocate(num_cars)
+        self.set_seed(seed)
+
+    # State: one row of numbers per quantity, the cars last.
+
+    def _allocate(self, cars: int) -> None:
+        def keep(name: str, *shape: int, dtype: torch.dtype = self.dtype_, persistent: bool = True) -> None:
+            self.register_buffer(name, torch.zeros(shape, dtype=dtype, device=self.device), persistent=persistent)
+
+        keep("track", cars, dtype=torch.int64)
+        keep("pose", 3, cars)
+        keep("history", HISTORY, cars)
+        keep("steps", cars, dtype=torch.int32)
+        keep("lap", cars, dtype=torch.int32)
+        keep("clock", cars, dtype=torch.int32)
+        keep("on_line", cars, dtype=torch.bool)
+        keep("known", 2 * self.map.slots, cars, dtype=torch.bool)
+        keep("samples", 2, SAMPLES, 2, cars)
+        keep("sampled", 2, cars, dtype=torch.bool)
+
+        # What a car sees at the start depends on its track alone, so a reset only copies it.
+        tracks = torch.arange(len(self.map), device=self.device)
+        samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
+        sampled = torch.zeros(2, len(tracks), dtype=torch.bool, device=self.device)
+        seen, _ = self._look(tracks, self.map.starts)
+        observation, samples, sampled = self._observe(self.map.starts, seen, samples, sampled)
+        for name, value in {
+            "start_cones": self._padded(seen.cones), "start_count": seen.count, "start_observation": observation,
+            "start_samples": samples, "start_sampled": sampled,
+        }.items():  # fmt: skip
+            self.register_buffer(name, value, persistent=False)
+
+    def get_extra_state(self) -> Tensor:
+        """The generator's state, so that `state_dict` also holds the tracks yet to be drawn."""
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the generator."""
+        self.generator.set_state(state.cpu())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+    # Specs
+
+    def _declare_specs(self) -> None:
+        def real(*shape: int) -> Unbounded:
+            return Unbounded((*self.batch_size, *shape), dtype=self.dtype_, device=self.device)
+
+        def whole(*shape: int) -> Unbounded:
+            return Unbounded((*self.batch_size, *shape), dtype=torch.int64, device=self.device)
+
+        def flag() -> Binary:
+            return Binary(1, shape=(*self.batch_size, 1), dtype=torch.bool, device=self.device)
+
+        def bounded(*shape: int) -> Bounded:
+            return Bounded(-1, 1, (*self.batch_size, *shape), dtype=self.dtype_, device=self.device)
+
+        info = Composite(
+            track=whole(1), lap=whole(1), lap_time=real(1), crashed=flag(), clearance=real(1), smoothness=real(1),
+            pose=real(3), reward=Composite({term: real(1) for term in REWARD_TERMS}, shape=self.batch_size),
+            shape=self.batch_size,
+        )  # fmt: skip
+        self.observation_spec = Composite(
+            observation=bounded(4 * SAMPLES), cones=real(2, self.kept_cones, 2), cone_count=whole(2),
+            steering=bounded(1), info=info, shape=self.batch_size,
+        )  # fmt: skip
+        self.action_spec = bounded(1)
+        self.reward_spec = real(1)
+        self.done_spec = Composite(
+            {key: flag() for key in ("done", "terminated", "truncated")}, shape=self.batch_size, device=self.device
+        )
+
+    # Dynamics
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        everyone = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
+        mask = everyone if tensordict is None else tensordict.get("_reset", everyone).view(self.batch_size)
+        cars = torch.arange(self.batch_size[0], device=self.device)
+        if self.assignment == "cyclic":
+            drawn = cars % len(self.map)
+        else:
+            # All cars draw, reset or not: which numbers come next must not depend on the data.
+            drawn = torch.randint(len(self.map), self.batch_size, generator=self.generator).to(self.device)
+        track = torch.where(mask, drawn, self.track)
+        self.track = track
+        self.pose = torch.where(mask, self.map.starts[:, track], self.pose)
+        self.samples = torch.where(mask, self.start_samples[..., track], self.samples)
+        self.sampled = torch.where(mask, self.start_sampled[..., track], self.sampled)
+        self.history = self.history * ~mask
+        self.known = self.known & ~mask
+        self.on_line = self.on_line & ~mask
+        self.steps, self.lap = self.steps * ~mask, self.lap * ~mask
+        self.clock = self.clock.masked_fill(mask, -1)
+        zero = torch.zeros_like(self.pose[0])
+        return self._tensordict(
+            self.start_observation[track],
+            self.start_cones[..., track],
+            self.start_count[:, track],
+            self._info(zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero)),
+        )
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].view(-1).clamp(-1, 1)
+        if self.held_steps:
+            action = action * (self.steps >= self.held_steps)
+        roughness = (action - _recent_mean(self.history)).abs()
+        self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
+        self.pose = self._move(action)
+        self.steps = self.steps + 1
+
+        lap_time, finished = self._cross_the_line()
+        seen, slot = self._look(self.track, self.pose)
+        discovered = self._discover(seen, slot, finished)
+        observation, self.samples, self.sampled = self._observe(self.pose, seen, self.samples, self.sampled)
+        clearance = self.map.clearance(self.track, self.pose[:2])
+
+        crashed = clearance <= 0
+        alive = (~crashed).to(action.dtype)
+        terms = {
+            "finish": torch.add(finished * self.weights.finish, lap_time, alpha=self.weights.second) * alive,
+            "crash": crashed * self.weights.crash,
+            "cone": discovered * self.weights.cone * alive,
+            "smooth": roughness * self.weights.smooth * alive,
+            "alive": self.weights.alive * alive,
+        }
+        terminated = crashed | (self.lap >= self.laps)
+        truncated = (self.steps >= self.max_steps) & ~terminated
+        out = self._tensordict(
+            observation,
+            self._padded(seen.cones),
+            seen.count,
+            self._info(lap_time, crashed, clearance, roughness, terms),
+        )
+        out["reward"] = sum(terms.values()).to(action.dtype).unsqueeze(-1)
+        out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
+        out["done"] = (terminated | truncated).unsqueeze(-1)
+        return out
+
+    def _move(self, action: Tensor) -> Tensor:
+        """The bicycle model (equations 99-100): first along the heading, then the heading turns."""
+        x, y, heading = self.pose
+        step = self.speed / self.rate
+        turn = (action * self.max_steering).sin()
+        return torch.stack(
+            [
+                torch.add(x, heading.cos(), alpha=step),
+                torch.add(y, heading.sin(), alpha=step),
+                torch.add(heading, turn, alpha=step / self.car_length),
+            ]
+        )
+
+    def _cross_the_line(self) -> tuple[Tensor, Tensor]:
+        """Count laps; returns the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
+        offset = self.pose[:2] - self.map.finish[:, self.track]
+        inside = offset[0].square() + offset[1].square() < FINISH_RADIUS**2
+        entered = inside & ~self.on_line
+        finished = entered & (self.clock >= 0)
+        lap_time = ((self.steps - self.clock) * finished).to(self.dtype_) / self.rate
+        self.on_line = inside
+        self.clock = torch.where(entered, self.steps, self.clock)
+        self.lap = self.lap + finished
+        return lap_time, finished
+
+    def _look(self, track: Tensor, pose: Tensor) -> tuple[View, Tensor]:
+        slot, cones = self.map.candidates(track, pose)
+        return view(to_car(pose, cones), self.kept_cones), slot
+
+    def _discover(self, seen: View, slot: Tensor, finished: Tensor) -> Tensor:
+        """On how many sides a cone came into sight [B]; keeps book of the cones that are not to be paid again."""
+        if not self.every_sighting:
+            self.known = self.known & ~finished
+        slot = slot.flatten(0, 1)
+        visible = seen.seen.flatten(0, 1)
+        new = visible & ~self.known.gather(0, slot)
+        before = torch.zeros_like(self.known) if self.every_sighting else self.known.clone()
+        # Padding slots are never visible, so nothing real is lost where several candidates write to one.
+        self.known = before.scatter_(0, slot, visible if self.every_sighting else visible | before.gather(0, slot))
+        return new.view(-1, 2, self.batch_size[0]).any(0).sum(0)
+
+    def _observe(self, pose: Tensor, seen: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The observation [B, 20], from the boundaries in view or, where there is none, from the last one that was."""
+        fresh = seen.count >= 2
+        local = boundary_samples(seen.cones, seen.count, self.fit)
+        samples = torch.where(fresh, to_world(pose, local), samples)
+        sampled = sampled | fresh
+        return encode(torch.where(fresh, local, to_car(pose, samples)), sampled), samples, sampled
+
+    # Output
+
+    def _padded(self, cones: Tensor) -> Tensor:
+        missing = self.kept_cones - cones.shape[1]
+        return cones if missing <= 0 else torch.cat([cones, cones.new_zeros(2, missing, *cones.shape[2:])], 1)
+
+    def _info(
+        self, lap_time: Tensor, crashed: Tensor, clearance: Tensor, smoothness: Tensor, terms: dict[str, Tensor]
+    ) -> TensorDict:
+        columns = {
+            "track": self.track, "lap": self.lap.long(), "lap_time": lap_time, "crashed": crashed,
+            "clearance": clearance, "smoothness": smoothness,
+        }  # fmt: skip
+        info = TensorDict({key: value.unsqueeze(-1) for key, value in columns.items()}, self.batch_size)
+        info["pose"] = self.pose.t()
+        info["reward"] = TensorDict(
+            {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}, self.batch_size
+        )
+        return info
+
+    def _tensordict(self, observation: Tensor, cones: Tensor, count: Tensor, info: TensorDict) -> TensorDict:
+        return TensorDict(
+            {
+                "observation": observation,
+                "cones": cones.permute(3, 2, 1, 0),
+                "cone_count": count.t(),
+                "steering": self.history[0].unsqueeze(-1),
+                "info": info,
+            },
+            self.batch_size,
+            device=self.device,
+        )
+
+
+FINISH_RADIUS = 0.625
+
+
+def _recent_mean(history: Tensor) -> Tensor:
+    """Mean of the last actions [20, B], newest first, weighted exp(-0.1 k), in a fixed order of summation."""
+    decay = math.exp(-0.1)
+    total = history[-1]
+    for action in reversed(history.unbind(0)[:-1]):
+        total = torch.add(action, total, alpha=decay)
+    return total * ((1 - decay) / (1 - decay**HISTORY))
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

@@ -1,0 +1,111 @@
+"""What a car sees: the cones in view, the boundary estimated from them, and the 20 numbers of the observation.
+
+Shared by every world that shows cones to an agent. The batch comes last; the two sides are `[..., 2, B]`, left first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from coil_rl.envs.splines import Spline
+
+SAMPLES = 5
+SIGHT = 7.0
+HALF_FIELD_OF_VIEW = math.radians(60)
+WIDEST_ANGLE = math.radians(120)
+
+Fit = Callable[[Tensor, Tensor], Spline]
+
+
+@dataclass(frozen=True)
+class View:
+    """The cones in sight of a batch of cars.
+
+    Attributes:
+        cones: [2, K, 2, B] m in the car's frame (x ahead, y left), nearest first, zeros after the last. Fewer slots
+            than K where there are fewer candidates.
+        count: [2, B] int64, how many of the K are real.
+        seen: [candidates, 2, B] bool, which candidates those are.
+    """
+
+    cones: Tensor
+    count: Tensor
+    seen: Tensor
+
+
+def to_car(pose: Tensor, points: Tensor) -> Tensor:
+    """World points [2, ..., B] m as the car at pose [3, B] sees them (x ahead, y left): [2, ..., B] m."""
+    x, y = points[0] - pose[0], points[1] - pose[1]
+    cos, sin = pose[2].cos(), pose[2].sin()
+    return torch.stack([torch.addcmul(cos * x, sin, y), torch.addcmul(cos * y, sin, x, value=-1)])
+
+
+def to_world(pose: Tensor, points: Tensor) -> Tensor:
+    """The inverse of `to_car`."""
+    x, y = points
+    cos, sin = pose[2].cos(), pose[2].sin()
+    return torch.stack([torch.addcmul(cos * x, sin, y, value=-1) + pose[0], torch.addcmul(cos * y, sin, x) + pose[1]])
+
+
+def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> View:
+    """Sort out which cones are in sight: at most `sight` m away and `half_field_of_view` to either side.
+
+    Args:
+        local: candidate cones in the car's frame, [2, candidates, 2, B] m.
+        kept: K, at most this many a side are kept, the nearest ones.
+        sight: m.
+        half_field_of_view: radians, at most pi / 2.
+    """
+    x, y = local
+    square = torch.addcmul(x * x, y, y)
+    visible = (square <= sight**2) & (x >= 0) & (x * x >= square * math.cos(half_field_of_view) ** 2)
+    rank = _rank(square.masked_fill_(~visible, math.inf))
+    visible &= rank < kept
+    cones = torch.empty_like(local).scatter_(1, rank.long().expand_as(local), local * visible)[:, :kept]
+    return View(cones, visible.sum(0), visible)
+
+
+def boundary_samples(cones: Tensor, count: Tensor, fit: Fit) -> Tensor:
+    """The estimated boundary: a spline through a side's cones, at equal steps of its parameter.
+
+    Args:
+        cones: [2, K, 2, B] m, nearest first.
+        count: [2, B].
+        fit: the spline (points, count) -> Spline.
+
+    Returns:
+        [2, 5, 2, B] m; without meaning where a side has fewer than two cones.
+    """
+    return fit(cones, count).equidistant(SAMPLES)
+
+
+def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
+    """The paper's observation (4.1): each sample as distance and angle, scaled to [-1, 1].
+
+    Args:
+        samples: boundary samples in the car's frame, [2, 5, 2, B] m.
+        known: [2, B] bool; a side not known yet reads as zeros.
+        sight: m, the distance that becomes 1.
+
+    Returns:
+        [B, 20]: r1, theta1, ..., r10, theta10, left side first.
+    """
+    x, y = samples
+    distance = torch.hypot(x, y) * (2 / sight) - 1
+    angle = torch.atan2(y, x) * (1 / WIDEST_ANGLE)
+    both = torch.stack([distance, angle]).clamp_(-1, 1) * known
+    return both.permute(3, 2, 1, 0).reshape(known.shape[-1], -1)
+
+
+def _rank(key: Tensor) -> Tensor:
+    """Place of each entry when its column is sorted, ties in order: [N, ...] to [N, ...] int8."""
+    rank = torch.zeros(key.shape, dtype=torch.int8, device=key.device)
+    for i, row in enumerate(key.unbind(0)):
+        rank[:i] += row < key[:i]
+        rank[i + 1 :] += row <= key[i + 1 :]
+    return rank

@@ -1,0 +1,230 @@
+"""The batched env against the oracle, an implementation of the same page that shares no code with it."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from oracle import OneCar, Outcome, guide_action, midpoints
+
+from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
+from coil_rl.envs.cone_track import REWARD_TERMS
+from coil_rl.guides.spline import SplineGuide
+
+Array = NDArray[np.float64]
+
+
+class Preset(NamedTuple):
+    env: dict[str, Any]
+    guide: dict[str, Any]
+
+
+PRESETS = {
+    "paper": Preset({}, {}),
+    "authors": Preset(
+        {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2},
+        {"spline": "quadratic", "gain": 80 / 120},
+    ),
+}
+# Level, reward and lap time in s that the authors' own program earned with its guide (shared/tracks/README.md).
+AUTHORS = [("MAP_1", 835.4, 69.58), ("MAP_2", 776.7, 63.55), ("MAP_3", 536.1, 41.13)]
+
+# Summation orders differ; a float64 trajectory of 9,000 steps stays within 1e-13 of the oracle's.
+CLOSE = 1e-6
+# The env interpolates the distance to a boundary on a grid of 10 cm.
+FIELD = 3e-3
+# Where two midpoints coincide the oracle has one point of weight two, and the env two points that its floor on chord
+# lengths holds apart; a tridiagonal solve loses as many digits there as the gap is small. The parabola loses none.
+COINCIDENT = {"cubic": 2e-2, "quadratic": 1e-5}
+
+
+def drive(
+    tracks: list[Track],
+    preset: Preset,
+    driver: str,
+    steps: int,
+    *,
+    seed: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> dict[str, Array]:
+    """One episode per track, all at once: what was emitted, [steps, cars, ...] each, until the last one ends."""
+    env = ConeTrackEnv(tracks, len(tracks), assignment="cyclic", dtype=dtype, **preset.env)
+    guide = SplineGuide(**preset.guide)
+    rng = np.random.default_rng(seed)
+    noise = np.zeros(len(tracks))
+    over = torch.zeros(len(tracks), 1, dtype=torch.bool)
+    rows: list[dict[str, Array]] = []
+    with torch.no_grad():
+        state = env.reset()
+        while len(rows) < steps and not over.all():
+            advice = guide(state)["action"]
+            noise = np.clip(0.97 * noise + 0.12 * rng.standard_normal(len(tracks)), -1, 1)
+            if driver == "random":
+                state["action"] = torch.tensor(noise).unsqueeze(-1).to(dtype)
+            elif driver == "disturbed":
+                state["action"] = (advice + 0.5 * torch.tensor(noise).unsqueeze(-1)).clamp(-1, 1).to(dtype)
+            after = env.step(state)["next"]
+            over |= after["done"]
+            row = {"advice": advice, "action": state["action"]}
+            row |= {key: after[key] for key in ("observation", "steering", "reward", "terminated", "truncated")}
+            row |= {key: after["info", key] for key in ("lap", "lap_time", "crashed", "clearance", "smoothness")}
+            row |= {key: after["info", "reward", key] for key in REWARD_TERMS}
+            rows.append({key: value.numpy().copy() for key, value in row.items()})
+            state = env.step_mdp(state)
+    return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
+
+
+def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[float, float, Outcome]]:
+    """The oracle under the same actions: its guide's advice, the smallest gap between midpoints, and the outcome."""
+    car = OneCar(track.left, track.right, track.start, **preset.env)
+    for action in actions:
+        cones = car.cones()
+        gaps = np.linalg.norm(np.diff(midpoints(*cones), axis=0), axis=1)
+        advice = guide_action(*cones, car.steering, **preset.guide)
+        outcome = car.step(action)
+        yield advice, gaps.min(initial=np.inf), outcome
+        if outcome.terminated:
+            return
+
+
+def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> Outcome:
+    """Compare one car's episode, trace [steps, ...], with the oracle's; returns how it ended there."""
+    advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
+    said = {key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in Outcome._fields if key != "terms"}
+    said |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in REWARD_TERMS}
+    said["reward"] = np.array([outcome.reward for outcome in outcomes])
+
+    # A car that comes as close to a crash as the field is coarse may crash in one of the two and not in the other;
+    # from there on they have nothing in common.
+    together = len(outcomes)
+    for k in np.flatnonzero(trace["crashed"][:together, 0] != said["crashed"])[:1]:
+        assert abs(said["clearance"][k]) < FIELD, f"step {k}: one crashes, {said['clearance'][k]} m from a crash"
+        together = k
+    ours = {key: value[:together, 0] if key != "observation" else value[:together] for key, value in trace.items()}
+    said = {key: value[:together] for key, value in said.items()}
+
+    tolerance = np.where(np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE)[:together]
+    difference = np.abs(ours["advice"] - np.array(advice)[:together])
+    assert (difference <= tolerance).all(), f"advice differs by {difference.max()} at step {difference.argmax()}"
+    for key in ("observation", "reward", "lap_time", "smoothness", *REWARD_TERMS):
+        np.testing.assert_allclose(ours[key], said[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}")
+    for key in ("lap", "crashed", "terminated", "truncated"):
+        np.testing.assert_array_equal(ours[key], said[key], err_msg=f"{key}, track {track.name}")
+    near = said["clearance"] < 1
+    np.testing.assert_allclose(ours["clearance"][near], said["clearance"][near], rtol=0, atol=FIELD)
+    held = np.where(np.arange(together) < preset.env.get("held_steps", 0), 0, ours["action"])
+    np.testing.assert_array_equal(ours["steering"], held)
+    return outcomes[-1]
+
+
+def column(trace: dict[str, Array], car: int) -> dict[str, Array]:
+    return {key: value[:, car] for key, value in trace.items()}
+
+
+def lap_times(trace: dict[str, Array], car: int) -> Array:
+    times = trace["lap_time"][:, car, 0]
+    return times[times > 0]
+
+
+@pytest.fixture(scope="module")
+def shipped() -> dict[str, Array]:
+    """The guide on the ten shipped tracks: at least a lap on each, both laps on the shortest."""
+    return drive(shipped_tracks("all"), PRESETS["paper"], "guide", 1750)
+
+
+@pytest.fixture(scope="module")
+def third_level(levels: list[Track]) -> dict[str, Array]:
+    return drive(levels[2:], PRESETS["authors"], "guide", 6000)
+
+
+def test_guide_drives_the_shipped_tracks_without_a_crash(shipped: dict[str, Array]) -> None:
+    assert not shipped["crashed"].any()
+    assert (shipped["lap"].max(axis=0) >= 1).all()
+    assert (shipped["lap"].max(axis=0) == 2).any()
+
+
+def test_env_agrees_with_the_oracle_on_shipped_tracks(shipped: dict[str, Array]) -> None:
+    tracks = shipped_tracks("all")
+    ends = {car: assert_agreement(tracks[car], PRESETS["paper"], column(shipped, car)) for car in (0, 9)}
+    assert ends[0].lap == 2
+
+
+def test_env_agrees_with_the_oracle_on_an_authors_level(levels: list[Track], third_level: dict[str, Array]) -> None:
+    assert assert_agreement(levels[2], PRESETS["authors"], column(third_level, 0)).lap == 2
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("driver", ["random", "disturbed"])
+def test_env_agrees_with_the_oracle_on_any_steering(preset: str, driver: str) -> None:
+    tracks = random_tracks(3, seed=5) * (3 if driver == "random" else 1)
+    trace = drive(tracks, PRESETS[preset], driver, 200, seed=1)
+    for car, track in enumerate(tracks):
+        assert_agreement(track, PRESETS[preset], column(trace, car))
+
+
+def test_coincident_midpoints_cost_the_guide_little(levels: list[Track]) -> None:
+    # The authors' cones lie on a grid, so that different pairs have the same midpoint.
+    trace = drive(levels[:1], PRESETS["paper"], "guide", 150)
+    assert min(gap for _, gap, _ in retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0])) < 1e-9
+    assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
+
+
+def race_alone(track: Track, laps: int) -> tuple[float, Outcome]:
+    """The oracle with its own guide: total reward of an episode and how it ended."""
+    car = OneCar(track.left, track.right, track.start, laps=laps)
+    total = 0.0
+    while True:
+        outcome = car.step(guide_action(*car.cones(), car.steering))
+        total += outcome.reward
+        if outcome.terminated or outcome.truncated:
+            return total, outcome
+
+
+def assert_float32_earns_the_same(tracks: list[Track], laps: int) -> None:
+    trace = drive(tracks, Preset({"laps": laps}, {}), "guide", 5000, dtype=torch.float32)
+    for car, track in enumerate(tracks):
+        total, outcome = race_alone(track, laps)
+        end = int(trace["terminated"][:, car, 0].argmax())
+        assert trace["lap"][end, car, 0] == outcome.lap == laps
+        assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(total, rel=1e-3)
+
+
+def test_float32_earns_what_the_oracle_earns() -> None:
+    assert_float32_earns_the_same([min(shipped_tracks("all"), key=lambda track: track.length)], laps=1)
+
+
+@pytest.mark.slow
+def test_float32_earns_what_the_oracle_earns_on_all_test_tracks() -> None:
+    assert_float32_earns_the_same(shipped_tracks("test"), laps=2)
+
+
+def assert_fidelity(trace: dict[str, Array], car: int, reward: float, lap_time: float) -> None:
+    end = int(trace["terminated"][:, car, 0].argmax())
+    assert not trace["crashed"][: end + 1, car].any()
+    assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(reward, rel=0.03)
+    assert lap_times(trace, car)[:2] == pytest.approx(lap_time, rel=0.01)
+
+
+def test_authors_preset_earns_what_their_program_earns(third_level: dict[str, Array]) -> None:
+    _, reward, lap_time = AUTHORS[2]
+    assert_fidelity(third_level, 0, reward, lap_time)
+
+
+@pytest.mark.slow
+def test_authors_preset_earns_what_their_program_earns_on_all_levels(levels: list[Track]) -> None:
+    trace = drive(levels, PRESETS["authors"], "guide", 10_000, dtype=torch.float32)
+    for car, (_, reward, lap_time) in enumerate(AUTHORS):
+        assert_fidelity(trace, car, reward, lap_time)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("driver", ["guide", "disturbed", "random"])
+def test_env_agrees_with_the_oracle_on_every_track(preset: str, driver: str, levels: list[Track]) -> None:
+    tracks = [*shipped_tracks("all"), *random_tracks(4, seed=11), *levels]
+    trace = drive(tracks, PRESETS[preset], driver, 12_000, seed=2)
+    ends = [assert_agreement(track, PRESETS[preset], column(trace, car)) for car, track in enumerate(tracks)]
+    if driver == "guide":
+        assert all(end.lap == 2 and not end.crashed for end in ends)

@@ -1,0 +1,361 @@
+"""Properties of the batched splines, against SciPy and NumPy where they know the answer."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import make_interp_spline, make_smoothing_spline
+from torch import Tensor
+
+from coil_rl.envs.splines import (
+    SelfEvolvingSpline,
+    Spline,
+    least_squares_parabola,
+    quadratic_spline,
+    smoothing_spline,
+)
+
+FITS = {
+    "smoothing": lambda points, count: smoothing_spline(points, count, 0.3),
+    "interpolating": lambda points, count: smoothing_spline(points, count, 0.0),
+    "quadratic": quadratic_spline,
+    "parabola": least_squares_parabola,
+}
+every_fit = pytest.mark.parametrize("fit", FITS.values(), ids=FITS.keys())
+SLOTS = 16
+steady = settings(derandomize=True, deadline=None, max_examples=40)
+seeds = st.integers(0, 2**31)
+
+
+def separated(seed: int, n: int, dim: int = 2) -> np.ndarray:
+    """A random walk of n points whose steps are 0.5 to 2 m long: [dim, n]."""
+    rng = np.random.default_rng(seed)
+    step = rng.normal(size=(dim, n))
+    step *= rng.uniform(0.5, 2, n) / np.linalg.norm(step, axis=0)
+    return step.cumsum(1)
+
+
+def padded(rows: list[np.ndarray], slots: int = SLOTS, garbage: float = 7.0) -> tuple[Tensor, Tensor]:
+    points = torch.full((rows[0].shape[0], slots, len(rows)), garbage, dtype=torch.float64)
+    for i, row in enumerate(rows):
+        points[:, : row.shape[1], i] = torch.from_numpy(row)
+    return points, torch.tensor([row.shape[1] for row in rows])
+
+
+def chord(row: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0], np.linalg.norm(np.diff(row), axis=0).cumsum()])
+
+
+def tensors(spline: Spline) -> tuple[Tensor, ...]:
+    return spline.knots, spline.values, spline.bends, spline.equidistant(7)
+
+
+def random_batch(dtype: torch.dtype = torch.float64, batch: int = 37) -> tuple[Tensor, Tensor]:
+    draw = torch.Generator().manual_seed(3)
+    points = torch.randn(2, SLOTS, batch, dtype=dtype, generator=draw).cumsum(1)
+    return points, torch.randint(0, SLOTS + 1, (batch,), generator=draw)
+
+
+@steady
+@given(seeds, st.integers(5, SLOTS), st.sampled_from([1e-4, 0.01, 0.1, 1.0, 30.0]))
+def test_smoothing_spline_is_scipys(seed: int, n: int, smoothing: float) -> None:
+    row = separated(seed, n)
+    u = chord(row)
+    spline = smoothing_spline(*padded([row]), smoothing)
+    where = np.linspace(0, u[-1], 23)
+    sampled = spline.sample(torch.from_numpy(where)[:, None])[..., 0].numpy()
+    for d in range(2):
+        truth = make_smoothing_spline(u, row[d], lam=smoothing)
+        assert spline.values[d, :n, 0].numpy() == pytest.approx(truth(u), abs=1e-9)
+        assert spline.bends[d, :n, 0].numpy() == pytest.approx(truth.derivative(2)(u), abs=1e-8)
+        assert sampled[d] == pytest.approx(truth(where), abs=1e-9)
+    assert spline.length.item() == pytest.approx(u[-1], abs=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+@pytest.mark.parametrize("smoothing", [0.01, 1.0])
+def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(n: int, smoothing: float) -> None:
+    row = separated(n, n)
+    h = np.diff(chord(row))
+    second = np.zeros((n - 2, n))
+    weight = np.zeros((n - 2, n - 2))
+    for i in range(n - 2):
+        second[i, i : i + 3] = 1 / h[i], -1 / h[i] - 1 / h[i + 1], 1 / h[i + 1]
+        weight[i, i] = (h[i] + h[i + 1]) / 3
+    for i in range(n - 3):
+        weight[i, i + 1] = weight[i + 1, i] = h[i + 1] / 6
+    roughness = second.T @ np.linalg.solve(weight, second)
+    truth = np.linalg.solve(np.eye(n) + smoothing * roughness, row.T).T
+    values = smoothing_spline(*padded([row]), smoothing).values[:, :n, 0]
+    assert values.numpy() == pytest.approx(truth, abs=1e-9)
+
+
+@steady
+@given(seeds, st.integers(2, SLOTS))
+def test_quadratic_spline_is_scipys(seed: int, n: int) -> None:
+    row = separated(seed, n)
+    u = chord(row)
+    where = np.linspace(0, u[-1], 41)
+    spline = quadratic_spline(*padded([row]))
+    truth = make_interp_spline(u, row.T, k=min(2, n - 1))
+    sampled = spline.sample(torch.from_numpy(where)[:, None])[..., 0].numpy()
+    assert sampled == pytest.approx(truth(where).T, abs=1e-9)
+
+
+@steady
+@given(seeds, st.integers(2, SLOTS))
+def test_parabola_is_numpys(seed: int, n: int) -> None:
+    row = separated(seed, n)
+    u = chord(row)
+    where = np.linspace(0, u[-1], 11)
+    spline = least_squares_parabola(*padded([row]))
+    sampled = spline.sample(torch.from_numpy(where)[:, None])[..., 0].numpy()
+    for d in range(2):
+        truth = np.polyfit(u, row[d], min(2, n - 1))
+        assert sampled[d] == pytest.approx(np.polyval(truth, where), abs=1e-9)
+        assert spline.values[d, :n, 0].numpy() == pytest.approx(np.polyval(truth, u), abs=1e-9)
+
+
+@every_fit
+def test_float32_is_close_to_float64(fit) -> None:
+    points, count = padded([100 + separated(n, n) for n in range(2, SLOTS + 1)])
+    single = fit(points.float(), count).equidistant(9)
+    assert torch.allclose(single.double(), fit(points, count).equidistant(9), atol=2e-3)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-4, 1e-2])
+@pytest.mark.parametrize("smoothing", [0.1, 10.0])
+def test_points_almost_on_one_another_smooth_like_one_of_double_weight(gap: float, smoothing: float) -> None:
+    # Midpoints of neighbouring cone pairs do come this close; the normal equations lose most digits here.
+    row = separated(1, 8)
+    row = np.insert(row, 4, row[:, 3] + [gap, 0], axis=1)
+    points, count = padded([row])
+    u = chord(np.delete(row, 4, axis=1))
+    weights = np.where(np.arange(8) == 3, 2.0, 1.0)
+    for dtype in (torch.float32, torch.float64):
+        values = smoothing_spline(points.to(dtype), count, smoothing).values[:, :9, 0]
+        values = torch.cat([values[:, :4], values[:, 5:]], 1).numpy()
+        for d in range(2):
+            truth = make_smoothing_spline(u, np.delete(row, 4, axis=1)[d], w=weights, lam=smoothing)
+            assert values[d] == pytest.approx(truth(u), abs=0.01 + 2 * gap)
+
+
+@every_fit
+def test_no_points_are_zeros_one_point_is_constant_two_are_a_line(fit) -> None:
+    rows = [np.zeros((2, 0)), np.array([[3.0], [4.0]]), np.array([[1.0, 4.0], [1.0, 5.0]])]
+    spline = fit(*padded(rows, garbage=-50.0))
+    at = spline.equidistant(3)
+    assert at[:, :, 0].eq(0).all()
+    assert spline.values[..., 0].eq(0).all()
+    assert at[:, :, 1] == pytest.approx(np.repeat([[3.0], [4.0]], 3, 1))
+    assert at[:, :, 2] == pytest.approx(np.array([[1, 2.5, 4], [1, 3, 5]]))
+    assert spline.length.tolist() == pytest.approx([0, 0, 5])
+
+
+@every_fit
+@pytest.mark.parametrize("slots", [2, 3, 4, 5])
+def test_few_slots_suffice(fit, slots: int) -> None:
+    rows = [separated(5, n) for n in range(1, slots + 1)]
+    few, many = fit(*padded(rows, slots)), fit(*padded(rows))
+    assert torch.equal(few.equidistant(6), many.equidistant(6))
+
+
+@every_fit
+def test_parameters_outside_are_clamped(fit) -> None:
+    points, count = random_batch()
+    spline = fit(points, count)
+    out = torch.stack([spline.length + 5, spline.length * 0 - 5])
+    assert torch.equal(spline.sample(out), spline.equidistant(2).flip(1))
+
+
+@every_fit
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_padding_has_no_influence(fit, dtype: torch.dtype) -> None:
+    points, count = random_batch(dtype)
+    padding = torch.arange(SLOTS)[:, None] >= count
+    for garbage in (0.0, -1e6, 1e30):
+        other = fit(points.masked_fill(padding, garbage), count)
+        for a, b in zip(tensors(fit(points, count)), tensors(other), strict=True):
+            assert torch.equal(a, b)
+
+
+@every_fit
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_padding_repeats_the_last_entry(fit, dtype: torch.dtype) -> None:
+    points, count = random_batch(dtype)
+    spline = fit(points, count)
+    last = torch.minimum(torch.arange(SLOTS)[:, None], (count - 1).clamp(min=0))
+    for x in (spline.knots, *spline.values, *spline.bends):
+        assert torch.equal(x, x.gather(0, last))
+
+
+@every_fit
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_rows_do_not_depend_on_their_batch(fit, dtype: torch.dtype) -> None:
+    points, count = random_batch(dtype)
+    whole = tensors(fit(points, count))
+    for rows in (slice(0, 1), slice(5, 6), slice(3, 20), slice(36, 37)):
+        for a, b in zip(whole, tensors(fit(points[..., rows].contiguous(), count[rows])), strict=True):
+            assert torch.equal(a[..., rows], b)
+
+
+@every_fit
+def test_batch_may_have_any_shape(fit) -> None:
+    points, count = random_batch(batch=24)
+    whole = tensors(fit(points, count))
+    for shape in ((2, 12), (2, 3, 4)):
+        parts = tensors(fit(points.view(2, SLOTS, *shape), count.view(shape)))
+        for a, b in zip(whole, parts, strict=True):
+            assert torch.equal(a, b.flatten(-len(shape)))
+    for a, b in zip(whole, tensors(fit(points[..., 3], count[3])), strict=True):
+        assert torch.equal(a[..., 3], b)
+    assert fit(points[..., :0], count[:0]).equidistant(5).shape == (2, 5, 0)
+
+
+@every_fit
+def test_any_number_of_coordinates(fit) -> None:
+    flat = separated(9, 8)
+    solid = np.stack([flat[0], np.zeros(8), flat[1]])
+    a, b = fit(*padded([flat])).equidistant(5), fit(*padded([solid])).equidistant(5)
+    assert torch.allclose(b[[0, 2]], a, atol=1e-12)
+    assert b[1].eq(0).all()
+
+
+@steady
+@given(seeds, st.integers(2, SLOTS), st.floats(-3, 3), st.floats(-100, 100))
+def test_splines_move_with_their_points(seed: int, n: int, angle: float, shift: float) -> None:
+    row = separated(seed, n)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for fit in FITS.values():
+        here, there = (fit(*padded([r])).equidistant(6)[..., 0].numpy() for r in (row, turn @ row + shift))
+        assert there == pytest.approx(turn @ here + shift, abs=1e-8)
+
+
+@steady
+@given(seeds, st.integers(2, SLOTS))
+def test_order_reversed_is_the_same_curve_backwards(seed: int, n: int) -> None:
+    row = separated(seed, n)
+    for fit in FITS.values():
+        ahead, back = (fit(*padded([r])).equidistant(6)[..., 0].numpy() for r in (row, row[:, ::-1].copy()))
+        assert back == pytest.approx(ahead[:, ::-1], abs=1e-8)
+
+
+SHAPES = {
+    "identical": lambda i: (0 * i + 3.0, 0 * i - 2.0),
+    "pairs": lambda i: ((i // 2) * 1.3, (i // 2) ** 2 * 0.1),
+    "collinear": lambda i: (i * 0.7, i * -0.3),
+    "there and back": lambda i: (i % 2, 0 * i),
+    "far away": lambda i: (1e3 + (i % 5) * 0.9, -1e3 + i * 0.5),
+    "barely apart": lambda i: (5 + i * 1e-6, 5 - i * 1e-7),
+    "clump and jump": lambda i: (np.where(i < 7, 1e-5 * i, 1e3), 0 * i),
+    "huge": lambda i: (1e3 * np.cos(i), 1e3 * np.sin(i)),
+}
+nasty = st.one_of(
+    st.sampled_from(sorted(SHAPES)).map(lambda name: np.stack(SHAPES[name](np.arange(SLOTS)))),
+    st.lists(
+        st.tuples(*[st.sampled_from([0.0, 1.0, 1 + 1e-7, 1e-30, -2.5, 1e3, 1e3 + 1e-4])] * 2),
+        min_size=SLOTS,
+        max_size=SLOTS,
+    ).map(lambda rows: np.array(rows).T),
+)
+
+
+@settings(steady, max_examples=60)
+@given(nasty, st.sampled_from([0.0, 1e-4, 0.1, 10.0, 1e3]), st.sampled_from([torch.float32, torch.float64]))
+def test_results_and_gradients_are_finite_for_any_points(row: np.ndarray, smoothing: float, dtype) -> None:
+    points = torch.from_numpy(row).to(dtype)[..., None].repeat(1, 1, SLOTS + 1)
+    count = torch.arange(SLOTS + 1)
+    for fit in (lambda *a: smoothing_spline(*a, smoothing), quadratic_spline, least_squares_parabola):
+        leaf = points.clone().requires_grad_()
+        spline = fit(leaf, count)
+        u = torch.linspace(-1, 9, 4, dtype=dtype)[:, None].expand(4, SLOTS + 1)
+        results = (*tensors(spline), spline.sample(u))
+        (gradient,) = torch.autograd.grad(sum(x.sum() for x in results), leaf)
+        assert all(x.isfinite().all() for x in (*results, gradient))
+
+
+@settings(steady, max_examples=60)
+@given(nasty, st.sampled_from([1e-4, 0.1, 10.0]))
+def test_smoothing_stays_near_its_points(row: np.ndarray, smoothing: float) -> None:
+    # The penalised minimum cannot be further off than the points' own spread, however close some of them are.
+    for dtype in (torch.float32, torch.float64):
+        points = torch.from_numpy(row).to(dtype)[..., None]
+        values = smoothing_spline(points, torch.tensor([SLOTS]), smoothing).values
+        spread = (points - points.mean(1, keepdim=True)).square().sum().sqrt()
+        assert (values - points).square().sum().sqrt() <= 1.1 * spread + 1e-2
+
+
+@every_fit
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_gradients_are_exact(fit, n: int) -> None:
+    points, count = padded([separated(4, n), separated(8, n)], slots=6)
+    assert torch.autograd.gradcheck(lambda p: tensors(fit(p, count))[1:], points.requires_grad_())
+    u = torch.tensor([[0.3, 0.2], [0.9, 1.1]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p, v: fit(p, count).sample(v), (points, u))
+
+
+def test_wrong_arguments_are_named() -> None:
+    points, count = random_batch()
+    with pytest.raises(ValueError, match="count"):
+        smoothing_spline(points, count[:3], 0.1)
+    with pytest.raises(ValueError, match="K >= 2"):
+        quadratic_spline(points[:, :1], count)
+    with pytest.raises(ValueError, match="smoothing=-1"):
+        smoothing_spline(points, count, -1)
+    with pytest.raises(ValueError, match="capacity=1"):
+        SelfEvolvingSpline(1, 3, 0.1)
+    with pytest.raises(ValueError, match="mask"):
+        SelfEvolvingSpline(4, 3, 0.1).add(torch.zeros(2, 1, 3), torch.ones(1, 2, dtype=torch.bool))
+
+
+def test_growing_point_by_point_equals_fitting_all_at_once() -> None:
+    points, count = random_batch()
+    path = SelfEvolvingSpline(SLOTS, 37, 0.3, dtype=torch.float64)
+    for k in range(SLOTS):
+        path.add(points[:, k : k + 1], (k < count)[None])
+    for a, b in zip(tensors(path.spline), tensors(smoothing_spline(points, count, 0.3)), strict=True):
+        assert torch.equal(a, b)
+    assert torch.equal(path.query(path.knots), path.spline.sample(path.knots))
+
+
+def test_beyond_capacity_the_oldest_points_go() -> None:
+    points, _ = random_batch()
+    draw = torch.Generator().manual_seed(0)
+    path = SelfEvolvingSpline(5, 37, 0.3, dtype=torch.float64)
+    seen: list[list[Tensor]] = [[] for _ in range(37)]
+    for first, many in ((0, 3), (3, 1), (4, 4), (8, 8)):
+        mask = torch.rand(many, 37, generator=draw) < 0.6
+        path.add(points[:, first : first + many], mask)
+        for row in range(37):
+            seen[row] += [points[:, first + k, row] for k in range(many) if mask[k, row]]
+            kept = seen[row][-5:]
+            assert path.count[row] == len(kept)
+            assert not kept or torch.equal(path.points[:, : len(kept), row], torch.stack(kept, 1))
+
+
+def test_reset_touches_only_masked_rows() -> None:
+    points, count = random_batch()
+    path = SelfEvolvingSpline(SLOTS, 37, 0.3, dtype=torch.float64)
+    path.add(points, torch.arange(SLOTS)[:, None] < count)
+    before = {name: state.clone() for name, state in path.state_dict().items()}
+    gone = torch.arange(37) % 3 == 0
+    path.reset(gone)
+    for name, state in path.state_dict().items():
+        assert state[..., gone].eq(0).all()
+        assert torch.equal(state[..., ~gone], before[name][..., ~gone])
+    path.add(points, (torch.arange(SLOTS)[:, None] < count) & gone)
+    del before["points"]
+    assert all(torch.equal(path.state_dict()[name], state) for name, state in before.items())
+
+
+def test_state_dict_holds_everything_and_old_splines_stay() -> None:
+    points, count = random_batch()
+    path, copy = (SelfEvolvingSpline(SLOTS, (37,), 0.3, dtype=torch.float64) for _ in range(2))
+    path.add(points[:, :4], torch.ones(4, 37, dtype=torch.bool))
+    copy.load_state_dict(path.state_dict())
+    old, frozen = path.spline, path.spline.equidistant(5)
+    for each in (path, copy):
+        each.add(points[:, 4:], torch.arange(4, SLOTS)[:, None] < count)
+    assert torch.equal(path.spline.equidistant(5), copy.spline.equidistant(5))
+    assert torch.equal(old.equidistant(5), frozen)

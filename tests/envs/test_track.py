@@ -1,0 +1,113 @@
+"""Tracks: their geometry, and that what cannot be driven is refused in one sentence."""
+
+import numpy as np
+import pytest
+
+from coil_rl.envs.track import Track, TrackError
+
+TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
+
+
+def ring(**changes):
+    """A ring between circles of 9 and 11 m, driven anticlockwise."""
+    return Track(**({"name": "ring", "left": 9 * CIRCLE, "right": 11 * CIRCLE} | changes))
+
+
+def refusal(call, *args, **kwargs):
+    with pytest.raises(TrackError) as caught:
+        call(*args, **kwargs)
+    message = str(caught.value)
+    assert message.endswith(".")
+    assert "\n" not in message
+    return message
+
+
+def test_car_starts_between_the_last_cones_heading_for_the_finish():
+    track = ring()
+    assert track.finish == pytest.approx([10, 0])
+    x, y, heading = track.start
+    assert (x, y) == pytest.approx((10 * np.cos(TURN[-1]), 10 * np.sin(TURN[-1])))
+    assert heading == pytest.approx(np.arctan2(-y, 10 - x))
+
+
+def test_start_that_is_given_is_kept():
+    assert ring(start=(0, -10, 0)).start == (0.0, -10.0, 0.0)
+
+
+def test_boundary_of_a_circle_is_that_circle():
+    points = ring().boundary("left", spacing=0.1)
+    assert points[0] == pytest.approx([9, 0])
+    assert np.linalg.norm(points, axis=1) == pytest.approx(9, abs=1e-3)
+    gaps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+    assert gaps.max() < 0.101
+    assert gaps.min() > 0.09
+
+
+def test_boundary_passes_through_every_cone():
+    track = ring()
+    gaps = np.linalg.norm(track.boundary("right", 0.01)[:, None] - track.right, axis=2).min(axis=0)
+    assert gaps.max() < 0.01
+
+
+def test_length_is_that_of_the_centre_line():
+    assert ring().length == pytest.approx(20 * np.pi, rel=1e-3)
+
+
+def test_cones_cannot_be_changed_afterwards():
+    track = ring()
+    with pytest.raises(ValueError, match="read-only"):
+        track.left[0] = 0
+
+
+def test_track_keeps_its_own_copy_of_the_cones():
+    left = 9 * CIRCLE
+    track = ring(left=left)
+    left[0] = 100
+    assert track.left[0] == pytest.approx([9, 0])
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_either_direction_is_driven(reverse):
+    inner, outer = 9 * CIRCLE, 11 * CIRCLE
+    track = ring(left=outer[::-1], right=inner[::-1]) if reverse else ring()
+    assert track.length == pytest.approx(20 * np.pi, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"left": 9 * CIRCLE[:3]}, "left side of track 'ring' has 3 cones"),
+        ({"right": 11 * np.ones((8, 3))}, "right side of track 'ring' has 8 cones, of shape [8, 3]"),
+        ({"left": np.where(np.arange(32)[:, None] == 5, np.nan, 9 * CIRCLE)}, "Cone 5 of the left side"),
+        ({"right": 11_000 * CIRCLE}, "at most 10000 from the origin"),
+        ({"left": np.vstack([9 * CIRCLE, 9 * CIRCLE[:1]])}, "Cones 32 and 0 of the left side"),
+        ({"left": 9 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]}, "The left side crosses itself near"),
+        ({"right": 11 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]}, "The right side crosses itself near"),
+        ({"left": 9 * CIRCLE + [3, 0]}, "The two sides cross each other near"),
+        ({"left": 11 * CIRCLE, "right": 9 * CIRCLE}, "swap LEFT and RIGHT"),
+        ({"left": 9 * CIRCLE[::-1]}, "list both sides in driving order"),
+        ({"left": 9 * CIRCLE + [50, 0]}, "not on the left of its driving direction"),
+        ({"start": (0, 0, 0)}, "The start of track 'ring' at [0.0, 0.0] is not between its two sides"),
+        ({"right": 11 * np.roll(CIRCLE, 16, axis=0)}, "list both sides from the same place on"),
+        ({"start": (10, 0, np.inf)}, "three finite numbers"),
+        ({"start": (10, 0)}, "three finite numbers"),
+    ],
+)
+def test_track_that_cannot_be_driven_is_refused(changes, words):
+    assert words in refusal(ring, **changes)
+
+
+def test_curves_count_and_not_the_polygons_through_the_cones():
+    # The curve through four corners is nearly a circle, and bulges through the straight edges of the larger square.
+    corners = np.array([[5, -5], [5, 5], [-5, 5], [-5, -5.0]])
+    edge = np.stack([np.full(12, 6.0), np.arange(-6.0, 6.0)], axis=1)
+    quarter = np.array([[0, 1], [-1, 0]])
+    larger = np.vstack([edge @ np.linalg.matrix_power(quarter, turns) for turns in range(4)])
+    assert "The two sides cross each other" in refusal(Track, "square", corners, larger)
+
+
+@pytest.mark.parametrize("arguments", [("middle", 0.1), ("left", 0), ("left", float("nan"))])
+def test_boundary_refuses_what_makes_no_sense(arguments):
+    with pytest.raises(ValueError, match=r"There is no side|above 0"):
+        ring().boundary(*arguments)

@@ -1,0 +1,273 @@
+"""A second opinion on the cone world: one car, plain NumPy and SciPy, loops and all.
+
+Written from the description of the simulation, sharing no code with `coil_rl.envs`, so that the batched env and this
+file can only agree by both being right. It is slow on purpose: every step looks at every cone of the track.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.linalg import cholesky, solve_triangular
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Curve = Callable[[Array], Array]
+
+MAX_STEERING = np.deg2rad(80)
+SIGHT = 7.0
+HALF_FIELD_OF_VIEW = np.deg2rad(60)
+KEPT_CONES = 16
+SAMPLES = 5
+FINISH_RADIUS = 0.625
+TARGET_REACHED = 0.625
+PAIR_DISTANCE = 4.0
+CONE_RADIUS = 0.4
+BOUNDARY_MARGIN = 0.25
+RECENT = np.exp(-0.1 * np.arange(20)) / np.exp(-0.1 * np.arange(20)).sum()
+
+
+def merge(points: Array) -> tuple[Array, Array]:
+    """Consecutive points less than a micrometre apart become one point that weighs as much as they did."""
+    first = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=1) >= 1e-6])
+    return points[first], np.bincount(np.cumsum(first) - 1).astype(float)
+
+
+def chord_length(points: Array) -> Array:
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+
+
+def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
+    """The natural cubic smoothing spline by chord length: its parameters at the points and a function of it.
+
+    Solved as what it is, the least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second
+    derivatives R^-1 Q' f at the inner points the integral is |L^-1 Q' f|^2, where R = L L'.
+    """
+    points, weights = merge(points)
+    u = chord_length(points)
+    if len(points) <= 2:
+        return u, lambda at: points[0] + np.multiply.outer(at, (points[-1] - points[0]) / max(u[-1], 1e-12))
+    h = np.diff(u)
+    n = len(u)
+    second = np.zeros((n - 2, n))
+    row = np.arange(n - 2)
+    second[row, row], second[row, row + 1], second[row, row + 2] = 1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]
+    gram = np.diag((h[:-1] + h[1:]) / 3) + np.diag(h[1:-1] / 6, 1) + np.diag(h[1:-1] / 6, -1)
+    rough = np.sqrt(smoothing) * solve_triangular(cholesky(gram, lower=True), second, lower=True)
+    root = np.sqrt(weights)[:, None]
+    wanted = np.vstack([root * points, np.zeros((n - 2, 2))])
+    values = np.linalg.lstsq(np.vstack([np.diag(root[:, 0]), rough]), wanted)[0]
+    return u, CubicSpline(u, values, bc_type="natural")
+
+
+def fit_quadratic(points: Array) -> tuple[Array, Curve]:
+    """The interpolating quadratic spline by chord length, a line for two points."""
+    u = chord_length(points)
+    return u, make_interp_spline(u, points, k=1 if len(points) == 2 else 2)
+
+
+def fit_parabola(points: Array) -> tuple[Array, Curve]:
+    """The least-squares parabola by chord length, a line for two points."""
+    u = chord_length(points)
+    degree = 1 if len(points) == 2 else 2
+    fits = [np.polynomial.Polynomial.fit(u, points[:, axis], degree) for axis in range(2)]
+    return u, lambda at: np.stack([fit(at) for fit in fits], axis=-1)
+
+
+def to_car(pose: Array, points: Array) -> Array:
+    x, y = (points - pose[:2]).T
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return np.stack([cos * x + sin * y, -sin * x + cos * y], axis=1)
+
+
+def midpoints(left: Array, right: Array) -> Array:
+    """Midpoints of close left-right pairs, nearest first."""
+    middle = (left[:, None] + right) / 2
+    middle = middle[np.linalg.norm(left[:, None] - right, axis=-1) < PAIR_DISTANCE]
+    return middle[np.argsort(np.linalg.norm(middle, axis=1), kind="stable")]
+
+
+def guide_action(
+    left: Array, right: Array, steering: float, *, spline: str = "cubic", smoothing: float = 1.0, gain: float = 1.0
+) -> float:
+    """Appendix A.1 on the visible cones (car frame, nearest first): the advice as a fraction of 80 degrees."""
+    points = midpoints(left, right)
+    if len(points) < 2:
+        return steering
+    u, curve = fit_cubic(points, smoothing) if spline == "cubic" else fit_parabola(points)
+    length = np.linalg.norm(np.diff(curve(u), axis=0), axis=1).sum()
+    targets = curve(np.linspace(0, u[-1], 1 + max(1, round(length))))
+    distance = np.linalg.norm(targets, axis=1)
+    angle = np.arctan2(targets[:, 1], targets[:, 0])
+    wanted = (distance > TARGET_REACHED) & (np.abs(angle) <= HALF_FIELD_OF_VIEW)
+    if not wanted.any():
+        return steering
+    best = np.flatnonzero(wanted)[np.argmin(distance[wanted])]
+    degrees = 160 / np.pi * np.arctan(np.rad2deg(angle[best]) / distance[best] ** 1.8)
+    return gain * float(np.clip(degrees, -80, 80)) / 80
+
+
+class Outcome(NamedTuple):
+    """What a step led to."""
+
+    observation: Array
+    terms: dict[str, float]
+    lap: int
+    lap_time: float
+    crashed: bool
+    clearance: float
+    smoothness: float
+    terminated: bool
+    truncated: bool
+
+    @property
+    def reward(self) -> float:
+        return sum(self.terms.values())
+
+
+@dataclass
+class OneCar:
+    """One car on one track."""
+
+    left: Array
+    right: Array
+    start: tuple[float, float, float]
+    rate: float = 24.0
+    spline: str = "cubic"
+    smoothing: float = 0.1
+    cone_bonus: str = "first_sighting"
+    held_steps: int = 0
+    time_limit: float = 200.0
+    laps: int = 2
+    speed: float = 2.0
+    car_length: float = 2.0
+    history: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.rings = (self.left, self.right)
+        self.finish = (self.left[0] + self.right[0]) / 2
+        curves = []
+        for ring in self.rings:
+            closed = np.vstack([ring, ring[:1]])
+            u = chord_length(closed)
+            # At a quarter of a metre, points 2 mm apart are a curve to within 2 micrometres.
+            curves.append(CubicSpline(u, closed, bc_type="periodic")(np.arange(0, u[-1], 0.002)))
+        self.boundary = cKDTree(np.vstack(curves))
+        self.reset()
+
+    def reset(self) -> Array:
+        self.pose = np.array(self.start, dtype=float)
+        self.history = []
+        self.steps = 0
+        self.lap = 0
+        self.clock: int | None = None
+        self.on_line = False
+        self.paid: list[set[int]] = [set(), set()]
+        self.before: list[set[int]] = [set(), set()]
+        self.samples: list[Array | None] = [None, None]
+        self.look()
+        return self.observe()
+
+    def look(self) -> None:
+        """Which cones of each side are in sight, nearest first."""
+        self.seen: list[list[int]] = []
+        for ring in self.rings:
+            local = to_car(self.pose, ring)
+            distance = np.linalg.norm(local, axis=1)
+            angle = np.arctan2(local[:, 1], local[:, 0])
+            visible = np.flatnonzero((distance <= SIGHT) & (np.abs(angle) <= HALF_FIELD_OF_VIEW))
+            self.seen.append([int(i) for i in visible[np.argsort(distance[visible])][:KEPT_CONES]])
+
+    def cones(self) -> tuple[Array, Array]:
+        left, right = (to_car(self.pose, ring[seen]) for ring, seen in zip(self.rings, self.seen, strict=True))
+        return left, right
+
+    @property
+    def steering(self) -> float:
+        return self.history[-1] if self.history else 0.0
+
+    def observe(self) -> Array:
+        parts = []
+        for side, (ring, seen) in enumerate(zip(self.rings, self.seen, strict=True)):
+            if len(seen) >= 2:
+                fit = fit_cubic(ring[seen], self.smoothing) if self.spline == "cubic" else fit_quadratic(ring[seen])
+                u, curve = fit
+                self.samples[side] = curve(np.linspace(0, u[-1], SAMPLES))
+            samples = self.samples[side]
+            if samples is None:
+                parts.append(np.zeros(2 * SAMPLES))
+                continue
+            local = to_car(self.pose, samples)
+            distance = np.linalg.norm(local, axis=1)
+            degrees = np.rad2deg(np.arctan2(local[:, 1], local[:, 0]))
+            both = np.stack([2 * distance / SIGHT - 1, degrees / 120], axis=1)
+            parts.append(np.clip(both, -1, 1).ravel())
+        return np.concatenate(parts)
+
+    def step(self, action: float) -> Outcome:
+        if self.steps < self.held_steps:
+            action = 0.0
+        action = float(np.clip(action, -1, 1))
+        newest_first = (self.history[:-21:-1] + [0.0] * 20)[:20]
+        roughness = abs(action - float(RECENT @ newest_first))
+
+        x, y, heading = self.pose
+        dt = 1 / self.rate
+        x += self.speed * np.cos(heading) * dt
+        y += self.speed * np.sin(heading) * dt
+        heading += self.speed / self.car_length * np.sin(action * MAX_STEERING) * dt
+        self.pose = np.array([x, y, heading])
+        self.history.append(action)
+        self.steps += 1
+
+        inside = bool(np.linalg.norm(self.pose[:2] - self.finish) < FINISH_RADIUS)
+        entered = inside and not self.on_line
+        self.on_line = inside
+        lap_time = 0.0
+        if entered:
+            if self.clock is not None:
+                lap_time = (self.steps - self.clock) * dt
+                self.lap += 1
+            self.clock = self.steps
+
+        self.look()
+        cone_sides = 0
+        for side in range(2):
+            now = set(self.seen[side])
+            if lap_time:
+                self.paid[side] = set()
+            known = self.paid[side] if self.cone_bonus == "first_sighting" else self.before[side]
+            cone_sides += bool(now - known)
+            self.paid[side] |= now
+            self.before[side] = now
+
+        to_cone = np.linalg.norm(np.vstack(self.rings) - self.pose[:2], axis=1).min()
+        to_boundary = self.boundary.query(self.pose[:2])[0]
+        clearance = float(min(to_cone - CONE_RADIUS, to_boundary - BOUNDARY_MARGIN))
+        crashed = clearance <= 0
+        terms = {
+            "finish": 70 - 0.8 * lap_time if lap_time else 0.0,
+            "crash": 0.0,
+            "cone": 2.5 * cone_sides,
+            "smooth": -0.1 * roughness,
+            "alive": 0.001,
+        }
+        if crashed:
+            terms = dict.fromkeys(terms, 0.0) | {"crash": -100.0}
+        terminated = crashed or self.lap >= self.laps
+        return Outcome(
+            observation=self.observe(),
+            terms=terms,
+            lap=self.lap,
+            lap_time=lap_time,
+            crashed=crashed,
+            clearance=clearance,
+            smoothness=roughness,
+            terminated=terminated,
+            truncated=not terminated and self.steps >= round(self.time_limit * self.rate),
+        )

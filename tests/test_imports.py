@@ -1,0 +1,121 @@
+import ast
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+LINKED = {"envs": "coil_rl.envs", "transforms": "coil_rl.transforms", "conf": "coil_rl.conf"}
+TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
+
+# Folder -> what its files may import beside the standard library and the folder itself.
+ALLOWED = {
+    "transforms": TENSOR_LIBRARIES,
+    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap"},
+    "conf": set(),
+}
+
+
+def source_files(folder: str) -> list[Path]:
+    # The links coil_rl/envs, ... lead to folders that are walked under their own name.
+    linked = [ROOT / "coil_rl" / name for name in LINKED]
+    found = (ROOT / folder).rglob("*.py")
+    return sorted(path for path in found if not any(path.is_relative_to(link) for link in linked))
+
+
+def package_of(path: Path) -> list[str]:
+    """The dotted package a file's relative imports start from: envs/robot/bag.py -> coil_rl, envs, robot."""
+    folder, *rest = path.relative_to(ROOT).parent.parts
+    return [*LINKED.get(folder, folder).split("."), *rest]
+
+
+def imported_modules(source: str, package: list[str]) -> Iterator[str]:
+    """Every module a source imports, anywhere in it, as an absolute dotted name.
+
+    `from a import b` gives `a.b`, for b may be a module; whoever compares prefixes need not know.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            start = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*start, *filter(None, [node.module])])
+            yield from (f"{stem}.{alias.name}" for alias in node.names)
+
+
+def is_inside(module: str, package: str) -> bool:
+    return module == package or module.startswith(package + ".")
+
+
+def forbidden_imports(source: str, package: list[str], folder: str) -> list[str]:
+    """The imports of one source of `transforms/`, `envs/` or `conf/` that its folder may not make."""
+    libraries = ALLOWED[folder] | sys.stdlib_module_names
+    return [
+        module
+        for module in imported_modules(source, package)
+        if module.split(".")[0] not in libraries and not is_inside(module, LINKED[folder])
+    ]
+
+
+@pytest.mark.parametrize("folder", ALLOWED)
+def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
+    wrong = {
+        str(path.relative_to(ROOT)): bad
+        for path in source_files(folder)
+        if (bad := forbidden_imports(path.read_text(encoding="utf-8"), package_of(path), folder))
+    }
+    assert not wrong, f"{folder}/ may import only {sorted(ALLOWED[folder])}, the standard library and itself"
+
+
+@pytest.mark.parametrize("folder", ["coil_rl", "tests", *LINKED])
+def test_nobody_imports_the_folders_by_their_bare_names(folder: str) -> None:
+    # `import envs` would load a second copy of the package, with classes that are not the first one's.
+    wrong = [
+        f"{path.relative_to(ROOT)}: {module}"
+        for path in source_files(folder)
+        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path))
+        if module.split(".")[0] in LINKED
+    ]
+    assert not wrong, "write coil_rl.envs, coil_rl.transforms, coil_rl.conf"
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("import torch.nn, math\nfrom tensordict import TensorDict", []),
+        ("from coil_rl.envs.track import Track\nfrom .track import Track\nfrom . import track", []),
+        ("from coil_rl.transforms import GuideActions", ["coil_rl.transforms.GuideActions"]),
+        ("from .. import transforms", ["coil_rl.transforms"]),
+        ("def f():\n    from ..learners.ppo import PPO", ["coil_rl.learners.ppo.PPO"]),
+        ("from coil_rl import build", ["coil_rl.build"]),
+        ("import envs.track", ["envs.track"]),
+        ("import hydra", ["hydra"]),
+    ],
+)
+def test_forbidden_imports_are_found_however_they_are_written(source: str, expected: list[str]) -> None:
+    assert forbidden_imports(source, ["coil_rl", "envs"], "envs") == expected
+
+
+def test_package_list_is_the_folders_with_an_init() -> None:
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    files = [path for folder in ["coil_rl", *LINKED] for path in source_files(folder)]
+    inits = [path for path in files if path.name == "__init__.py"]
+    folders = {".".join(package_of(path)): path.parent.relative_to(ROOT).as_posix() for path in inits}
+    assert sorted(setuptools["packages"]) == sorted(folders)
+
+    def mapped(package: str) -> str:
+        """Where setuptools looks: the longest listed prefix's folder, then the rest of the name."""
+        parts, rest = package.split("."), []
+        while parts and ".".join(parts) not in setuptools["package-dir"]:
+            rest.insert(0, parts.pop())
+        return "/".join([setuptools["package-dir"][".".join(parts)], *rest])
+
+    assert {package: mapped(package) for package in folders} == folders
+
+
+def test_every_folder_with_python_in_it_is_a_package() -> None:
+    # A forgotten __init__.py works in the checkout and is missing from the wheel.
+    folders = {path.parent for folder in ["coil_rl", *LINKED] for path in source_files(folder)}
+    assert [str(path.relative_to(ROOT)) for path in folders if not (path / "__init__.py").is_file()] == []

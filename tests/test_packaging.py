@@ -1,0 +1,108 @@
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+LINKS = ["envs", "transforms", "conf"]
+
+
+def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
+    env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    if pythonpath:
+        env["PYTHONPATH"] = str(pythonpath)
+    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the sources as Git checks them out where links do not exist: small text files in their place.
+
+    One nested YAML and one track are planted, so that the globs are tried whatever the project ships today.
+    """
+    tree = tmp_path_factory.mktemp("packaging") / "tree"
+    ignore = shutil.ignore_patterns(
+        ".*", "build", "dist", "outputs", "*.egg-info", "__pycache__", "site", "node_modules"
+    )
+    shutil.copytree(ROOT, tree, symlinks=True, ignore=ignore)
+    for name in LINKS:
+        link = tree / "coil_rl" / name
+        link.unlink(missing_ok=True)
+        link.write_text(f"../{name}")
+    for planted in ["conf/planted.yaml", "conf/a/b/planted.yaml", "envs/tracks/a/planted.csv"]:
+        (tree / planted).parent.mkdir(parents=True, exist_ok=True)
+        (tree / planted).write_text("")
+    return tree
+
+
+@pytest.fixture(scope="module")
+def wheel(tree: Path) -> Path:
+    run(sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", "..", cwd=tree)
+    [wheel] = tree.parent.glob("*.whl")
+    return wheel
+
+
+@pytest.fixture(scope="module")
+def installed(wheel: Path) -> Path:
+    target = wheel.parent / "installed"
+    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--target", target]
+    run(*pip, wheel, cwd=wheel.parent)
+    return target
+
+
+def test_wheel_holds_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
+    patterns = {"coil_rl": ["*.py", "py.typed"], "envs": ["*.py", "tracks/**/*.csv"]}
+    patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"]}
+    expected = {
+        (path.relative_to(tree) if folder == "coil_rl" else "coil_rl" / path.relative_to(tree)).as_posix()
+        for folder, globs in patterns.items()
+        for glob in globs
+        for path in (tree / folder).rglob(glob)
+    }
+    names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert names == expected
+    assert {"coil_rl/py.typed", "coil_rl/conf/a/b/planted.yaml", "coil_rl/envs/tracks/a/planted.csv"} <= names
+
+
+def test_wheel_takes_one_import_name_only(wheel: Path) -> None:
+    top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
+
+
+def test_installed_wheel_imports_from_another_folder(installed: Path, tmp_path: Path) -> None:
+    program = """
+import importlib.resources
+import coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms
+for module in (coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms):
+    print(module.__file__)
+print(importlib.resources.files("coil_rl.conf").joinpath("a", "b", "planted.yaml"))
+"""
+    lines = run(sys.executable, "-c", program, cwd=tmp_path, pythonpath=installed).splitlines()
+    outside = [line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())]
+    assert (len(lines), outside) == (5, [])
+    assert all(Path(line).is_file() for line in lines)
+
+
+def test_every_dependency_has_one_exact_version_in_its_range() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines if not line.startswith("#"))
+    pins = {canonicalize_name(name): version for name, version in pins.items()}
+    extras = [text for extra in project["optional-dependencies"].values() for text in extra]
+    requirements = [Requirement(text) for text in [*project["dependencies"], *extras]]
+    wrong = [
+        str(requirement)
+        for requirement in requirements
+        if requirement.name != project["name"]
+        and not requirement.specifier.contains(pins.get(canonicalize_name(requirement.name), "0"))
+    ]
+    assert not wrong, "constraints.txt has no version, or one out of range, for these"

@@ -1,0 +1,118 @@
+"""COIL: the actions that guides would take, as one more observation (paper section 3, equation 97)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
+from torchrl.envs import Transform
+
+
+class GuideActions(Transform):
+    """Asks each guide what it would do and writes the answers next to the observation.
+
+    The agent is free to use them: nothing ties its action to them. A guide is any TensorDictModule that reads what the
+    env writes and writes an action; it runs without gradients, on its own copy of the data, so that nothing but its
+    action gets through.
+
+    Where the env's actions are numbers of a finite set (`Categorical`), the advice is one-hot.
+
+    Args:
+        guides: the guides by name, in the order of the rows they write.
+        action_key: the entry that the guides write.
+        out_key: where the advice goes, [*batch, n_guides, A], in action units.
+
+    Raises:
+        ValueError: without a guide, or if one does not write `action_key`.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> from coil_rl.guides import SplineGuide
+        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")), GuideActions({"middle": SplineGuide()}))
+        >>> env.reset()["guide_action"].shape
+        torch.Size([64, 1, 1])
+    """
+
+    def __init__(
+        self,
+        guides: Mapping[str, TensorDictModuleBase],
+        action_key: NestedKey = "action",
+        out_key: NestedKey = "guide_action",
+    ) -> None:
+        if not guides:
+            raise ValueError("GuideActions needs at least one guide, none was given")
+        for name, guide in guides.items():
+            if action_key not in guide.out_keys:
+                raise ValueError(f"guide {name!r} must write {action_key!r}; it writes {guide.out_keys}")
+        in_keys = dict.fromkeys(key for guide in guides.values() for key in guide.in_keys)
+        super().__init__(in_keys=list(in_keys), out_keys=[out_key])
+        self.guides = nn.ModuleDict(guides)
+        self._reads = {name: guide.in_keys for name, guide in guides.items()}
+        self.action_key = action_key
+        # Asking the env costs as much as a step, so it is asked once.
+        self._choices: int | None = None
+
+    @property
+    def names(self) -> list[str]:
+        """The guides' names, one per row of the advice."""
+        return list(self.guides)
+
+    @torch.no_grad()
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return next_tensordict.set(self.out_keys[0], self._advice(next_tensordict))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        mask = tensordict.get("_reset", None)
+        if mask is None or mask.all():
+            return self._call(tensordict_reset)
+        # The other rows are thrown away, and in a large batch nearly every step resets a few.
+        rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
+        with torch.no_grad():
+            advice = self._advice(tensordict_reset.select(*self.in_keys, strict=False)[rows])
+        everything = advice.new_zeros((*tensordict_reset.batch_size, *advice.shape[1:]))
+        return tensordict_reset.set(self.out_keys[0], everything.index_put(rows, advice))
+
+    def _advice(self, tensordict: TensorDictBase) -> Tensor:
+        """[*batch, n_guides, A]."""
+        if self._choices is None:
+            self._choices = _choices(self._action_spec())
+        rows = []
+        for name, guide in self.guides.items():
+            action = guide(tensordict.select(*self._reads[name], strict=False))[self.action_key]
+            if self._choices:
+                action = F.one_hot(action.reshape(tensordict.batch_size).long(), self._choices)
+            rows.append(action if action.dtype.is_floating_point else action.float())
+        return torch.stack(rows, tensordict.batch_dims)
+
+    def _action_spec(self) -> TensorSpec:
+        if self.parent is None:
+            raise RuntimeError("GuideActions gives advice inside a TransformedEnv only: it needs the env's action spec")
+        return self.parent.full_action_spec[self.action_key]
+
+    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+        """Add the advice: bounded like the action, and within 0 and 1 where it is one-hot."""
+        spec = self._action_spec()
+        batch = self.parent.batch_size
+        size = _choices(spec) or spec.shape[-1]
+        shape = (*batch, len(self.guides), size)
+        dtype = spec.dtype if spec.dtype.is_floating_point else torch.float32
+        advice: TensorSpec = Unbounded(shape, device=spec.device, dtype=dtype)
+        if not spec.dtype.is_floating_point:
+            advice = Bounded(0, 1, shape, device=spec.device, dtype=dtype)
+        elif isinstance(spec, Bounded):
+            low, high = (bound.unsqueeze(len(batch)).expand(shape) for bound in (spec.space.low, spec.space.high))
+            advice = Bounded(low, high, shape, device=spec.device, dtype=dtype)
+        observation_spec[self.out_keys[0]] = advice
+        return observation_spec
+
+
+def _choices(spec: TensorSpec) -> int:
+    """How many choices a `Categorical` action has; 0 for actions that are already vectors."""
+    return spec.n if isinstance(spec, Categorical) else 0
