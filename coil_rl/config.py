@@ -55,7 +55,6 @@ class Train(Common):
 
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
-    experiment: str | None = None
     watch: dict[str, Any] = field(default_factory=dict)
     checkpoint_every: int = 10
 

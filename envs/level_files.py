@@ -7,6 +7,7 @@ import io
 import os
 import re
 from collections.abc import Iterator, Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Literal
@@ -78,11 +79,17 @@ def shipped_tracks(split: Split) -> list[Track]:
     """The project's own tracks: seven to "train" on, three to "test" on, or "all" ten."""
     if split not in ("train", "test", "all"):
         raise ValueError(f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'.")
+    return list(_shipped(split))
+
+
+# Tracks cannot be changed, so everybody may have the same ones.
+@cache
+def _shipped(split: Split) -> tuple[Track, ...]:
     tracks: list[Track] = []
     for part in ("train", "test") if split == "all" else (split,):
         with resources.as_file(resources.files("coil_rl.envs") / "tracks" / part) as folder:
             tracks += load_tracks(folder)
-    return tracks
+    return tuple(tracks)
 
 
 def _read_text(path: Path) -> str:

@@ -52,6 +52,16 @@ def to_world(pose: Tensor, points: Tensor) -> Tensor:
     return torch.stack([torch.addcmul(cos * x, sin, y, value=-1) + pose[0], torch.addcmul(cos * y, sin, x) + pose[1]])
 
 
+def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Distance and angle from the x axis in rad, as `hypot` and `atan2` have them, but for 0 at the origin.
+
+    On a CPU those two round differently at the end of a tensor, and a car would depend on how many others there are.
+    """
+    distance = torch.addcmul(x * x, y, y).sqrt_()
+    acute = (y / (distance + x.abs()).clamp_(min=torch.finfo(x.dtype).tiny)).atan_() * 2
+    return distance, torch.where(x < 0, torch.full_like(y, math.pi).copysign_(y) - acute, acute)
+
+
 def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> View:
     """Sort out which cones are in sight: at most `sight` m away and `half_field_of_view` to either side.
 
@@ -95,10 +105,8 @@ def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
     Returns:
         [B, 20]: r1, theta1, ..., r10, theta10, left side first.
     """
-    x, y = samples
-    distance = torch.hypot(x, y) * (2 / sight) - 1
-    angle = torch.atan2(y, x) * (1 / WIDEST_ANGLE)
-    both = torch.stack([distance, angle]).clamp_(-1, 1) * known
+    distance, angle = polar(*samples)
+    both = torch.stack([distance * (2 / sight) - 1, angle * (1 / WIDEST_ANGLE)]).clamp_(-1, 1) * known
     return both.permute(3, 2, 1, 0).reshape(known.shape[-1], -1)
 
 

@@ -8,6 +8,7 @@ here, lengths are in m and curvatures in 1/m.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,12 @@ def write_shipped_tracks(folder: str | Path) -> None:
 def _draw(seed: int, k: int, name: str) -> Track:
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"The seed of a random track is a whole number from 0 on, not {seed!r}.")
+    return _search(int(seed), k, name)
+
+
+# Tracks cannot be changed, so everybody may have the same ones.
+@lru_cache(maxsize=256)
+def _search(seed: int, k: int, name: str) -> Track:
     rng = np.random.default_rng([seed, k])
     # Drawn once for all tries: short laps pass more easily and would otherwise crowd out the long ones.
     lap = rng.uniform(*LAP)

@@ -8,6 +8,7 @@ the distance to the nearest boundary. A step then reads a few numbers per car.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -124,13 +125,10 @@ class TrackMap(nn.Module):
         self._list_candidates(rings, sight, half_field_of_view)
         self.fine = Grid(lows, highs, field_cell, dtype)
         field = [
-            [
-                cKDTree(track.boundary(side, 0.02)).query(nodes, distance_upper_bound=FAR, workers=-1)[0]
-                for side in ("left", "right")
-            ]
-            for track, nodes in zip(tracks, map(self.fine.nodes, range(len(tracks))), strict=True)
+            _boundary_distances(track, tuple(lows[index].tolist()), tuple(highs[index].tolist()), field_cell, dtype)
+            for index, track in enumerate(tracks)
         ]
-        self._keep("field", np.minimum(np.concatenate(field, axis=1), FAR).T, dtype)
+        self._keep("field", np.concatenate(field), dtype)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -217,11 +215,25 @@ class TrackMap(nn.Module):
         return self.cones.index_select(1, index).view(2, *slot.shape)
 
 
+# A program builds the same tracks into several envs, and this is the slowest part of building.
+@lru_cache(maxsize=64)
+def _boundary_distances(
+    track: Track, low: tuple[float, float], high: tuple[float, float], cell: float, dtype: torch.dtype
+) -> NDArray[np.float64]:
+    """Distance of each grid node of one track from its left and its right boundary, at most FAR: [nodes, 2] m."""
+    nodes = Grid(np.array([low]), np.array([high]), cell, dtype).nodes(0)
+    trees = [cKDTree(track.boundary(side, 0.02)) for side in ("left", "right")]
+    distances = [tree.query(nodes, distance_upper_bound=FAR, workers=-1)[0] for tree in trees]
+    return np.minimum(np.stack(distances, axis=1), FAR)
+
+
 def _columns(mask: NDArray[np.bool_], padding: int) -> NDArray[np.int64]:
     """The places of each last row's True entries, ascending, padded to the longest: [..., N] to [..., most]."""
-    columns = np.full((*mask.shape[:-1], max(1, int(mask.sum(axis=-1).max()))), padding)
+    counts = mask.sum(axis=-1)
+    columns = np.full((*mask.shape[:-1], max(1, int(counts.max()))), padding)
     *row, column = np.nonzero(mask)
-    columns[(*row, (np.cumsum(mask, axis=-1) - 1)[mask])] = column
+    first = np.cumsum(counts) - counts.ravel()
+    columns[(*row, np.arange(len(column)) - np.repeat(first, counts.ravel()))] = column
     return columns
 
 

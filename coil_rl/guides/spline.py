@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from functools import partial
+from functools import partial, reduce
 from typing import Any, Literal
 
 import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
+from coil_rl.envs.sight import polar
 from coil_rl.envs.splines import least_squares_parabola, smoothing_spline
 
 PAIR_DISTANCE = 4.0
@@ -34,8 +35,6 @@ class SplineSteering(nn.Module):
         midpoints: room for so many midpoints.
         targets: room for so many targets along the path.
     """
-
-    reduce: Tensor
 
     def __init__(
         self,
@@ -68,10 +67,10 @@ class SplineSteering(nn.Module):
         """
         points, count = self._midpoints(cones, cone_count)
         target, found = self._target(points, count)
-        x, y = target
-        distance = torch.hypot(x, y).clamp(min=TARGET_REACHED)
-        degrees = torch.atan2(y, x) * (180 / math.pi)
-        advice = (degrees * distance**-self.sharpness).atan() * (2 * self.max_steering / math.pi)
+        distance, angle = polar(*target)
+        # As exp and log, because a power rounds differently at the end of a tensor.
+        sharp = (distance.clamp(min=TARGET_REACHED).log() * -self.sharpness).exp()
+        advice = (angle * (180 / math.pi) * sharp).atan() * (2 * self.max_steering / math.pi)
         advice = advice.clamp(-self.max_steering, self.max_steering) * (self.gain / self.max_steering)
         return torch.where(found, advice, steering.squeeze(-1)).unsqueeze(-1)
 
@@ -96,7 +95,9 @@ class SplineSteering(nn.Module):
         """The nearest target that is ahead and not reached: [2, B] m, and whether there is one [B]."""
         path = self.fit(points, count)
         knots = path.values
-        length = (knots[:, 1:] - knots[:, :-1]).square().sum(0).sqrt().sum(0)
+        chords = (knots[:, 1:] - knots[:, :-1]).square().sum(0).sqrt()
+        # Not `Tensor.sum`, which adds in an order that depends on the size of the batch.
+        length = reduce(torch.add, chords.unbind(0))
         steps = (length / TARGET_SPACING).round().clamp(1, self.targets - 1)
         number = torch.arange(self.targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
         x, y = path.sample(path.length * (number / steps).clamp(max=1))

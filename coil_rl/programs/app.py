@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Callable
@@ -19,6 +20,7 @@ from coil_rl.errors import UserError
 def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task under Hydra; exit code 2 and one sentence on standard error for a mistake in what was given."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     wrapped = hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(task)
     try:
         wrapped()

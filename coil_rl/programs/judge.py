@@ -50,7 +50,7 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     drives: dict[str, Drive] = {}
-    with tqdm(unit="step", desc="evaluate", leave=False) as bar:
+    with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         for driver, actions, policy, repeats in plan:
             bar.set_postfix_str(f"{driver}, {actions}")
             overrides: Mapping[str, Any] = {**config.evaluation.env, "num_cars": repeats * len(tracks)}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
 
 from coil_rl import checkpoint
 from coil_rl.build import build, build_env, build_guide
@@ -50,7 +51,7 @@ def learn(config: DictConfig, folder: Path) -> torch.nn.Module:
         Rollout(env, learner.policy, config.budget.steps, keys),
         config.budget.frames,
         folder,
-        logger=None if config.logger is None else build(config.logger, "logger"),
+        logger=build(config.logger, "logger") if config.logger else None,
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
     )
@@ -65,7 +66,8 @@ def guide_on_training_tracks(config: DictConfig) -> float:
     """The guide's own mean return where the agent trains: the line to beat."""
     tracks = build(config.track.train, "track.train")
     env = build_env(config, {"assignment": "cyclic", "num_cars": len(tracks)}, observed=False)
-    episodes = drive(env, build_guide(config)).episodes
+    with tqdm(unit="step", desc="guide on the training tracks", leave=False, mininterval=0.5) as bar:
+        episodes = drive(env, build_guide(config), tick=bar.update).episodes
     return sum(episode["reward"] for episode in episodes) / len(episodes)
 
 

@@ -45,5 +45,5 @@ def test_deterministic_action_is_the_squashed_mean():
 
 def test_unknown_entry_is_named_beside_those_that_exist():
     env = ConeTrackEnv(shipped_tracks("test"), 3)
-    with pytest.raises(KeyError, match="no entry guide_action to observe; it has .*observation"):
+    with pytest.raises(KeyError, match=r"no entry guide_action to observe; it has .*observation"):
         actor(env, ["observation", "guide_action"])

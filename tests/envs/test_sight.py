@@ -7,21 +7,23 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from coil_rl.envs.sight import View, boundary_samples, encode, to_car, to_world, view
+from coil_rl.envs.sight import View, boundary_samples, encode, polar, to_car, to_world, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 
 seeds = st.integers(0, 2**31)
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
 
-def sides(left: list[tuple[float, float]], right: list[tuple[float, float]], dtype: torch.dtype = torch.float64) -> Tensor:
+def sides(
+    left: list[tuple[float, float]], right: list[tuple[float, float]], dtype: torch.dtype = torch.float64
+) -> Tensor:
     """Cones of one car, filled up with cones behind it: [2, candidates, 2, 1]."""
     most = max(len(left), len(right))
     filled = [side + [(-1.0, 0.0)] * (most - len(side)) for side in (left, right)]
     return torch.tensor(filled, dtype=dtype).permute(2, 1, 0).unsqueeze(-1)
 
 
-def polar(distance: float, degrees: float) -> tuple[float, float]:
+def at(distance: float, degrees: float) -> tuple[float, float]:
     return distance * math.cos(math.radians(degrees)), distance * math.sin(math.radians(degrees))
 
 
@@ -64,7 +66,7 @@ def test_sight_ends_at_seven_metres(dtype: torch.dtype) -> None:
 def test_sight_ends_at_sixty_degrees(dtype: torch.dtype) -> None:
     # Exactly 60 degrees is not a floating-point number.
     angles = [59.999, 60.001, -59.999, -60.001, 90.0, 120.0, 180.0]
-    assert seen([polar(5, angle) for angle in angles], dtype) == [True, False, True, False, False, False, False]
+    assert seen([at(5, angle) for angle in angles], dtype) == [True, False, True, False, False, False, False]
 
 
 def test_a_cone_under_the_car_is_in_sight() -> None:
@@ -120,10 +122,10 @@ def test_to_world_undoes_to_car(seed: int) -> None:
 
 def test_samples_become_distance_and_angle_from_left_to_right() -> None:
     samples = torch.zeros(2, 5, 2, 1, dtype=torch.float64)
-    left = [(7.0, 0.0), (0.0, 3.5), (0.0, 0.0), (-1.0, 0.0), polar(14, 30)]
-    right = [polar(1.75, -60), polar(5.25, -120), polar(7, -150), (3.5, 0.0), (0.0, -7.0)]
+    left = [(7.0, 0.0), (0.0, 3.5), (0.0, 0.0), (-1.0, 0.0), at(14, 30)]
+    right = [at(1.75, -60), at(5.25, -120), at(7, -150), (3.5, 0.0), (0.0, -7.0)]
     samples[:, :, 0, 0], samples[:, :, 1, 0] = torch.tensor(left).t(), torch.tensor(right).t()
-    expected = [1, 0, 0, 0.75, -1, 0, 2 / 7 - 1, 1, 1, 0.25] + [-0.5, -0.5, 0.5, -1, 1, -1, 0, 0, 1, -0.75]
+    expected = [1, 0, 0, 0.75, -1, 0, 2 / 7 - 1, 1, 1, 0.25, -0.5, -0.5, 0.5, -1, 1, -1, 0, 0, 1, -0.75]
     known = torch.ones(2, 1, dtype=torch.bool)
     assert encode(samples, known).tolist()[0] == pytest.approx(expected, abs=1e-6)
 
@@ -154,3 +156,23 @@ def test_boundary_samples_of_a_straight_row_lie_evenly_on_it(fit) -> None:
     assert samples[0, :, 0].tolist() == pytest.approx([2, 3, 4, 5, 6])
     assert samples[0, :, 1].tolist() == pytest.approx([2, 2.25, 2.5, 2.75, 3])
     assert samples[1].flatten().tolist() == pytest.approx([1] * 10)
+
+
+@both_dtypes
+def test_polar_coordinates_are_those_of_hypot_and_atan2(dtype: torch.dtype) -> None:
+    line = torch.tensor([-7.0, -1.0, -1e-6, -0.0, 0.0, 1e-6, 0.5, 3.0], dtype=dtype)
+    x, y = torch.meshgrid(line, line, indexing="ij")
+    distance, angle = polar(x, y)
+    assert torch.allclose(distance, torch.hypot(x, y))
+    assert torch.allclose(angle[distance > 0], torch.atan2(y, x)[distance > 0])
+    assert angle[distance == 0].eq(0).all()
+
+
+@both_dtypes
+def test_observations_do_not_depend_on_the_other_cars(dtype: torch.dtype) -> None:
+    draw = torch.Generator().manual_seed(1)
+    samples = 3 * torch.randn(2, 5, 2, 1003, dtype=dtype, generator=draw)
+    known = torch.ones(2, 1003, dtype=torch.bool)
+    together = encode(samples, known)
+    for car in range(0, 1003, 17):
+        assert torch.equal(encode(samples[..., car : car + 1], known[:, :1]), together[car : car + 1])

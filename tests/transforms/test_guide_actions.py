@@ -51,9 +51,7 @@ def test_discrete_advice_is_one_hot(categorical):
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     check_transform(GymEnv("CartPole-v1", categorical_action_encoding=categorical), GuideActions({"lean": guide}))
-    env = TransformedEnv(
-        GymEnv("CartPole-v1", categorical_action_encoding=categorical), GuideActions({"lean": guide})
-    )
+    env = TransformedEnv(GymEnv("CartPole-v1", categorical_action_encoding=categorical), GuideActions({"lean": guide}))
     rollout = env.rollout(5)
     leaning = (rollout["observation"][..., 2] > 0).long()
     assert torch.equal(rollout["guide_action"].squeeze(1), one_hot(leaning, 2).float())

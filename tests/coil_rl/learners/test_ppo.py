@@ -92,9 +92,9 @@ def test_policy_moves_towards_what_pays():
 @pytest.mark.slow
 def test_solves_cartpole():
     torch.manual_seed(0)
-    env = GymEnv("CartPole-v1", num_envs=8)
+    env = GymEnv("CartPole-v1")
     ppo = PPO(env, learning_rate=Linear(1e-3, 0.0), epochs=10, minibatches=8, gamma=0.98, gae_lambda=0.8)
-    rollout = Rollout(env, ppo.policy, 128, ppo.keys)
+    rollout = Rollout(env, ppo.policy, 1024, ppo.keys)
     for k in range(80):
         batch = rollout.collect()
         ppo.update(batch, k / 80)

@@ -1,0 +1,113 @@
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).parents[3]
+
+TINY = ["budget.frames=512", "budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1",
+        "track.test.count=1", "env.laps=1", "evaluation.repeats=1", "logger=none"]  # fmt: skip
+
+
+def program(name, *arguments, cwd, code=0):
+    command = [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd)])}
+    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("train")
+    return folder, program("train", *TINY, "run_dir=run", cwd=folder)
+
+
+def test_train_prints_a_table_and_leaves_everything_in_its_folder(run):
+    folder, done = run
+    lines = done.stdout.strip().splitlines()
+    assert [line.split("|")[1].strip() for line in lines[2:-1]] == ["guide"] * 2 + ["coil"] * 4
+    assert lines[-1].startswith("coil: mean test reward")
+    files = {file.name for file in (folder / "run").iterdir()}
+    assert files >= {"config.yaml", "versions.json", "metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt"}
+    assert json.loads((folder / "run" / "versions.json").read_text())["torchrl"] == "0.14.1"
+    for picture in ("lines.png", "lines.gif", "learning_curve.png"):
+        with Image.open(folder / "run" / picture) as image:
+            assert image.width >= 600
+
+
+def test_train_shows_progress_and_nothing_alarming(run):
+    _, done = run
+    assert "guide=" in done.stderr
+    assert "Warning" not in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_evaluate_gives_the_same_numbers_again(run):
+    folder, trained = run
+    again = program("evaluate", "run=run", *TINY[3:6], "evaluation.repeats=1", cwd=folder)
+    deterministic = [line for line in trained.stdout.splitlines() if "deterministic" in line]
+    assert [line for line in again.stdout.splitlines() if "deterministic" in line] == deterministic
+
+
+def test_guide_alone_is_a_method_and_an_evaluation(tmp_path):
+    done = program("train", *TINY, "method=guide", "guide=zero", "run_dir=run", cwd=tmp_path)
+    assert "guide: mean test reward" in done.stdout
+    assert not (tmp_path / "run" / "metrics.csv").exists()
+    alone = program("evaluate", "guide=zero", *TINY[3:7], "run_dir=alone", cwd=tmp_path)
+    assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
+
+
+def test_a_folder_that_holds_a_run_is_refused(run):
+    folder, _ = run
+    done = program("train", *TINY, "run_dir=run", cwd=folder, code=2)
+    assert done.stderr.strip().splitlines()[-1] == "train: run already holds a run; give another run_dir"
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "words"),
+    [
+        ("train", ["sed=1"], "Key 'sed' not in 'Train'"),
+        ("train", ["method=coyl"], "Available options in 'method': coil guide ppo"),
+        ("train", ["learner.rate=1"], "Key 'rate' is not in struct"),
+        ("train", ["budget.frames=many"], "Value 'many' of type 'str' could not be converted to Integer"),
+        ("train", ["track=folder", "track.dir=/nowhere"], "/nowhere cannot be read"),
+        ("evaluate", ["run=/nowhere"], "run=/nowhere is not the folder of a run"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
+    done = program(name, *arguments, cwd=tmp_path, code=2)
+    assert words in done.stderr.strip().splitlines()[-1]
+    assert "Traceback" not in done.stderr
+
+
+def test_info_names_the_versions_that_matter(tmp_path):
+    out = program("info", cwd=tmp_path).stdout
+    for name in ("python", "coil-rl", "torch ", "torchrl", "hydra-core", "commit"):
+        assert name in out
+
+
+def test_part_of_another_package_needs_no_change_here(tmp_path):
+    (tmp_path / "their_package.py").write_text(
+        "from coil_rl.guides import ConstantGuide\n\n\nclass TheirGuide(ConstantGuide):\n"
+        "    def __init__(self, angle):\n        super().__init__(angle / 80)\n"
+    )
+    experiments = tmp_path / "conf" / "experiment"
+    experiments.mkdir(parents=True)
+    (experiments.parent / "guide").mkdir()
+    (experiments.parent / "guide" / "theirs.yaml").write_text("_target_: their_package.TheirGuide\nangle: 8\n")
+    (experiments / "mine.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
+    )
+    done = program("train", "--config-dir", "conf", *TINY, "+experiment=mine", "run_dir=run", cwd=tmp_path)
+    assert "100%" in done.stdout, "a constant steering of 8 degrees should have crashed every car"
+
+
+def test_a_sweep_gives_every_run_a_folder(tmp_path):
+    program("train", "-m", *TINY, "method=guide", "guide=zero", "seed=0,1", "evaluation.gif=false", cwd=tmp_path)
+    runs = sorted(path.parent.name for path in (tmp_path / "outputs" / "sweep").glob("*/*/evaluation.csv"))
+    assert runs == ["0_guide_seed0", "1_guide_seed1"]

@@ -1,0 +1,88 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.build import build, build_env, build_guide
+from coil_rl.errors import UserError
+from coil_rl.testing import check_env, check_guide
+
+CONF = Path(__file__).parents[2] / "conf"
+SMALL = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.cars=4", "run_dir=unused"]
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*SMALL, *overrides])
+
+
+def choices(group):
+    return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("preset", choices("preset"))
+@pytest.mark.parametrize("method", choices("method"))
+def test_every_method_builds_an_env_that_keeps_the_contract(preset, method):
+    env = build_env(composed(f"preset={preset}", f"method={method}"))
+    check_env(env, steps=3)
+    assert env.rate == {"paper": 24, "authors": 60}[preset]
+
+
+@pytest.mark.parametrize("guide", choices("guide"))
+def test_every_guide_advises_on_what_the_env_shows(guide):
+    config = composed(f"guide={guide}")
+    guide_module, data = build_guide(config), build_env(config, observed=False).reset()
+    assert guide_module(data.copy())["action"].shape == (4, 1)
+    if guide != "random":
+        check_guide(guide_module, data)
+
+
+@pytest.mark.parametrize("learner", choices("learner"))
+def test_every_learner_builds_from_the_env(learner):
+    config = composed(f"learner={learner}")
+    env = build_env(config)
+    built = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    assert built.policy(env.reset())["action"].shape == (4, 1)
+
+
+@pytest.mark.parametrize("track", sorted(set(choices("track")) - {"folder"}))
+def test_every_track_group_gives_tracks(track):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        node = compose("train", [f"track={track}", "run_dir=unused"]).track
+    assert len(build(node.train, "track.train")) > 3 <= len(build(node.test, "track.test"))
+
+
+def test_evaluate_composes():
+    assert composed(name="evaluate").run is None
+
+
+def test_key_that_a_part_does_not_take_is_refused_beside_those_it_takes():
+    node = OmegaConf.create({"_target_": "coil_rl.guides.ZeroGuide", "sise": 1})
+    with pytest.raises(UserError, match="guide: ZeroGuide takes no sise; it takes size, in_key, out_key"):
+        build(node, "guide")
+
+
+def test_key_of_a_nested_part_is_checked_too():
+    node = {"_target_": "coil_rl.learners.PPO", "learning_rate": {"_target_": "coil_rl.schedules.Linear", "begin": 0}}
+    with pytest.raises(UserError, match=r"learner\.learning_rate: Linear takes no begin; it takes start, end, until"):
+        build(node, "learner")
+
+
+def test_target_that_does_not_exist_is_named():
+    with pytest.raises(UserError, match=r"guide: there is no coil_rl\.guides\.Oracle"):
+        build({"_target_": "coil_rl.guides.Oracle"}, "guide")
+
+
+def test_value_that_a_part_refuses_is_one_sentence():
+    with pytest.raises(UserError, match="env: spline='round' must be one of cubic, quadratic"):
+        build_env(composed("env.spline=round"))
+
+
+def test_overrides_change_the_env_and_leave_the_configuration():
+    config = composed()
+    env = build_env(config, {"num_cars": 2, "assignment": "cyclic"})
+    assert env.batch_size == torch.Size([2])
+    assert config.env.assignment == "random"

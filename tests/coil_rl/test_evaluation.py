@@ -1,0 +1,60 @@
+import math
+
+import pytest
+
+from coil_rl.envs import ConeTrackEnv, random_tracks
+from coil_rl.evaluation import drive, summarise
+from coil_rl.guides import ConstantGuide, SplineGuide
+from coil_rl.networks import actor
+
+TRACKS = random_tracks(2, seed=5)
+
+
+def test_guide_completes_its_laps_and_the_measures_agree_with_one_another():
+    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", laps=1)
+    driven = drive(env, SplineGuide(), names=[track.name for track in TRACKS])
+    for track, row, line in zip(TRACKS, driven.episodes, driven.lines, strict=True):
+        assert row["track"] == track.name
+        assert row["completed"]
+        assert not row["crashed"]
+        assert row["laps"] == 1
+        assert row["clearance"] > 0
+        # The middle line at 2 m/s, less what is cut at corners.
+        assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
+        assert len(line) == row["steps"] >= row["lap_time"] * 24
+    again = drive(env, SplineGuide(), names=[track.name for track in TRACKS])
+    assert again.episodes == driven.episodes
+
+
+def test_crash_ends_the_measuring():
+    env = ConeTrackEnv(TRACKS, 4, assignment="cyclic")
+    driven = drive(env, ConstantGuide(1.0))
+    for row in driven.episodes:
+        assert row["crashed"]
+        assert not row["completed"]
+        assert math.isnan(row["lap_time"])
+        assert row["clearance"] <= 0
+        assert -100 < row["reward"] < -80
+
+
+def test_sampled_actions_differ_from_the_deterministic_ones():
+    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic")
+    policy = actor(env, ["observation"])
+    plain, drawn = (drive(env, policy, sampled=sampled).episodes[0]["smoothness"] for sampled in (False, True))
+    assert drawn > 10 * plain
+
+
+def test_summary_is_the_mean_over_tracks_of_means_over_episodes():
+    def episode(track, reward, lap_time, crashed):
+        return {
+            "track": track, "reward": reward, "lap_time": lap_time, "smoothness": 0.1, "completed": not crashed,
+            "crashed": crashed, "clearance": reward / 100,
+        }  # fmt: skip
+
+    rows = summarise([episode("a", 10, 5.0, False), episode("a", 20, math.nan, True), episode("b", 40, math.nan, True)])
+    assert [row["track"] for row in rows] == ["a", "b", "mean"]
+    assert [row["reward"] for row in rows] == [15, 40, 27.5]
+    assert rows[0]["lap_time"] == rows[2]["lap_time"] == 5
+    assert math.isnan(rows[1]["lap_time"])
+    assert [row["crashed"] for row in rows] == [0.5, 1, 0.75]
+    assert rows[2]["clearance"] == 0.1

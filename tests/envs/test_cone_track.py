@@ -1,0 +1,409 @@
+import copy
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs.utils import check_env_specs
+
+from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
+from coil_rl.envs.cone_track import REWARD_TERMS
+from coil_rl.guides.spline import SplineGuide
+
+AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}
+
+
+@pytest.fixture(scope="module")
+def tracks() -> list[Track]:
+    return random_tracks(3, seed=1)
+
+
+@pytest.fixture(scope="module")
+def rings(ring: Track) -> list[Track]:
+    """Three small tracks, whose maps are quick to make."""
+    return [Track(f"ring_{size}", size * ring.left, size * ring.right) for size in (1.0, 1.1, 1.2)]
+
+
+@pytest.fixture(autouse=True)
+def no_gradients() -> Iterator[None]:
+    with torch.no_grad():
+        yield
+
+
+def steering(steps: int, cars: int, seed: int) -> Tensor:
+    """Smooth random actions [steps, cars, 1], calm for the first cars and wild for the last."""
+    draw = torch.Generator().manual_seed(seed)
+    actions = [torch.zeros(cars, 1)]
+    for _ in range(steps):
+        push = torch.linspace(0.01, 0.3, cars).unsqueeze(-1) * torch.randn(cars, 1, generator=draw)
+        actions.append((0.95 * actions[-1] + push).clamp(-1, 1))
+    return torch.stack(actions[1:])
+
+
+def advance(env: ConeTrackEnv, state: TensorDictBase, action: Tensor) -> tuple[TensorDictBase, TensorDictBase]:
+    """One step, and a reset of the cars whose episode ended: what the step emitted and the state to go on from."""
+    state["action"] = action.to(env.dtype_)
+    emitted, state = env.step_and_maybe_reset(state)
+    return emitted["next"], state
+
+
+def leaves(data: TensorDictBase) -> dict[Any, Tensor]:
+    return dict(data.items(include_nested=True, leaves_only=True))
+
+
+def same(a: TensorDictBase, b: TensorDictBase) -> bool:
+    ours, theirs = leaves(a), leaves(b)
+    return ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
+
+
+def buffers(env: ConeTrackEnv) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in env.state_dict().items() if not name.endswith("_extra_state")}
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("assignment", ["random", "cyclic"])
+@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
+def test_specs_hold(rings: list[Track], preset: dict, assignment: str, dtype: torch.dtype) -> None:
+    check_env_specs(ConeTrackEnv(rings, 3, assignment=assignment, dtype=dtype, **preset))
+
+
+def test_everything_emitted_lies_within_its_spec(rings: list[Track]) -> None:
+    env = ConeTrackEnv(rings, 64)
+    state = env.reset()
+    assert env.observation_spec.is_in(state.select(*env.observation_spec.keys()))
+    for action in steering(120, 64, seed=2):
+        emitted, state = advance(env, state, action)
+        assert env.observation_spec.is_in(emitted.select(*env.observation_spec.keys()))
+        assert emitted["cones"].square().sum(-1).max() <= 49 + 1e-4
+
+
+def test_a_car_of_thousands_drives_as_if_alone(tracks: list[Track]) -> None:
+    cars, chosen = 4096, (1731, 4095)
+    env = ConeTrackEnv(tracks, cars, assignment="cyclic")
+    actions = steering(150, cars, seed=3)
+    state = env.reset()
+    for action in actions[:50]:
+        _, state = advance(env, state, action)
+    # A fresh env of one car is on the first track, where every third car of the batch is, too.
+    alone = {car: ConeTrackEnv(tracks, 1, assignment="cyclic") for car in chosen}
+    states = {}
+    for car, single in alone.items():
+        single.reset()
+        columns = {name: value[..., car : car + 1] for name, value in buffers(env).items()}
+        single.load_state_dict(env.state_dict() | columns)
+        states[car] = state[car : car + 1].clone()
+    resets = 0
+    for action in actions[50:]:
+        emitted, state = advance(env, state, action)
+        resets += int(emitted["done"].sum())
+        for car, single in alone.items():
+            own, states[car] = advance(single, states[car], action[car : car + 1])
+            assert same(own, emitted[car : car + 1])
+    assert resets > cars / 2
+    for car, single in alone.items():
+        assert all(
+            torch.equal(value, buffers(env)[name][..., car : car + 1]) for name, value in buffers(single).items()
+        )
+
+
+@pytest.mark.parametrize("assignment", ["random", "cyclic"])
+def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track], assignment: str) -> None:
+    env = ConeTrackEnv(rings, 12, assignment=assignment)
+    state = env.reset()
+    for action in steering(20, 12, seed=4):
+        state["action"] = action
+        state = env.step_mdp(env.step(state))
+    before = buffers(env)
+    mask = torch.arange(12) % 3 == 1
+    fresh = env.reset(TensorDict({"_reset": mask.unsqueeze(-1)}, 12))
+    after = buffers(env)
+    for name, value in before.items():
+        assert torch.equal(after[name][..., ~mask], value[..., ~mask]), name
+    assert torch.equal(env.pose[:, mask], env.map.starts[:, env.track[mask]])
+    for name in ("history", "steps", "lap", "on_line", "known"):
+        assert not after[name][..., mask].any(), name
+    assert fresh["observation"][mask].ne(state["observation"][mask]).any(dim=-1).all()
+
+
+def test_a_car_that_goes_on_keeps_what_it_saw_when_others_are_reset(tracks: list[Track]) -> None:
+    env = ConeTrackEnv(tracks, 64)
+    state = env.reset()
+    for action in steering(150, 64, seed=5):
+        emitted, state = advance(env, state, action)
+        running = ~emitted["done"].squeeze(-1)
+        for key in ("observation", "cones", "cone_count", "steering"):
+            assert torch.equal(state[key][running], emitted[key][running])
+        assert state["steering"][~running].eq(0).all()
+        assert not state["done"].any()
+
+
+def visited(env: ConeTrackEnv) -> Tensor:
+    return torch.cat([env.reset()["info", "track"] for _ in range(5)])
+
+
+def test_a_seed_fixes_the_tracks(rings: list[Track]) -> None:
+    seen = visited(ConeTrackEnv(rings, 20, seed=7))
+    assert torch.equal(visited(ConeTrackEnv(rings, 20, seed=7)), seen)
+    assert not torch.equal(visited(ConeTrackEnv(rings, 20, seed=8)), seen)
+    assert seen.unique().tolist() == [0, 1, 2]
+    env = ConeTrackEnv(rings, 20, seed=8)
+    env.set_seed(7)
+    assert torch.equal(visited(env), seen)
+
+
+def test_the_global_seed_does_not_matter(rings: list[Track]) -> None:
+    torch.manual_seed(1)
+    seen = visited(ConeTrackEnv(rings, 20, seed=7))
+    torch.manual_seed(2)
+    state = torch.get_rng_state()
+    assert torch.equal(visited(ConeTrackEnv(rings, 20, seed=7)), seen)
+    assert torch.equal(torch.get_rng_state(), state)
+
+
+def test_cyclic_assignment_keeps_every_car_on_its_track(rings: list[Track]) -> None:
+    env = ConeTrackEnv(rings, 7, assignment="cyclic")
+    for _ in range(3):
+        assert env.reset()["info", "track"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 0]
+
+
+@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
+def test_a_restored_env_goes_on_bit_for_bit(tracks: list[Track], preset: dict) -> None:
+    env = ConeTrackEnv(tracks, 16, seed=3, **preset)
+    actions = steering(280, 16, seed=6)
+    state = env.reset()
+    for action in actions[:100]:
+        _, state = advance(env, state, action)
+    saved, saved_state = copy.deepcopy(env.state_dict()), state.clone()
+    trace = []
+    for action in actions[100:]:
+        emitted, state = advance(env, state, action)
+        trace.append((emitted, state.clone()))
+    # Future tracks count as state, so episodes have to end on the way.
+    assert sum(int(emitted["done"].sum()) for emitted, _ in trace) > 10
+
+    restored = ConeTrackEnv(tracks, 16, seed=99, **preset)
+    restored.load_state_dict(saved)
+    for action, (emitted, after) in zip(actions[100:], trace, strict=True):
+        ours, saved_state = advance(restored, saved_state, action)
+        assert same(ours, emitted)
+        assert same(saved_state, after)
+
+
+def test_time_runs_out_as_truncation(rings: list[Track]) -> None:
+    env = ConeTrackEnv(rings, 4, time_limit=0.5)
+    rollout = env.rollout(20, SplineGuide(), break_when_any_done=True)["next"]
+    assert rollout.shape == (4, 12)
+    assert rollout["truncated"][:, -1].all()
+    assert rollout["done"][:, -1].all()
+    assert not rollout["truncated"][:, :-1].any()
+    assert not rollout["terminated"].any()
+
+
+def test_a_crash_costs_its_price_and_nothing_else(tracks: list[Track]) -> None:
+    env = ConeTrackEnv(tracks, 32)
+    state = env.reset()
+    crashes = 0
+    for action in steering(150, 32, seed=7):
+        emitted, state = advance(env, state, action)
+        crashed = emitted["info", "crashed"]
+        crashes += int(crashed.sum())
+        terms = emitted["info", "reward"]
+        assert emitted["reward"][crashed].eq(-100).all()
+        assert terms["crash"][crashed].eq(-100).all()
+        assert terms["crash"][~crashed].eq(0).all()
+        assert all(terms[term][crashed].eq(0).all() for term in REWARD_TERMS if term != "crash")
+        assert all(terms[term][~crashed].ne(0).any() for term in ("alive", "smooth"))
+        assert torch.equal(crashed, emitted["info", "clearance"] <= 0)
+        assert torch.equal(crashed, emitted["terminated"])
+    assert crashes > 10
+
+
+def test_the_reward_is_the_sum_of_its_terms(ring: Track) -> None:
+    weights = {"finish": 3.0, "second": -0.1, "cone": 0.5, "smooth": -7.0, "alive": 0.25, "crash": -9.0}
+    env = ConeTrackEnv([ring], 8, rate=12, laps=1, reward=weights)
+    guide = SplineGuide()
+    state = env.reset()
+    finished = 0
+    for action in steering(240, 8, seed=8):
+        emitted, state = advance(env, state, guide(state)["action"] + 0.2 * action)
+        terms = emitted["info", "reward"]
+        assert torch.allclose(emitted["reward"], sum(terms[term] for term in REWARD_TERMS), rtol=0, atol=1e-6)
+        kept = ~emitted["info", "crashed"]
+        lap_time = emitted["info", "lap_time"]
+        assert torch.allclose(terms["smooth"], -7 * emitted["info", "smoothness"] * kept, rtol=0, atol=1e-6)
+        assert torch.allclose(terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * kept, rtol=0, atol=1e-5)
+        assert torch.equal(terms["alive"], 0.25 * kept)
+        assert torch.equal(terms["crash"], -9.0 * ~kept)
+        finished += int((lap_time > 0).sum())
+    assert finished > 0
+
+
+def test_held_steps_keep_the_wheel_straight(rings: list[Track]) -> None:
+    env = ConeTrackEnv(rings, 3, held_steps=2)
+    state = env.reset()
+    heading = state["info", "pose"][:, 2]
+    for expected in (0.0, 0.0, 1.0):
+        state["action"] = torch.ones(3, 1)
+        emitted = env.step(state)["next"]
+        assert emitted["steering"].eq(expected).all()
+        assert emitted["info", "pose"][:, 2].eq(heading).all() == (expected == 0)
+        assert emitted["info", "smoothness"].eq(expected).all()
+        state = env.step_mdp(state)
+
+
+def lap_after_lap(track: Track, weave: float = 0.0, **kwargs: Any) -> TensorDictBase:
+    """One car behind the guide that swings its nose, until its episode ends: [steps, ...]."""
+    env = ConeTrackEnv([track], 1, rate=12, **kwargs)
+    guide = SplineGuide()
+
+    def policy(data: TensorDictBase) -> TensorDictBase:
+        data = guide(data)
+        data["action"] = (data["action"] + weave * math.sin(1.6 * float(env.steps))).clamp(-1, 1)
+        return data
+
+    return env.rollout(5000, policy)["next"][0]
+
+
+def test_an_episode_ends_after_its_laps(ring: Track) -> None:
+    episode = lap_after_lap(ring, laps=1)
+    assert episode["terminated"][-1]
+    assert not episode["truncated"][-1]
+    assert not episode["info", "crashed"].any()
+    assert episode["info", "lap"].flatten().tolist() == [0] * (len(episode) - 1) + [1]
+    times = episode["info", "lap_time"]
+    assert times[:-1].eq(0).all()
+    # The first entry of the finish area, not the start, starts the clock.
+    assert 0.9 * ring.length / 2 < times[-1].item() < len(episode) / 12
+
+
+def test_a_cone_is_paid_once_a_lap_on_first_sighting_and_again_on_every_sighting(ring: Track) -> None:
+    cones = len(ring.left) + len(ring.right)
+    once = lap_after_lap(ring, 0.5, cone_bonus="first_sighting")
+    again = lap_after_lap(ring, 0.5, cone_bonus="every_sighting", laps=1)
+    assert torch.equal(once["info", "pose"][: len(again)], again["info", "pose"])
+    assert once["info", "lap"][-1] == 2
+    paid = [episode["info", "reward", "cone"] / 2.5 for episode in (once, again)]
+    assert all(set(sightings.flatten().tolist()) <= {0, 1, 2} for sightings in paid)
+    # The cones ahead are new again in the step that completes a lap.
+    first_lap = once["info", "lap"] == 0
+    assert cones / 2 < paid[0][first_lap].sum() <= cones
+    assert paid[0][~first_lap].sum() <= cones + 2
+    assert paid[1].sum() > paid[0][: len(again)].sum()
+
+
+def test_what_was_emitted_never_changes(tracks: list[Track]) -> None:
+    env = ConeTrackEnv(tracks, 24)
+    state = env.reset()
+    kept = [(state, state.clone())]
+    for action in steering(80, 24, seed=9):
+        before = state.clone()
+        emitted, after = advance(env, state, action)
+        kept += [(emitted, emitted.clone()), (after, after.clone())]
+        assert same(state.select(*before.keys()).exclude("action"), before.exclude("action"))
+        state = after.clone(recurse=False)
+    env.reset()
+    assert all(same(data.select(*copied.keys()), copied) for data, copied in kept)
+
+
+def assert_finite(data: TensorDictBase) -> None:
+    for key, value in leaves(data).items():
+        assert value.isfinite().all(), key
+
+
+def assert_all_finite_under_random_steering(steps: int, **kwargs: Any) -> None:
+    env = ConeTrackEnv(shipped_tracks("train"), 256, **kwargs)
+    state = env.reset()
+    for action in steering(steps, 256, seed=10):
+        emitted, state = advance(env, state, action)
+        assert_finite(emitted)
+
+
+def test_everything_stays_finite_under_random_steering() -> None:
+    assert_all_finite_under_random_steering(250)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
+def test_everything_stays_finite_under_long_random_steering(preset: dict) -> None:
+    assert_all_finite_under_random_steering(2000, **preset)
+
+
+def test_everything_stays_finite_far_off_the_track(tracks: list[Track]) -> None:
+    env = ConeTrackEnv(tracks, 16)
+    state = env.reset()
+    for action in steering(400, 16, seed=11):
+        state["action"] = 0.2 * action
+        emitted = env.step(state)["next"]
+        assert_finite(emitted)
+        state = env.step_mdp(state)
+    assert (state["info", "pose"] - env.map.starts[:, env.track].t())[:, :2].norm(dim=-1).max() > 25
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"spline": "linear"}, "spline='linear' must be one of cubic, quadratic"),
+        ({"cone_bonus": "never"}, "cone_bonus='never' must be one of first_sighting, every_sighting"),
+        ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, cyclic"),
+        *(
+            ({name: value}, f"{name}={value} must be more than 0")
+            for name in ("num_cars", "rate", "laps", "time_limit", "kept_cones", "speed", "car_length", "max_steering")
+            for value in (0, -1)
+        ),
+        ({"rate": math.nan}, "rate=nan must be more than 0"),
+        ({"reward": {"cone": 1.0, "speed": 1.0}}, r"reward has no weight \['speed'\]; it has finish, second, crash"),
+        ({"smoothing": -0.1}, "smoothing=-0.1 must be"),
+    ],
+)
+def test_wrong_values_are_named(rings: list[Track], wrong: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ConeTrackEnv(rings, **({"num_cars": 2} | wrong))
+
+
+def test_an_env_without_tracks_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one track"):
+        ConeTrackEnv([])
+
+
+def test_actions_beyond_the_limits_count_as_the_limit(rings: list[Track]) -> None:
+    wild, tame = (ConeTrackEnv(rings, 4, assignment="cyclic") for _ in range(2))
+    states = [wild.reset(), tame.reset()]
+    for value in ([[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]):
+        actions = [torch.tensor(value), torch.tensor(value).clamp(-1, 1)]
+        for env, state, action in zip((wild, tame), states, actions, strict=True):
+            state["action"] = action
+            env.step(state)
+        assert same(states[0]["next"], states[1]["next"])
+        states = [env.step_mdp(state) for env, state in zip((wild, tame), states, strict=True)]
+
+
+def test_few_kept_cones_change_nothing_but_the_room(rings: list[Track]) -> None:
+    # Sixteen a side are more than a car ever sees on such a track.
+    few, many = (ConeTrackEnv(rings, 8, kept_cones=kept, assignment="cyclic") for kept in (16, 30))
+    states = [few.reset(), many.reset()]
+    for action in steering(60, 8, seed=12):
+        emitted = []
+        for i, env in enumerate((few, many)):
+            after, states[i] = advance(env, states[i], action)
+            emitted.append(after)
+        assert emitted[1]["cones"].shape == (8, 2, 30, 2)
+        assert torch.equal(emitted[1]["cones"][:, :, :16], emitted[0]["cones"])
+        assert same(emitted[0].exclude("cones"), emitted[1].exclude("cones"))
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+def test_the_env_runs_on_a_gpu(tracks: list[Track]) -> None:
+    envs = [ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")]
+    check_env_specs(envs[1])
+    states = [env.reset() for env in envs]
+    for action in steering(30, 32, seed=13):
+        emitted = []
+        for i, env in enumerate(envs):
+            after, states[i] = advance(env, states[i], action.to(env.device))
+            assert all(value.device.type == env.device.type for value in leaves(after).values())
+            emitted.append(after.cpu())
+        assert torch.allclose(emitted[0]["observation"], emitted[1]["observation"], atol=1e-2)
+        assert torch.equal(emitted[0]["info", "track"], emitted[1]["info", "track"])
