@@ -28,10 +28,10 @@ evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
 	$(BIN)/coil-evaluate $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
-	$(BIN)/python -m pytest -q $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
-	$(BIN)/python -m pytest -q -m '' $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m '' $(ARGS)
 
 check: $(INSTALLED) ## lint, formatting, types and import directions
 	$(BIN)/ruff check .

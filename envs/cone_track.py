@@ -23,6 +23,7 @@ from coil_rl.envs.track import Track
 from coil_rl.envs.track_map import TrackMap
 
 HISTORY = 20
+FINISH_RADIUS = 0.625  # m
 REWARD_TERMS = ("finish", "crash", "cone", "smooth", "alive")
 
 
@@ -155,8 +156,8 @@ class ConeTrackEnv(EnvBase):
     # State: one row of numbers per quantity, the cars last.
 
     def _allocate(self, cars: int) -> None:
-        def keep(name: str, *shape: int, dtype: torch.dtype = self.dtype_, persistent: bool = True) -> None:
-            self.register_buffer(name, torch.zeros(shape, dtype=dtype, device=self.device), persistent=persistent)
+        def keep(name: str, *shape: int, dtype: torch.dtype = self.dtype_) -> None:
+            self.register_buffer(name, torch.zeros(shape, dtype=dtype, device=self.device))
 
         keep("track", cars, dtype=torch.int64)
         keep("pose", 3, cars)
@@ -322,12 +323,14 @@ class ConeTrackEnv(EnvBase):
         """On how many sides a cone came into sight [B]; keeps book of the cones that are not to be paid again."""
         if not self.every_sighting:
             self.known = self.known & ~finished
-        slot = slot.flatten(0, 1)
-        visible = seen.seen.flatten(0, 1)
-        new = visible & ~self.known.gather(0, slot)
-        before = torch.zeros_like(self.known) if self.every_sighting else self.known.clone()
-        # Padding slots are never visible, so nothing real is lost where several candidates write to one.
-        self.known = before.scatter_(0, slot, visible if self.every_sighting else visible | before.gather(0, slot))
+        slot, visible = slot.flatten(0, 1), seen.seen.flatten(0, 1)
+        known = self.known.gather(0, slot)
+        new = visible & ~known
+        # All padding of a side shares one slot, and is never visible.
+        if self.every_sighting:
+            self.known = torch.zeros_like(self.known).scatter_(0, slot, visible)
+        else:
+            self.known = self.known.scatter(0, slot, visible | known)
         return new.view(-1, 2, self.batch_size[0]).any(0).sum(0)
 
     def _observe(self, pose: Tensor, seen: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -370,9 +373,6 @@ class ConeTrackEnv(EnvBase):
             self.batch_size,
             device=self.device,
         )
-
-
-FINISH_RADIUS = 0.625
 
 
 def _recent_mean(history: Tensor) -> Tensor:

@@ -293,7 +293,7 @@ def _total(x: Tensor, dim: int) -> Tensor:
 def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Which slots are real, 1 or 0 [K, *batch], knots [K, *batch], steps [D, K-1, *batch], their lengths, m.
 
-    Lengths have a floor, 16 sqrt(eps) of 1 m and the longest step (1 cm between cones in float32), so that
+    Lengths have a floor, eps^(1/3) of 1 m and the longest step (1 cm in float32, 10 um in float64), so that
     points on one another keep every quotient finite and Q'Q its digits. The floor also holds in the padding,
     where the steps are 0.
     """
@@ -305,7 +305,7 @@ def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
     step = (points[:, 1:] - points[:, :-1]) * real[1:]
     square = _total(step * step, 0)
     longest = square.amax(0)
-    h = torch.maximum(square, (longest + 1) * (256 * torch.finfo(points.dtype).eps)).sqrt()
+    h = torch.maximum(square, (longest + 1) * torch.finfo(points.dtype).eps ** (2 / 3)).sqrt()
     travelled = accumulate((h * real[1:]).unbind(0), torch.add, initial=torch.zeros_like(longest))
     return real, torch.stack(list(travelled)), step, h
 

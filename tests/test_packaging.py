@@ -92,6 +92,16 @@ print(importlib.resources.files("coil_rl.conf").joinpath("a", "b", "planted.yaml
     assert all(Path(line).is_file() for line in lines)
 
 
+def test_programs_of_the_wheel_run_from_another_folder(installed: Path, tmp_path: Path) -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    for target in scripts.values():
+        module = target.removesuffix(":main")
+        assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
+    tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "run_dir=run"]
+    out = run(sys.executable, "-m", "coil_rl.programs.train", *tiny, cwd=tmp_path, pythonpath=installed)
+    assert "test_3" in out, "the shipped tracks should have come from the wheel"
+
+
 def test_every_dependency_has_one_exact_version_in_its_range() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 from hydra.errors import HydraException
@@ -21,12 +22,23 @@ def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task under Hydra; exit code 2 and one sentence on standard error for a mistake in what was given."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    wrapped = hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(task)
-    try:
-        wrapped()
-    except (UserError, HydraException, OmegaConfBaseException) as error:
+
+    def refuse(error: Exception) -> NoReturn:
         print(f"{config_name}: {_sentence(error)}", file=sys.stderr)
         sys.exit(2)
+
+    @functools.wraps(task)
+    def politely(config: DictConfig) -> Any:
+        # Here and not outside, where Hydra would have put a line of its own before the sentence.
+        try:
+            return task(config)
+        except (UserError, OmegaConfBaseException) as error:
+            refuse(error)
+
+    try:
+        hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(politely)()
+    except (HydraException, OmegaConfBaseException) as error:
+        refuse(error)
     except KeyboardInterrupt:
         print(f"{config_name}: interrupted", file=sys.stderr)
         sys.exit(130)

@@ -322,7 +322,7 @@ def assert_all_finite_under_random_steering(steps: int, **kwargs: Any) -> None:
 
 
 def test_everything_stays_finite_under_random_steering() -> None:
-    assert_all_finite_under_random_steering(250)
+    assert_all_finite_under_random_steering(150)
 
 
 @pytest.mark.slow

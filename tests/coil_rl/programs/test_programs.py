@@ -81,7 +81,8 @@ def test_a_folder_that_holds_a_run_is_refused(run):
 )
 def test_mistakes_are_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
     done = program(name, *arguments, cwd=tmp_path, code=2)
-    assert words in done.stderr.strip().splitlines()[-1]
+    (sentence,) = done.stderr.strip().splitlines()
+    assert words in sentence
     assert "Traceback" not in done.stderr
 
 
