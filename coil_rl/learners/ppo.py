@@ -86,6 +86,7 @@ class PPO:
         self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
+        self.learned_from = [*in_keys, "action", "action_log_prob", "advantage", "value_target"]
         self.keys = [*in_keys, "action", "action_log_prob", "reward", "done", "terminated"]
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
@@ -105,13 +106,13 @@ class PPO:
             self.loss.entropy_coeff.fill_(self.entropy(progress))
         with torch.no_grad():
             self.advantage(batch)
-        flat = batch.exclude("next").reshape(-1)
+        flat = batch.select(*self.learned_from).reshape(-1)
         sums: dict[str, Tensor] = {}
         size = len(flat) // self.minibatches
         for _ in range(self.epochs):
-            order = torch.randperm(len(flat), generator=self.generator).to(flat.device)
-            for rows in order[: size * self.minibatches].split(size):
-                losses = self.loss(flat[rows])
+            order = torch.randperm(len(flat), generator=self.generator)[: size * self.minibatches]
+            for minibatch in flat[order.to(flat.device)].split(size):
+                losses = self.loss(minibatch)
                 total = losses["loss_objective"] + losses["loss_critic"]
                 if self.loss.entropy_bonus:
                     total = total + losses["loss_entropy"]
