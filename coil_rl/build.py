@@ -43,9 +43,7 @@ def _check(node: Any, name: str, given: set[str]) -> None:
             try:
                 called = hydra.utils.get_object(target)
             except Exception as error:
-                raise UserError(
-                    f"{name}: there is no {target}; check _target_ and that its package is installed"
-                ) from error
+                raise UserError(f"{name}: there is no {target}; is its package installed?") from error
             _check_keys(called, set(node) - {"_target_", "_partial_"} | given, name, target)
         for key, value in node.items():
             _check(value, f"{name}.{key}", set())

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial, reduce
-from typing import Any, Literal
+from typing import Literal
 
 import torch
-from tensordict.nn import TensorDictModule
-from torch import Tensor, nn
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor
 
 from coil_rl.envs.sight import polar
 from coil_rl.envs.splines import least_squares_parabola, smoothing_spline
@@ -20,10 +23,11 @@ HALF_FIELD_OF_VIEW = math.radians(60)
 FAR = 1e6
 
 
-class SplineSteering(nn.Module):
-    """Steering from cones: a smooth path through the midpoints of left-right pairs, and pursuit of a target on it.
+class SplineGuide(TensorDictModuleBase):
+    """A smooth path through the midpoints of left-right pairs of cones, and pursuit of a target on it.
 
-    It knows the cones in sight and the steering in force, never the map and never its own past.
+    Reads `cones`, `cone_count` and `steering`, writes `action`: it knows the cones in sight and the steering in force,
+    never the map and never its own past.
 
     Args:
         spline: of the path, "cubic" (smoothing) or "quadratic" (least-squares parabola).
@@ -34,6 +38,14 @@ class SplineSteering(nn.Module):
         cones: only the nearest so many cones of a side are paired.
         midpoints: room for so many midpoints.
         targets: room for so many targets along the path.
+        in_keys: where to read the three.
+        out_key: where to write the advice.
+
+    Example:
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> env = ConeTrackEnv(shipped_tracks("test"), num_cars=4)
+        >>> env.rollout(5, SplineGuide(), break_when_any_done=False)["action"].shape
+        torch.Size([4, 5, 1])
     """
 
     def __init__(
@@ -46,7 +58,10 @@ class SplineSteering(nn.Module):
         cones: int = 8,
         midpoints: int = 24,
         targets: int = 12,
+        in_keys: Sequence[NestedKey] = ("cones", "cone_count", "steering"),
+        out_key: NestedKey = "action",
     ) -> None:
+        self.in_keys, self.out_keys = list(in_keys), [out_key]
         super().__init__()
         if spline not in ("cubic", "quadratic"):
             raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
@@ -54,7 +69,11 @@ class SplineSteering(nn.Module):
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
         self.cones, self.midpoints, self.targets = cones, midpoints, targets
 
-    def forward(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the advice."""
+        return tensordict.set(self.out_keys[0], self.steer(*(tensordict[key] for key in self.in_keys)))
+
+    def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
         """Advise a steering.
 
         Args:
@@ -107,27 +126,3 @@ class SplineSteering(nn.Module):
         best = square.masked_fill(~wanted, math.inf).min(0, keepdim=True)
         target = torch.stack([x, y]).gather(1, best.indices.expand(2, -1, -1)).squeeze(1)
         return target, best.values.squeeze(0) < math.inf
-
-
-class SplineGuide(TensorDictModule):
-    """`SplineSteering` as a guide: reads `cones`, `cone_count` and `steering`, writes `action`.
-
-    Args:
-        in_keys: where to read the three.
-        out_keys: where to write the advice.
-        kwargs: see `SplineSteering`.
-
-    Example:
-        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = ConeTrackEnv(shipped_tracks("test"), num_cars=4)
-        >>> env.rollout(5, SplineGuide(), break_when_any_done=False)["action"].shape
-        torch.Size([4, 5, 1])
-    """
-
-    def __init__(
-        self,
-        in_keys: tuple[str, ...] = ("cones", "cone_count", "steering"),
-        out_keys: tuple[str, ...] = ("action",),
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(SplineSteering(**kwargs), in_keys=list(in_keys), out_keys=list(out_keys))

@@ -123,9 +123,8 @@ class PPO:
                 for key, value in losses.items():
                     sums[key] = sums.get(key, 0) + value.detach().mean()
         steps = self.epochs * self.minibatches
-        return {key: float(value) / steps for key, value in sums.items()} | {
-            "learning_rate": self.learning_rate(progress)
-        }
+        means = {key: float(value) / steps for key, value in sums.items()}
+        return means | {"learning_rate": self.learning_rate(progress)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an update depends on besides the batch."""

@@ -8,7 +8,7 @@ from oracle import guide_action
 from tensordict import TensorDict
 from torch import Tensor
 
-from coil_rl.guides.spline import SplineGuide, SplineSteering
+from coil_rl.guides.spline import SplineGuide
 
 SLOTS = 16
 seeds = st.integers(0, 2**31)
@@ -26,7 +26,7 @@ def sight(left: list[Point], right: list[Point], steering: float = 0.0) -> tuple
 
 
 def advice(left: list[Point], right: list[Point], steering: float = 0.0, **kwargs) -> float:
-    return SplineSteering(**kwargs)(*sight(left, right, steering)).item()
+    return SplineGuide(**kwargs).steer(*sight(left, right, steering)).item()
 
 
 def roads(seed: int, cars: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor]:
@@ -126,7 +126,7 @@ def test_a_bend_to_the_left_is_steered_to_the_left(spline: str) -> None:
 @every_spline
 @given(seed=seeds)
 def test_a_mirrored_road_is_steered_the_other_way(spline: str, seed: int) -> None:
-    guide = SplineSteering(spline)
+    guide = SplineGuide(spline).steer
     cones, count, steering = roads(seed, cars=40)
     mirrored = cones.flip(1) * torch.tensor([1.0, -1.0])
     assert torch.allclose(guide(mirrored, count.flip(1), -steering), -guide(cones, count, steering), rtol=0, atol=1e-9)
@@ -135,7 +135,7 @@ def test_a_mirrored_road_is_steered_the_other_way(spline: str, seed: int) -> Non
 @every_spline
 def test_advice_is_the_oracles_on_any_road(spline: str) -> None:
     cones, count, steering = roads(8, cars=300)
-    ours = SplineSteering(spline)(cones, count, steering)
+    ours = SplineGuide(spline).steer(cones, count, steering)
     for car in range(300):
         left, right = (cones[car, side, : count[car, side]].numpy() for side in range(2))
         theirs = guide_action(left, right, steering[car].item(), spline=spline)
@@ -145,7 +145,7 @@ def test_advice_is_the_oracles_on_any_road(spline: str) -> None:
 @every_spline
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_advice_does_not_depend_on_the_other_cars(spline: str, dtype: torch.dtype) -> None:
-    guide = SplineSteering(spline)
+    guide = SplineGuide(spline).steer
     inputs = roads(9, cars=1003, dtype=dtype)
     together = guide(*inputs)
     for car in range(0, 1003, 17):
@@ -155,7 +155,7 @@ def test_advice_does_not_depend_on_the_other_cars(spline: str, dtype: torch.dtyp
 @every_spline
 @given(seed=seeds)
 def test_what_lies_in_the_padding_has_no_influence(spline: str, seed: int) -> None:
-    guide = SplineSteering(spline)
+    guide = SplineGuide(spline).steer
     cones, count, steering = roads(seed, cars=20)
     padding = torch.arange(SLOTS) >= count.unsqueeze(-1)
     shuffled = torch.where(padding.unsqueeze(-1), cones.flip(2) - 3, cones)
@@ -177,7 +177,7 @@ def test_advice_is_an_action_whatever_is_seen(
         left, right = (left + left)[:SLOTS], (right + left)[:SLOTS]
     inputs = sight(left, right, steering)
     for dtype in (torch.float32, torch.float64):
-        action = SplineSteering(spline)(inputs[0].to(dtype), inputs[1], inputs[2].to(dtype))
+        action = SplineGuide(spline).steer(inputs[0].to(dtype), inputs[1], inputs[2].to(dtype))
         assert action.shape == (1, 1)
         assert action.dtype == dtype
         assert action.abs() <= 1
@@ -201,12 +201,12 @@ def test_guide_reads_what_the_env_writes() -> None:
 def test_guide_can_write_beside_the_action() -> None:
     cones, count, steering = roads(2, cars=5)
     data = TensorDict({"seen": cones, "cone_count": count, "steering": steering}, 5)
-    guide = SplineGuide(in_keys=("seen", "cone_count", "steering"), out_keys=(("guide", "action"),))
+    guide = SplineGuide(in_keys=("seen", "cone_count", "steering"), out_key=("guide", "action"))
     written = guide(data)
     assert "action" not in written
-    assert torch.equal(written["guide", "action"], SplineSteering()(cones, count, steering))
+    assert torch.equal(written["guide", "action"], SplineGuide().steer(cones, count, steering))
 
 
 def test_an_unknown_spline_is_named() -> None:
     with pytest.raises(ValueError, match="spline='linear' must be one of cubic, quadratic"):
-        SplineSteering("linear")  # type: ignore[arg-type]
+        SplineGuide("linear")  # type: ignore[arg-type]
