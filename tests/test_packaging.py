@@ -97,7 +97,7 @@ def test_programs_of_the_wheel_run_from_another_folder(installed: Path, tmp_path
     for target in scripts.values():
         module = target.removesuffix(":main")
         assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
-    tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "run_dir=run"]
+    tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "hydra.run.dir=run"]
     out = run(sys.executable, "-m", "coil_rl.programs.train", *tiny, cwd=tmp_path, pythonpath=installed)
     assert "test_3" in out, "the shipped tracks should have come from the wheel"
 

@@ -27,7 +27,7 @@ def train(config: DictConfig) -> float:
     torch.manual_seed(config.seed)
     folder = Path(config.run_dir)
     if (folder / "config.yaml").exists():
-        raise UserError(f"{folder} already holds a run; give another run_dir")
+        raise UserError(f"{folder} already holds a run; choose another folder with hydra.run.dir=FOLDER")
     folder.mkdir(parents=True, exist_ok=True)
     OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml")
     (folder / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")

@@ -24,7 +24,7 @@ def program(name, *arguments, cwd, code=0):
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
-    return folder, program("train", *TINY, "run_dir=run", cwd=folder)
+    return folder, program("train", *TINY, "hydra.run.dir=run", cwd=folder)
 
 
 def test_train_prints_a_table_and_leaves_everything_in_its_folder(run):
@@ -55,17 +55,18 @@ def test_evaluate_gives_the_same_numbers_again(run):
 
 
 def test_guide_alone_is_a_method_and_an_evaluation(tmp_path):
-    done = program("train", *TINY, "method=guide", "guide=zero", "run_dir=run", cwd=tmp_path)
+    done = program("train", *TINY, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path)
     assert "guide: mean test reward" in done.stdout
     assert not (tmp_path / "run" / "metrics.csv").exists()
-    alone = program("evaluate", "guide=zero", *TINY[3:7], "run_dir=alone", cwd=tmp_path)
+    alone = program("evaluate", "guide=zero", *TINY[3:7], "hydra.run.dir=alone", cwd=tmp_path)
     assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
 
 
 def test_a_folder_that_holds_a_run_is_refused(run):
     folder, _ = run
-    done = program("train", *TINY, "run_dir=run", cwd=folder, code=2)
-    assert done.stderr.strip().splitlines()[-1] == "train: run already holds a run; give another run_dir"
+    done = program("train", *TINY, "hydra.run.dir=run", cwd=folder, code=2)
+    sentence = f"train: {folder / 'run'} already holds a run; choose another folder with hydra.run.dir=FOLDER"
+    assert done.stderr.strip() == sentence
 
 
 @pytest.mark.parametrize(
@@ -104,7 +105,7 @@ def test_part_of_another_package_needs_no_change_here(tmp_path):
     (experiments / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
     )
-    done = program("train", "--config-dir", "conf", *TINY, "+experiment=mine", "run_dir=run", cwd=tmp_path)
+    done = program("train", "--config-dir", "conf", *TINY, "+experiment=mine", "hydra.run.dir=run", cwd=tmp_path)
     assert "100%" in done.stdout, "a constant steering of 8 degrees should have crashed every car"
 
 
