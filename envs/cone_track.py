@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.sight import SAMPLES, View, boundary_samples, encode, to_car, to_world, view
+from coil_rl.envs.sight import SAMPLES, View, boundary_samples, encode, flat_index, to_car, to_world, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 from coil_rl.envs.track import Track
 from coil_rl.envs.track_map import TrackMap
@@ -94,7 +94,8 @@ class ConeTrackEnv(EnvBase):
     lap: Tensor
     clock: Tensor
     on_line: Tensor
-    known: Tensor
+    epoch: Tensor
+    seen_in: Tensor
     samples: Tensor
     sampled: Tensor
     start_cones: Tensor
@@ -166,19 +167,21 @@ class ConeTrackEnv(EnvBase):
         keep("lap", cars, dtype=torch.int32)
         keep("clock", cars, dtype=torch.int32)
         keep("on_line", cars, dtype=torch.bool)
-        keep("known", 2 * self.map.slots, cars, dtype=torch.bool)
+        keep("epoch", cars, dtype=torch.int32)
+        keep("seen_in", 2 * self.map.slots, cars, dtype=torch.int32)
         keep("samples", 2, SAMPLES, 2, cars)
-        keep("sampled", 2, cars, dtype=torch.bool)
+        keep("sampled", 2, cars)
 
         # What a car sees at the start depends on its track alone, so a reset only copies it.
         tracks = torch.arange(len(self.map), device=self.device)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
-        sampled = torch.zeros(2, len(tracks), dtype=torch.bool, device=self.device)
-        seen, _ = self._look(tracks, self.map.starts)
+        sampled = torch.zeros(2, len(tracks), dtype=self.dtype_, device=self.device)
+        cell = self.map.cell(tracks, self.map.starts[:2])
+        seen, _ = self._look(tracks, cell, self.map.starts)
         observation, samples, sampled = self._observe(self.map.starts, seen, samples, sampled)
         for name, value in {
-            "start_cones": self._padded(seen.cones), "start_count": seen.count, "start_observation": observation,
-            "start_samples": samples, "start_sampled": sampled,
+            "start_cones": self._padded(seen.cones), "start_count": seen.count.long(),
+            "start_observation": observation.t(), "start_samples": samples, "start_sampled": sampled,
         }.items():  # fmt: skip
             self.register_buffer(name, value, persistent=False)
 
@@ -227,34 +230,38 @@ class ConeTrackEnv(EnvBase):
     # Dynamics
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        everyone = torch.ones(self.batch_size, dtype=torch.bool, device=self.device)
-        mask = everyone if tensordict is None else tensordict.get("_reset", everyone).view(self.batch_size)
-        cars = torch.arange(self.batch_size[0], device=self.device)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        everyone = torch.arange(self.batch_size[0], device=self.device)
+        cars = everyone if mask is None else mask.view(-1).nonzero().squeeze(-1)
         if self.assignment == "cyclic":
-            drawn = cars % len(self.map)
+            track = cars % len(self.map)
         else:
             # All cars draw, reset or not: which numbers come next must not depend on the data.
-            drawn = torch.randint(len(self.map), self.batch_size, generator=self.generator).to(self.device)
-        track = torch.where(mask, drawn, self.track)
-        self.track = track
-        self.pose = torch.where(mask, self.map.starts[:, track], self.pose)
-        self.samples = torch.where(mask, self.start_samples[..., track], self.samples)
-        self.sampled = torch.where(mask, self.start_sampled[..., track], self.sampled)
-        self.history = self.history * ~mask
-        self.known = self.known & ~mask
-        self.on_line = self.on_line & ~mask
-        self.steps, self.lap = self.steps * ~mask, self.lap * ~mask
-        self.clock = self.clock.masked_fill(mask, -1)
+            drawn = torch.randint(len(self.map), self.batch_size, generator=self.generator)
+            track = drawn.to(self.device)[cars]
+
+        def put(state: Tensor, value: Tensor | float) -> Tensor:
+            if isinstance(value, Tensor):
+                return state.index_copy(-1, cars, value)
+            return state.index_fill(-1, cars, value)
+
+        self.track = put(self.track, track)
+        self.pose = put(self.pose, self.map.starts[:, track])
+        self.samples = put(self.samples, self.start_samples[..., track])
+        self.sampled = put(self.sampled, self.start_sampled[..., track])
+        self.history, self.on_line = put(self.history, 0), put(self.on_line, False)
+        self.steps, self.lap, self.clock = put(self.steps, 0), put(self.lap, 0), put(self.clock, -1)
+        # Two on: by neither rule of the cone bonus has a car seen anything in the epoch before.
+        self.epoch = put(self.epoch, self.epoch[cars] + 2)
         zero = torch.zeros_like(self.pose[0])
-        return self._tensordict(
-            self.start_observation[track],
-            self.start_cones[..., track],
-            self.start_count[:, track],
-            self._info(zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero)),
-        )
+        start = (self.start_observation, self.start_cones, self.start_count)
+        empty = (x.new_zeros(*x.shape[:-1], len(everyone)) for x in start)
+        observation, cones, count = (put(x, y[..., track]) for x, y in zip(empty, start, strict=True))
+        terms = dict.fromkeys(REWARD_TERMS, zero)
+        return self._tensordict(observation.t(), cones, count, self._info(zero, zero.bool(), zero, zero, terms))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].view(-1).clamp(-1, 1)
+        action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
         roughness = (action - _recent_mean(self.history)).abs()
@@ -263,10 +270,11 @@ class ConeTrackEnv(EnvBase):
         self.steps = self.steps + 1
 
         lap_time, finished = self._cross_the_line()
-        seen, slot = self._look(self.track, self.pose)
+        cell = self.map.cell(self.track, self.pose[:2])
+        seen, slot = self._look(self.track, cell, self.pose)
         discovered = self._discover(seen, slot, finished)
         observation, self.samples, self.sampled = self._observe(self.pose, seen, self.samples, self.sampled)
-        clearance = self.map.clearance(self.track, self.pose[:2])
+        clearance = self.map.clearance(self.track, cell, self.pose[:2])
 
         crashed = clearance <= 0
         alive = (~crashed).to(action.dtype)
@@ -282,7 +290,7 @@ class ConeTrackEnv(EnvBase):
         out = self._tensordict(
             observation,
             self._padded(seen.cones),
-            seen.count,
+            seen.count.long(),
             self._info(lap_time, crashed, clearance, roughness, terms),
         )
         out["reward"] = sum(terms.values()).to(action.dtype).unsqueeze(-1)
@@ -315,31 +323,34 @@ class ConeTrackEnv(EnvBase):
         self.lap = self.lap + finished
         return lap_time, finished
 
-    def _look(self, track: Tensor, pose: Tensor) -> tuple[View, Tensor]:
-        slot, cones = self.map.candidates(track, pose)
+    def _look(self, track: Tensor, cell: Tensor, pose: Tensor) -> tuple[View, Tensor]:
+        slot, cones = self.map.candidates(track, cell, pose[2])
         return view(to_car(pose, cones), self.kept_cones), slot
 
     def _discover(self, seen: View, slot: Tensor, finished: Tensor) -> Tensor:
-        """On how many sides a cone came into sight [B]; keeps book of the cones that are not to be paid again."""
-        if not self.every_sighting:
-            self.known = self.known & ~finished
-        slot, visible = slot.flatten(0, 1), seen.seen.flatten(0, 1)
-        known = self.known.gather(0, slot)
-        new = visible & ~known
-        # All padding of a side shares one slot, and is never visible.
-        if self.every_sighting:
-            self.known = torch.zeros_like(self.known).scatter_(0, slot, visible)
-        else:
-            self.known = self.known.scatter(0, slot, visible | known)
-        return new.view(-1, 2, self.batch_size[0]).any(0).sum(0)
+        """On how many sides a cone came into sight [B]; keeps book of the cones that are not to be paid again.
+
+        Each cone carries the epoch in which it was last seen. An epoch is a lap, or a step if sightings always pay.
+        """
+        before = self.epoch
+        self.epoch = before + (1 if self.every_sighting else finished)
+        known_since = before if self.every_sighting else self.epoch
+        cars = torch.arange(self.batch_size[0], device=self.device)
+        slot = slot.flatten().index_select(0, flat_index(seen.place)).view_as(seen.place)
+        index = torch.add(cars, slot, alpha=len(cars)).flatten()
+        book = self.seen_in.view(-1)
+        last = book.index_select(0, index).view_as(slot)
+        new = seen.real * torch.ne(last, known_since)
+        book.scatter_(0, index, torch.where(seen.real > 0, self.epoch, last).flatten())
+        return new.amax(0).sum(0)
 
     def _observe(self, pose: Tensor, seen: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The observation [B, 20], from the boundaries in view or, where there is none, from the last one that was."""
-        fresh = seen.count >= 2
+        fresh = (seen.count - 1).clamp_(0, 1)
         local = boundary_samples(seen.cones, seen.count, self.fit)
-        samples = torch.where(fresh, to_world(pose, local), samples)
-        sampled = sampled | fresh
-        return encode(torch.where(fresh, local, to_car(pose, samples)), sampled), samples, sampled
+        samples = torch.lerp(samples, to_world(pose, local), fresh)
+        sampled = torch.maximum(sampled, fresh)
+        return encode(torch.lerp(to_car(pose, samples), local, fresh), sampled), samples, sampled
 
     # Output
 
@@ -354,12 +365,10 @@ class ConeTrackEnv(EnvBase):
             "track": self.track, "lap": self.lap.long(), "lap_time": lap_time, "crashed": crashed,
             "clearance": clearance, "smoothness": smoothness,
         }  # fmt: skip
-        info = TensorDict({key: value.unsqueeze(-1) for key, value in columns.items()}, self.batch_size)
-        info["pose"] = self.pose.t()
-        info["reward"] = TensorDict(
-            {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}, self.batch_size
-        )
-        return info
+        paid = {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}
+        entries: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
+        entries |= {"pose": self.pose.t(), "reward": TensorDict(paid, self.batch_size, device=self.device)}
+        return TensorDict(entries, self.batch_size, device=self.device)
 
     def _tensordict(self, observation: Tensor, cones: Tensor, count: Tensor, info: TensorDict) -> TensorDict:
         return TensorDict(

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from coil_rl.envs.splines import Spline
+from coil_rl.envs.sorting import smallest
+from coil_rl.envs.splines import Spline, slots_in_use
 
 SAMPLES = 5
 SIGHT = 7.0
@@ -28,14 +29,16 @@ class View:
 
     Attributes:
         cones: [2, K, 2, B] m in the car's frame (x ahead, y left), nearest first, zeros after the last. Fewer slots
-            than K where there are fewer candidates.
-        count: [2, B] int64, how many of the K are real.
-        seen: [candidates, 2, B] bool, which candidates those are.
+            than K where so many are not needed.
+        count: [2, B], how many of the K are real.
+        real: [K, 2, B], 1 for those, else 0.
+        place: [K, 2, B] integers, which candidate each one is.
     """
 
     cones: Tensor
     count: Tensor
-    seen: Tensor
+    real: Tensor
+    place: Tensor
 
 
 def to_car(pose: Tensor, points: Tensor) -> Tensor:
@@ -59,7 +62,8 @@ def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """
     distance = torch.addcmul(x * x, y, y).sqrt_()
     acute = (y / (distance + x.abs()).clamp_(min=torch.finfo(x.dtype).tiny)).atan_() * 2
-    return distance, torch.where(x < 0, torch.full_like(y, math.pi).copysign_(y) - acute, acute)
+    obtuse = torch.full_like(y, math.pi).copysign_(y) - acute
+    return distance, torch.lerp(acute, obtuse, x.clone().lt_(0))
 
 
 def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> View:
@@ -73,11 +77,16 @@ def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: flo
     """
     x, y = local
     square = torch.addcmul(x * x, y, y)
-    visible = (square <= sight**2) & (x >= 0) & (x * x >= square * math.cos(half_field_of_view) ** 2)
-    rank = _rank(square.masked_fill_(~visible, math.inf))
-    visible &= rank < kept
-    cones = torch.empty_like(local).scatter_(1, rank.long().expand_as(local), local * visible)[:, :kept]
-    return View(cones, visible.sum(0), visible)
+    # Ahead of the car, so x |x| instead of the square of x.
+    ahead = torch.addcmul(square * -(math.cos(half_field_of_view) ** 2), x, x.abs()).ge_(0)
+    visible = square.clone().le_(sight**2).mul_(ahead)
+    count = visible.sum(0).clamp_(max=kept)
+    kept = slots_in_use(count, min(kept, len(x)))
+    slots = torch.arange(kept, dtype=x.dtype, device=x.device).view(-1, 1, 1)
+    real = (count - slots).clamp_(0, 1)
+    place = smallest(square, visible, kept)
+    cones = local.flatten(1).index_select(1, flat_index(place)).view(2, *place.shape) * real
+    return View(cones, count, real, place)
 
 
 def boundary_samples(cones: Tensor, count: Tensor, fit: Fit) -> Tensor:
@@ -99,7 +108,7 @@ def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
 
     Args:
         samples: boundary samples in the car's frame, [2, 5, 2, B] m.
-        known: [2, B] bool; a side not known yet reads as zeros.
+        known: [2, B], 1 or 0; a side not known yet reads as zeros.
         sight: m, the distance that becomes 1.
 
     Returns:
@@ -107,13 +116,11 @@ def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
     """
     distance, angle = polar(*samples)
     both = torch.stack([distance * (2 / sight) - 1, angle * (1 / WIDEST_ANGLE)]).clamp_(-1, 1) * known
-    return both.permute(3, 2, 1, 0).reshape(known.shape[-1], -1)
+    return both.permute(2, 1, 0, 3).reshape(-1, known.shape[-1]).t()
 
 
-def _rank(key: Tensor) -> Tensor:
-    """Place of each entry when its column is sorted, ties in order: [N, ...] to [N, ...] int8."""
-    rank = torch.zeros(key.shape, dtype=torch.int8, device=key.device)
-    for i, row in enumerate(key.unbind(0)):
-        rank[:i] += row < key[:i]
-        rank[i + 1 :] += row <= key[i + 1 :]
-    return rank
+def flat_index(place: Tensor) -> Tensor:
+    """Rows [K, *batch] of a tensor [N, *batch] as places in it once it is flattened, [K * batch]."""
+    columns = place[0].numel()
+    column = torch.arange(columns, dtype=place.dtype, device=place.device).view(place.shape[1:])
+    return torch.add(column, place, alpha=columns).flatten()

@@ -23,7 +23,14 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-__all__ = ["SelfEvolvingSpline", "Spline", "least_squares_parabola", "quadratic_spline", "smoothing_spline"]
+__all__ = [
+    "SelfEvolvingSpline",
+    "Spline",
+    "least_squares_parabola",
+    "quadratic_spline",
+    "slots_in_use",
+    "smoothing_spline",
+]
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,12 @@ class Spline:
         """Parameter of the last point: [*batch], m."""
         return self.knots[-1]
 
+    @property
+    def polyline_length(self) -> Tensor:
+        """How far it is from knot to knot along the spline's values: [*batch], m."""
+        step = self.values[:, 1:] - self.values[:, :-1]
+        return _total(_total(step * step, 0).sqrt(), 0)
+
     def sample(self, u: Tensor) -> Tensor:
         """Evaluate at parameters u: [S, *batch], m, clamped to [0, length]; returns [D, S, *batch], m."""
         return self._at(torch.minimum(u.clamp(min=0), self.length))
@@ -65,12 +78,10 @@ class Spline:
     def _at(self, u: Tensor) -> Tensor:
         rows = self.knots[0].numel()
         # Strictly below, so that the end of the spline falls into the last real interval, never into padding.
-        # A comparison in place keeps the floating type, the one comparison that is vectorised on CPU.
-        interval = torch.zeros_like(u)
-        for knot in self.knots.detach()[1:-1].unbind(0):
-            interval = interval + u.detach().clone().gt_(knot)
-        row = torch.arange(rows, device=u.device).view(u.shape[1:])
-        start = torch.add(row, interval.long(), alpha=rows).flatten()
+        inner = self.knots.detach()[1:-1].unsqueeze(1)
+        below = torch.gt(u.detach(), inner, out=u.new_empty(len(inner), *u.shape))
+        row = torch.arange(rows, device=u.device, dtype=torch.int32).view(u.shape[1:])
+        start = torch.add(row, below.sum(0).int(), alpha=rows).flatten()
         ends = (start, start + rows)
 
         dim = len(self.values)
@@ -280,6 +291,17 @@ class SelfEvolvingSpline(nn.Module):
             setattr(self, name, state.masked_fill(mask, 0))
 
 
+def slots_in_use(count: Tensor, slots: int) -> int:
+    """How many of the slots to look at, for counts [*batch]: at least 2.
+
+    What lies behind is padding and has no influence on a result, so where a look at the data costs nothing (on a CPU,
+    outside of compiled code) it need not be computed with.
+    """
+    if count.device.type != "cpu" or torch.compiler.is_compiling() or not count.numel():
+        return slots
+    return min(slots, max(2, int(count.max())))
+
+
 def _column(x: Tensor, like: Tensor) -> Tensor:
     """View x: [K] so that it broadcasts against like: [any, *batch]."""
     return x.view(-1, *[1] * (like.ndim - 1))
@@ -319,7 +341,7 @@ def _turns(step: Tensor, per_m: Tensor) -> Tensor:
 def _hold(x: Tensor, count: Tensor, real: Tensor) -> Tensor:
     """Repeat the last real entry of x: [D, K, *batch] in the padding; zeros if there is none."""
     last = (count.long() - 1).clamp(min=0).expand_as(x[:, :1])
-    return torch.lerp(x.gather(1, last) * real[0], x, real)
+    return torch.addcmul((x.gather(1, last) * real[0]) * (1 - real), x, real)
 
 
 def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Tensor, least: Tensor) -> Tensor:

@@ -33,25 +33,25 @@ class Grid(nn.Module):
     """
 
     low: Tensor
+    last: Tensor
     columns: Tensor
-    rows: Tensor
     offset: Tensor
 
     def __init__(self, lows: NDArray[np.float64], highs: NDArray[np.float64], cell: float, dtype: torch.dtype) -> None:
         super().__init__()
         self.cell = cell
         shape = np.ceil((highs - lows) / cell).astype(np.int64) + 1
-        self.register_buffer("low", torch.as_tensor(lows.T.copy(), dtype=dtype), persistent=False)
-        self.register_buffer("columns", torch.as_tensor(shape[:, 0]), persistent=False)
-        self.register_buffer("rows", torch.as_tensor(shape[:, 1]), persistent=False)
         sizes = shape.prod(axis=1)
+        self.register_buffer("low", torch.as_tensor(lows.T.copy(), dtype=dtype), persistent=False)
+        self.register_buffer("last", torch.as_tensor(shape.T - 2, dtype=dtype), persistent=False)
+        self.register_buffer("columns", torch.as_tensor(shape[:, 0]), persistent=False)
         self.register_buffer("offset", torch.as_tensor(np.cumsum(sizes) - sizes), persistent=False)
 
     def nodes(self, track: int) -> NDArray[np.float64]:
         """The lower left corners of one area's cells, [cells, 2] m, in the order of their numbers."""
         low = self.low[:, track].double().numpy()
-        x = low[0] + self.cell * np.arange(int(self.columns[track]))
-        y = low[1] + self.cell * np.arange(int(self.rows[track]))
+        columns, rows = (int(last) + 2 for last in self.last[:, track])
+        x, y = low[0] + self.cell * np.arange(columns), low[1] + self.cell * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
     def locate(self, track: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -59,12 +59,12 @@ class Grid(nn.Module):
 
         A position outside its area counts as the nearest cell.
         """
-        at = (position - self.low[:, track]) / self.cell
-        columns = self.columns[track]
-        last = torch.stack([columns, self.rows[track]]) - 2
-        corner = torch.minimum(at.floor().clamp_(min=0), last.to(at.dtype))
-        column, row = corner.long()
-        return self.offset[track] + row * columns + column, columns, (at - corner).clamp_(0, 1)
+        at = (position - self.low.index_select(1, track)) / self.cell
+        corner = torch.minimum(at.floor().clamp_(min=0), self.last.index_select(1, track))
+        column, row = corner.long().unbind(0)
+        columns = self.columns.index_select(0, track)
+        number = torch.addcmul(self.offset.index_select(0, track) + column, row, columns)
+        return number, columns, (at - corner).clamp_(0, 1)
 
 
 class TrackMap(nn.Module):
@@ -170,48 +170,53 @@ class TrackMap(nn.Module):
         self.most = candidate.shape[-1]
         self._keep("candidate", candidate.reshape(-1, 2 * self.most), torch.int16)
         self._keep("block", np.concatenate(blocks), torch.int64)
-        self._keep("near", _stack(nears, np.array([self.slots - 1])), torch.int64)
+        self._keep("near", _stack(nears, np.array([self.slots - 1])), torch.int32)
 
-    def candidates(self, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+    def cell(self, track: Tensor, position: Tensor) -> Tensor:
+        """The cell [B] in which a car of these tracks [B] at this position [2, B] m is."""
+        return self.cells.locate(track, position)[0]
+
+    def candidates(self, track: Tensor, cell: Tensor, heading: Tensor) -> tuple[Tensor, Tensor]:
         """The cones a car may see, never fewer than it does.
 
         Args:
             track: [B], the car's track.
-            pose: [3, B], x and y in m and heading in radians.
+            cell: [B], where it is.
+            heading: [B], radians.
 
         Returns:
             Slot of each candidate among its track's cones [most, 2, B] (left then right, rings padded to `slots`),
             ascending, and its position [2, most, 2, B] in m; padding lies 10 km away.
         """
-        cell, _, _ = self.cells.locate(track, pose[:2])
-        sector = (pose[2] * (SECTORS / (2 * np.pi))).floor_().remainder_(SECTORS).long()
-        slot = self.candidate.index_select(0, self.block[cell] * SECTORS + sector).long()
-        slot = slot.view(-1, 2, self.most).permute(2, 1, 0).contiguous()
+        sector = (heading * (SECTORS / (2 * np.pi))).floor_().remainder_(SECTORS).long()
+        slot = self.candidate.index_select(0, torch.add(sector, self.block.index_select(0, cell), alpha=SECTORS))
+        slot = slot.view(-1, 2, self.most).permute(2, 1, 0).contiguous().int()
         return slot, self._positions(track, slot)
 
-    def clearance(self, track: Tensor, position: Tensor) -> Tensor:
+    def clearance(self, track: Tensor, cell: Tensor, position: Tensor) -> Tensor:
         """How far a car is from a crash: the nearer of cones and boundaries, less the distance that counts as one.
 
         Args:
             track: [B], the car's track.
+            cell: [B], where it is.
             position: [2, B] in m.
 
         Returns:
             [B] in m; zero or less is a crash. Exact up to 1 m, beyond that a cone may have been overlooked.
         """
-        cell, _, _ = self.cells.locate(track, position)
         cones = self._positions(track, self.near.index_select(0, cell).t().contiguous())
         to_cone = (cones - position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
         node, columns, (right, up) = self.fine.locate(track, position)
         right, up = right.unsqueeze(-1), up.unsqueeze(-1)
-        low = torch.lerp(self.field[node], self.field[node + 1], right)
-        high = torch.lerp(self.field[node + columns], self.field[node + columns + 1], right)
+        corners = (self.field.index_select(0, place) for place in (node, node + 1, node + columns, node + columns + 1))
+        low_left, low_right, high_left, high_right = corners
+        low, high = torch.lerp(low_left, low_right, right), torch.lerp(high_left, high_right, right)
         # Each side by itself: half-way between the two the nearer one changes, and no interpolation can follow that.
-        to_boundary = torch.lerp(low, high, up).amin(-1)
+        to_boundary = torch.minimum(*torch.lerp(low, high, up).unbind(-1))
         return torch.minimum(to_cone - self.cone_radius, to_boundary - self.boundary_margin)
 
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
-        index = (slot + track * (2 * self.slots)).flatten()
+        index = (slot + track.int() * (2 * self.slots)).flatten()
         return self.cones.index_select(1, index).view(2, *slot.shape)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial, reduce
+from functools import partial
 from typing import Literal
 
 import torch
@@ -13,14 +13,15 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from coil_rl.envs.sight import polar
-from coil_rl.envs.splines import least_squares_parabola, smoothing_spline
+from coil_rl.envs.sight import flat_index, polar
+from coil_rl.envs.sorting import smallest
+from coil_rl.envs.splines import least_squares_parabola, slots_in_use, smoothing_spline
 
 PAIR_DISTANCE = 4.0
 TARGET_SPACING = 1.0
 TARGET_REACHED = 0.625
 HALF_FIELD_OF_VIEW = math.radians(60)
-FAR = 1e6
+FAR = 1e3  # m
 
 
 class SplineGuide(TensorDictModuleBase):
@@ -95,34 +96,33 @@ class SplineGuide(TensorDictModuleBase):
 
     def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Midpoints of close left-right pairs, nearest first: [2, M, B] m, and how many there are [B]."""
-        near = cones[:, :, : self.cones].permute(3, 2, 1, 0)
-        slot = torch.arange(near.shape[1], device=cones.device).unsqueeze(-1)
-        real = (slot.unsqueeze(-1) < count.t()).to(near.dtype)
-        left, right = near[:, :, 0].unsqueeze(2), near[:, :, 1].unsqueeze(1)
-        gap = (left - right).square_().sum(0)
-        close = ((gap < PAIR_DISTANCE**2) * real[:, 0].unsqueeze(1) * real[:, 1]).flatten(0, 1)
-        middle = (left + right).mul_(0.5).flatten(1, 2)
-        # Pack the close pairs together before sorting: there are few of them among all pairs.
-        place = torch.where(close > 0, close.cumsum(0) - 1, self.midpoints).clamp_(max=self.midpoints).long()
-        room = middle.new_full((2, self.midpoints + 1, middle.shape[-1]), FAR)
-        points = room.scatter_(1, place.expand_as(middle), middle)[:, :-1]
-        order = points.square().sum(0).t().contiguous().argsort(dim=1, stable=True).t()
-        total = close.sum(0).clamp_(max=self.midpoints).long()
-        return points.gather(1, order.expand_as(points)), total
+        near = cones[:, :, : slots_in_use(count, self.cones)].permute(3, 2, 1, 0)
+        slot = torch.arange(near.shape[1], dtype=near.dtype, device=cones.device).view(-1, 1, 1)
+        real = (count.t() - slot).clamp_(0, 1)
+        # What is no cone lies apart from everything, so it makes no pair.
+        apart = torch.tensor([[-FAR], [FAR]], dtype=near.dtype, device=near.device)
+        (left_x, right_x), (left_y, right_y) = torch.lerp(apart, near[0], real).unbind(1), near[1].unbind(1)
+        left_x, left_y = left_x.unsqueeze(1), left_y.unsqueeze(1)
+        gap = torch.addcmul((left_x - right_x).square_(), left_y - right_y, left_y - right_y)
+        close = gap.lt_(PAIR_DISTANCE**2).flatten(0, 1)
+        x, y = (left_x + right_x).flatten(0, 1), (left_y + right_y).flatten(0, 1)
+        total = close.sum(0).clamp_(max=self.midpoints)
+        kept = slots_in_use(total, min(self.midpoints, len(x)))
+        nearest = flat_index(smallest(torch.addcmul(x * x, y, y), close, kept))
+        points = torch.stack([axis.flatten().index_select(0, nearest).view(kept, -1) for axis in (x, y)])
+        return points * 0.5, total
 
     def _target(self, points: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """The nearest target that is ahead and not reached: [2, B] m, and whether there is one [B]."""
         path = self.fit(points, count)
-        knots = path.values
-        chords = (knots[:, 1:] - knots[:, :-1]).square().sum(0).sqrt()
-        # Not `Tensor.sum`, which adds in an order that depends on the size of the batch.
-        length = reduce(torch.add, chords.unbind(0))
-        steps = (length / TARGET_SPACING).round().clamp(1, self.targets - 1)
-        number = torch.arange(self.targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
+        steps = (path.polyline_length / TARGET_SPACING).round().clamp(1, self.targets - 1)
+        targets = slots_in_use(steps + 1, self.targets)
+        number = torch.arange(targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
         x, y = path.sample(path.length * (number / steps).clamp(max=1))
-        square = x * x + y * y
-        ahead = (x >= 0) & (x * x >= square * math.cos(HALF_FIELD_OF_VIEW) ** 2)
-        wanted = ahead & (square > TARGET_REACHED**2) & (count >= 2)
-        best = square.masked_fill(~wanted, math.inf).min(0, keepdim=True)
-        target = torch.stack([x, y]).gather(1, best.indices.expand(2, -1, -1)).squeeze(1)
-        return target, best.values.squeeze(0) < math.inf
+        square = torch.addcmul(x * x, y, y)
+        # Ahead of the car, so x |x| instead of the square of x.
+        ahead = torch.addcmul(square * -(math.cos(HALF_FIELD_OF_VIEW) ** 2), x, x.abs()).ge_(0)
+        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead).mul_((count - 1).clamp(0, 1))
+        nearest = flat_index(smallest(square, wanted, 1))
+        target = torch.stack([x.flatten().index_select(0, nearest), y.flatten().index_select(0, nearest)])
+        return target, wanted.amax(0) > 0

@@ -123,7 +123,7 @@ def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track], assig
     for name, value in before.items():
         assert torch.equal(after[name][..., ~mask], value[..., ~mask]), name
     assert torch.equal(env.pose[:, mask], env.map.starts[:, env.track[mask]])
-    for name in ("history", "steps", "lap", "on_line", "known"):
+    for name in ("history", "steps", "lap", "on_line"):
         assert not after[name][..., mask].any(), name
     assert fresh["observation"][mask].ne(state["observation"][mask]).any(dim=-1).all()
 
