@@ -6,6 +6,7 @@ import csv
 import io
 import os
 import re
+import stat
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
@@ -18,6 +19,7 @@ from coil_rl.envs.track import Track, TrackError
 
 Split = Literal["train", "test", "all"]
 
+LARGEST_FILE = 10_000_000  # bytes, a hundred times the longest track's
 COLUMNS = ("Cone_Type", "Cone_X", "Cone_Y")
 
 
@@ -49,12 +51,16 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
 def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> list[Track]:
     """Read one level file, or every *.csv of a folder, MAP_2 before MAP_10; `start` as in `load_track`, for all."""
     path = Path(path)
-    if not path.is_dir():
-        return [load_track(path, start)]
-    files = [file for file in path.iterdir() if file.suffix.lower() == ".csv" and not file.name.startswith(".")]
+    try:
+        if not path.is_dir():
+            return [load_track(path, start)]
+        files = [file for file in path.iterdir() if file.suffix.lower() == ".csv" and not file.name.startswith(".")]
+    except OSError as error:
+        raise TrackError(f"{path} cannot be read ({error.strerror}); give a level file or a folder of some.") from None
     if not files:
         raise TrackError(f"The folder {path} holds no level files (*.csv); give a folder with some, or one file.")
-    files.sort(key=lambda file: [int(part) if part.isdigit() else part for part in re.split(r"([0-9]+)", file.name)])
+    # Every second part is a number.
+    files.sort(key=lambda file: [int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", file.name))])
     return [load_track(file, start) for file in files]
 
 
@@ -94,11 +100,19 @@ def _shipped(split: Split) -> tuple[Track, ...]:
 
 def _read_text(path: Path) -> str:
     try:
+        about = path.stat()
+        # A pipe would wait for ever, a device never end.
+        if stat.S_ISCHR(about.st_mode) or stat.S_ISFIFO(about.st_mode) or about.st_size > LARGEST_FILE:
+            raise TrackError(f"{path} is no file of at most {LARGEST_FILE} bytes; give the path of a level file.")
         text = path.read_bytes().decode("utf-8-sig")
     except OSError as error:
         raise TrackError(f"{path} cannot be read ({error.strerror}); give the path of a level file.") from None
     except UnicodeDecodeError:
         raise TrackError(f"{path} is not a text file; save the level as CSV in UTF-8.") from None
+    except ValueError as error:
+        if isinstance(error, TrackError):
+            raise
+        raise TrackError(f"{str(path)!r} is no path ({error}); give the path of a level file.") from None
     if not text.strip():
         raise TrackError(f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}.")
     return text

@@ -16,8 +16,13 @@ Side = Literal["left", "right"]
 SIDES: tuple[Side, Side] = ("left", "right")
 MINIMUM_CONES = 4
 AS_COMPLEX = np.array([1, 1j])
-# Boundaries are sampled every few centimetres, so a level drawn in millimetres would fill the memory.
 LARGEST_COORDINATE = 10_000.0
+# Boundaries are sampled every few centimetres, and an env keeps a grid of the whole area: a level drawn in
+# millimetres, or a file of something else, would fill the memory.
+MOST_CONES = 1000
+LARGEST_EXTENT = 500.0
+LONGEST_SIDE = 5000.0
+MOST_PAIRS = 2 * 10**7
 
 
 class TrackError(ValueError):
@@ -39,9 +44,9 @@ class Track:
             last left and the last right cone, heading for the finish.
 
     Raises:
-        TrackError: if a side has fewer than four cones, cones that are not finite or lie on top of each other, if a
-            boundary crosses itself or the other one, if left is not left of the driving direction, or if the start or
-            the finish lies off the track.
+        TrackError: if a side has fewer than four cones, more or farther apart than any track, cones that are not finite
+            or lie on top of each other, if a boundary crosses itself or the other one, if left is not left of the
+            driving direction, or if the start or the finish lies off the track.
 
     Example:
         >>> import numpy as np
@@ -64,11 +69,13 @@ class Track:
             cones.flags.writeable = False
             object.__setattr__(self, side, cones)
         rings = {side: self.boundary(side, 0.1) for side in SIDES}
+        self._check_size(rings)
         self._check_boundaries(rings)
         pose = self._default_start() if self.start is None else tuple(float(value) for value in self.start)
-        if len(pose) != 3 or not np.isfinite(pose).all():
+        if len(pose) != 3 or not (np.abs(pose) <= LARGEST_COORDINATE).all():
             raise TrackError(
-                f"The start of track {self.name!r} is {self.start}; give three finite numbers x, y, heading."
+                f"The start of track {self.name!r} is {self.start}; give three finite numbers x, y, heading, "
+                f"of at most {LARGEST_COORDINATE:.0f}."
             )
         object.__setattr__(self, "start", pose)
         for what, place in (("start", np.array(pose[:2])), ("finish", self.finish)):
@@ -115,11 +122,20 @@ class Track:
                 f"The {side} side of track {self.name!r} has {len(cones)} cones, of shape {list(cones.shape)}; "
                 f"give at least {MINIMUM_CONES}, of shape [N, 2]."
             )
+        if len(cones) > MOST_CONES:
+            raise TrackError(
+                f"The {side} side of track {self.name!r} has {len(cones)} cones; give at most {MOST_CONES}."
+            )
         if not (np.abs(cones) <= LARGEST_COORDINATE).all():
             row = int(np.flatnonzero(~(np.abs(cones) <= LARGEST_COORDINATE).all(axis=1))[0])
             raise TrackError(
                 f"Cone {row} of the {side} side of track {self.name!r} lies at {cones[row].tolist()}; give finite "
                 f"coordinates in m, at most {LARGEST_COORDINATE:.0f} from the origin."
+            )
+        if np.ptp(cones, axis=0).max() > LARGEST_EXTENT or np.linalg.norm(_edges(cones), axis=1).sum() > LONGEST_SIDE:
+            raise TrackError(
+                f"The {side} side of track {self.name!r} is too large; it may be {LARGEST_EXTENT:.0f} across and "
+                f"{LONGEST_SIDE:.0f} long, both in m."
             )
         double = np.flatnonzero(np.linalg.norm(_edges(cones), axis=1) < 1e-6)
         if len(double):
@@ -128,6 +144,14 @@ class Track:
                 f"Cones {here} and {after} of the {side} side of track {self.name!r} lie on the same spot; remove one "
                 "of them (the ring closes by itself, its first cone is not repeated)."
             )
+
+    def _check_size(self, rings: dict[Side, Array]) -> None:
+        for side, ring in rings.items():
+            if not np.isfinite(ring).all() or np.ptp(ring, axis=0).max() > 2 * LARGEST_EXTENT:
+                raise TrackError(
+                    f"The {side} boundary of track {self.name!r} swings far out between its cones; space them evenly, "
+                    "in driving order."
+                )
 
     def _check_boundaries(self, rings: dict[Side, Array]) -> None:
         crossing = _first_crossing(rings)
@@ -179,7 +203,10 @@ def _first_crossing(rings: dict[Side, Array]) -> tuple[set[Side], Array] | None:
     after[[count - 1, -1]] = 0, count
     # Two pieces can only meet if their middles are no farther apart than the longest piece is long.
     reach = np.linalg.norm(edge, axis=1).max()
-    one, other = cKDTree(begin + edge / 2).query_pairs(reach, output_type="ndarray").T
+    tree = cKDTree(begin + edge / 2)
+    if tree.count_neighbors(tree, reach) > MOST_PAIRS:
+        raise TrackError("The boundaries are a tangle; list each side's cones in driving order, evenly spaced.")
+    one, other = tree.query_pairs(reach, output_type="ndarray").T
 
     def on_left(point: NDArray[np.intp], line: NDArray[np.intp]) -> NDArray[np.bool_]:
         to = begin[point] - begin[line]

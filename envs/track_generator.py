@@ -45,6 +45,8 @@ SMOOTHING = 1.0
 STEP = 0.25
 FINE_STEP = 0.1
 TRIES = 5000
+# To draw so many takes minutes.
+MOST = 10_000
 
 
 def random_track(seed: int, name: str | None = None) -> Track:
@@ -63,8 +65,8 @@ def random_track(seed: int, name: str | None = None) -> Track:
 
 def random_tracks(count: int, seed: int) -> list[Track]:
     """The first `count` tracks of a seed: track k is the same whatever the count, track 0 is `random_track(seed)`."""
-    if count < 1:
-        raise ValueError(f"random_tracks was asked for {count} tracks; ask for at least 1.")
+    if not 1 <= count <= MOST:
+        raise ValueError(f"random_tracks was asked for {count} tracks; ask for 1 to {MOST}.")
     return [_draw(seed, k, f"random_{seed}_{k}") for k in range(count)]
 
 
