@@ -2,64 +2,88 @@
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import hydra.utils
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, RewardSum, TransformedEnv
+from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
+from coil_rl.signature import check_call, shown
 
 
-def build(node: Any, name: str, **given: Any) -> Any:
-    """Instantiate a node of the configuration after checking its keys against what its target takes.
+def build(node: Any, name: str, kind: type | None = None, **given: Any) -> Any:
+    """Instantiate a node of the configuration after checking it against what its target takes.
 
     Args:
         node: has a `_target_`; nodes inside it are instantiated too.
         name: what a person calls this node, for the message.
+        kind: what it must make, if not just anything.
         given: arguments that do not come from the configuration.
 
     Raises:
-        UserError: if a key is none of the target's, if the target does not exist, or if it refuses a value.
+        UserError: if the node has no `_target_`, if that does not exist, does not take a key or a value, or makes
+            something else.
     """
-    if isinstance(node, DictConfig):
-        node = OmegaConf.to_container(node, resolve=True)
-    _check(node, name, set(given))
+    node = check_node(node, name, given)
     try:
-        return hydra.utils.instantiate(node, **given, _convert_="all")
+        built = hydra.utils.instantiate(node, **given, _convert_="all")
     except hydra.errors.InstantiationException as error:
-        if isinstance(error.__cause__, (ValueError, KeyError, TypeError)):
-            raise UserError(f"{name}: {error.__cause__.args[0]}") from error
+        cause = error.__cause__
+        if isinstance(cause, (ValueError, KeyError, TypeError, OSError)):
+            said = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
+            raise UserError(f"{name}: {' '.join(str(said).split())}") from error
+        if cause is None:  # Hydra itself will not call this target
+            raise UserError(f"{name}: {' '.join(str(error).split())}") from error
+        if isinstance(cause, MemoryError) or "allocate" in str(cause):
+            raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         raise
+    if kind is not None and not isinstance(built, kind):
+        raise UserError(f"{name}: {node['_target_']} makes {type(built).__name__}, but {kind.__name__} is wanted")
+    return built
 
 
-def _check(node: Any, name: str, given: set[str]) -> None:
+def check_node(node: Any, name: str, given: Iterable[str] = ()) -> dict[str, Any]:
+    """The node with all references resolved, if it and the nodes inside it are calls that can be made.
+
+    Args:
+        node: as for `build`.
+        name: as for `build`.
+        given: the names of what `build` is given besides.
+
+    Raises:
+        UserError: as `build`, without building anything.
+    """
+    if isinstance(node, (DictConfig, ListConfig)):
+        node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    if not isinstance(node, Mapping) or "_target_" not in node:
+        raise UserError(f"{name}={shown(node)} names nothing to build; give it a _target_, the full name of a class")
+    _check(node, name, given)
+    return dict(node)
+
+
+def _check(node: Any, name: str, given: Iterable[str] = ()) -> None:
     if isinstance(node, Mapping):
-        if "_target_" in node:
-            target = node["_target_"]
-            try:
-                called = hydra.utils.get_object(target)
-            except Exception as error:
-                raise UserError(f"{name}: there is no {target}; is its package installed?") from error
-            _check_keys(called, set(node) - {"_target_", "_partial_"} | given, name, target)
         for key, value in node.items():
-            _check(value, f"{name}.{key}", set())
+            _check(value, f"{name}.{key}")
+        if "_target_" in node:
+            check_call(_target(node["_target_"], name), node, name, given)
     elif isinstance(node, list):
         for index, value in enumerate(node):
-            _check(value, f"{name}[{index}]", set())
+            _check(value, f"{name}[{index}]")
 
 
-def _check_keys(called: Any, keys: set[str], name: str, target: str) -> None:
-    parameters = inspect.signature(called).parameters.values()
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    takes = [parameter.name for parameter in parameters if parameter.kind is not parameter.VAR_POSITIONAL]
-    unknown = sorted(keys - set(takes))
-    if unknown:
-        raise UserError(f"{name}: {target.rsplit('.')[-1]} takes no {', '.join(unknown)}; it takes {', '.join(takes)}")
+def _target(target: Any, name: str) -> Callable[..., Any]:
+    try:
+        found = hydra.utils.get_object(target)
+    except Exception as error:
+        raise UserError(f"{name}: there is no {target!r}; is it spelt right, and its package installed?") from error
+    if not callable(found):
+        raise UserError(f"{name}: {target} is {found!r}, which cannot be called; give a class or a function")
+    called: Callable[..., Any] = found
+    return called
 
 
 def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, observed: bool = True) -> EnvBase:
@@ -70,14 +94,15 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
         overrides: what to change in `env`.
         observed: False leaves the method's transforms out: a guide drives in the bare env.
     """
-    node = OmegaConf.merge(config.env, dict(overrides or {}))
-    env: EnvBase = build(node, "env")
+    with open_dict(config):  # which keys the env takes is its own to say
+        node = OmegaConf.merge(config.env, dict(overrides or {}))
+    env: EnvBase = build(node, "env", EnvBase)
     parts = config.method.transforms if observed else []
-    transforms = [build(part, f"method.transforms[{i}]") for i, part in enumerate(parts)]
+    transforms = [build(part, f"method.transforms[{i}]", Transform) for i, part in enumerate(parts)]
     return TransformedEnv(env, Compose(*transforms, RewardSum()))
 
 
 def build_guide(config: DictConfig) -> TensorDictModuleBase:
     """The guide of a configuration."""
-    guide: TensorDictModuleBase = build(config.guide, "guide")
+    guide: TensorDictModuleBase = build(config.guide, "guide", TensorDictModuleBase)
     return guide

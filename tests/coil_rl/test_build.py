@@ -72,7 +72,7 @@ def test_key_of_a_nested_part_is_checked_too():
 
 
 def test_target_that_does_not_exist_is_named():
-    with pytest.raises(UserError, match=r"guide: there is no coil_rl\.guides\.Oracle"):
+    with pytest.raises(UserError, match=r"guide: there is no 'coil_rl\.guides\.Oracle'"):
         build({"_target_": "coil_rl.guides.Oracle"}, "guide")
 
 
