@@ -33,14 +33,24 @@ class Evaluation:
 
 
 @dataclass
+class Method:
+    """What the agent learns from, if there is an agent."""
+
+    name: str = MISSING
+    observes: list[str] | None = MISSING
+    transforms: list[Any] = field(default_factory=list)
+
+
+@dataclass
 class Common:
     """What every program that drives has."""
 
+    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
     preset: dict[str, Any] = MISSING
     track: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
-    method: dict[str, Any] = MISSING
+    method: Method = field(default_factory=Method)
     budget: Budget = field(default_factory=Budget)
     evaluation: Evaluation = field(default_factory=Evaluation)
     seed: int = 0
@@ -55,7 +65,7 @@ class Train(Common):
 
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
-    watch: dict[str, Any] = field(default_factory=dict)
+    watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: int = 10
 
 
@@ -66,5 +76,7 @@ class Evaluate(Common):
     run: str | None = None
 
 
+REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
+ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
 ConfigStore.instance().store(name="schema", node=Train)
 ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)

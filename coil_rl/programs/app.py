@@ -7,47 +7,60 @@ import logging
 import os
 import sys
 from collections.abc import Callable
-from typing import Any, NoReturn
+from typing import Any
 
 import hydra
+import yaml
+from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl import config as _schema  # noqa: F401  registers the typed roots
+from coil_rl.check import check
 from coil_rl.errors import UserError
+from coil_rl.programs.refusal import refuse
 
 
 def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
     """Run a task under Hydra; exit code 2 and one sentence on standard error for a mistake in what was given."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-
-    def refuse(error: Exception) -> NoReturn:
-        print(f"{config_name}: {_sentence(error)}", file=sys.stderr)
-        sys.exit(2)
+    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
+    _check_options(config_name)
+    of_task: list[Exception] = []
 
     @functools.wraps(task)
-    def politely(config: DictConfig) -> Any:
-        # Here and not outside, where Hydra would have put a line of its own before the sentence.
+    def checked(config: DictConfig) -> Any:
         try:
+            check(config)
             return task(config)
-        except (UserError, OmegaConfBaseException) as error:
-            refuse(error)
+        except Exception as error:
+            of_task.append(error)
+            raise
 
     try:
-        hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(politely)()
-    except (HydraException, OmegaConfBaseException) as error:
-        refuse(error)
+        hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
+    except (UserError, OmegaConfBaseException) as error:
+        refuse(config_name, error)
+    except (HydraException, ValueError, OSError, yaml.YAMLError) as error:
+        # Until the task runs there is only what was given to go wrong; in it, the same error is a bug of ours.
+        if error in of_task:
+            raise
+        refuse(config_name, error)
     except KeyboardInterrupt:
         print(f"{config_name}: interrupted", file=sys.stderr)
         sys.exit(130)
 
 
-def _sentence(error: BaseException) -> str:
-    """The message on one line, with the cause that Hydra hides behind it."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    cause = error.__cause__
-    if cause is not None and not isinstance(error, UserError) and str(cause).splitlines()[0] not in lines:
-        lines.append(str(cause).splitlines()[0])
-    return " ".join(line for line in lines if not line.startswith(("full_key:", "object_type=", "reference_type=")))
+def _check_options(config_name: str) -> None:
+    """Refuse unknown options, for which argparse would print its whole usage."""
+    parser = get_args_parser()
+
+    def error(message: str) -> None:
+        refuse(config_name, UserError(f"{message}; options such as -m come first, then KEY=VALUE (see --hydra-help)"))
+
+    vars(parser)["error"] = error
+    for override in parser.parse_args().overrides:
+        if override.startswith("="):
+            error(f"{override!r} has no key, write KEY=VALUE")

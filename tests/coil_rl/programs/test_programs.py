@@ -69,22 +69,18 @@ def test_a_folder_that_holds_a_run_is_refused(run):
     assert done.stderr.strip() == sentence
 
 
+# Many more of them, in one process, are in test_mistakes.py.
 @pytest.mark.parametrize(
-    ("name", "arguments", "words"),
+    ("name", "arguments", "sentence"),
     [
-        ("train", ["sed=1"], "Key 'sed' not in 'Train'"),
-        ("train", ["method=coyl"], "Available options in 'method': coil guide ppo"),
-        ("train", ["learner.rate=1"], "Key 'rate' is not in struct"),
-        ("train", ["budget.frames=many"], "Value 'many' of type 'str' could not be converted to Integer"),
-        ("train", ["track=folder", "track.dir=/nowhere"], "/nowhere cannot be read"),
-        ("evaluate", ["run=/nowhere"], "run=/nowhere is not the folder of a run"),
+        ("train", ["learner.gamma=abc"], "train: learner: gamma='abc' must be a finite number"),
+        ("evaluate", ["run=/nowhere"], "evaluate: run=/nowhere is not the folder of a run: it has no config.yaml"),
     ],
 )
-def test_mistakes_are_one_sentence_and_exit_code_2(name, arguments, words, tmp_path):
-    done = program(name, *arguments, cwd=tmp_path, code=2)
-    (sentence,) = done.stderr.strip().splitlines()
-    assert words in sentence
-    assert "Traceback" not in done.stderr
+def test_mistakes_are_one_sentence_exit_code_2_and_no_folder(name, arguments, sentence, tmp_path):
+    done = program(name, *arguments, *TINY[3:5], cwd=tmp_path, code=2)
+    assert done.stderr == sentence + "\n"
+    assert not list(tmp_path.iterdir())
 
 
 def test_info_names_the_versions_that_matter(tmp_path):

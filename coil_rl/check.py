@@ -1,0 +1,144 @@
+"""Everything that a run will need, built once before it starts: a mistake shall cost seconds, not the night.
+
+Nothing is written, but for the folder of the run as the very last step.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from coil_rl.build import build, build_env, build_guide, check_node
+from coil_rl.config import Train
+from coil_rl.errors import UserError
+from coil_rl.signature import near
+
+LARGEST = 2**63 - 1
+# Lowest and highest value; most of the highest only keep a slip of the keyboard from filling the memory.
+LIMITS = {
+    "seed": (0, LARGEST),
+    "threads": (1, 1024),
+    "budget.frames": (1, LARGEST),
+    "budget.cars": (1, 2**20),
+    "budget.steps": (1, 2**16),
+    "evaluation.repeats": (1, 10_000),
+    "checkpoint_every": (1, LARGEST),
+}
+LARGEST_BATCH = 2**28
+POLICIES = ("last", "best")
+
+
+def check(config: DictConfig) -> None:
+    """Refuse a configuration that could not be run to its end.
+
+    Args:
+        config: of a program; one with a `learner` trains.
+
+    Raises:
+        UserError: in one sentence, what is wrong.
+    """
+    _check_values(config)
+    training = OmegaConf.get_type(config) is Train
+    for part in ("train", "test") if training else ("test",):
+        if not build(config.track.get(part), f"track.{part}"):
+            raise UserError(f"track.{part} gives no tracks; give at least one")
+    if training or config.run is None:
+        check_node(config.env, "env")
+        env = build_env(config, {**config.evaluation.env, "num_cars": 1}, observed=False)
+        _check_guide(build_guide(config), env)
+    if training and config.method.observes is not None:
+        _check_training(config)
+    _make_folder(Path(config.run_dir))
+
+
+def _check_values(config: DictConfig) -> None:
+    for name in ("", "budget", "evaluation", "method"):
+        node = OmegaConf.select(config, name) if name else config
+        known = [field.name for field in fields(node._metadata.object_type) if field.name != "defaults"]
+        for key in sorted(set(node).difference(known)):
+            inside = name or "the configuration"
+            raise UserError(f"there is no key {key} in {inside}, which has {', '.join(known)}{near(str(key), known)}")
+    for name, (low, high) in LIMITS.items():
+        value = OmegaConf.select(config, name)
+        if value is not None and not low <= value <= high:
+            raise UserError(f"{name}={value} must be {f'at least {low}' if value < low else f'at most {high}'}")
+    if config.evaluation.policy not in POLICIES:
+        raise UserError(f"evaluation.policy={config.evaluation.policy} must be one of {', '.join(POLICIES)}")
+    frames = config.budget.cars * config.budget.steps
+    if frames > LARGEST_BATCH:
+        raise UserError(f"budget.cars x budget.steps={frames} must be at most {LARGEST_BATCH}")
+    for name in ("device", "env.device"):
+        if isinstance(device := OmegaConf.select(config, name), str):
+            _check_device(name, device)
+
+
+def _check_device(key: str, name: str) -> None:
+    if not re.fullmatch(r"cpu|cuda(:\d+)?", name):
+        raise UserError(f"{key}={name} must be cpu, cuda, or one GPU such as cuda:0")
+    try:
+        torch.empty(0, device=name)
+    except (AssertionError, RuntimeError) as error:
+        raise UserError(f"{key}={name} cannot be used ({str(error).splitlines()[0]}); take {key}=cpu") from error
+
+
+def _check_guide(guide: TensorDictModuleBase, env: EnvBase) -> None:
+    data = env.reset()
+    for key in guide.in_keys:
+        if key not in data.keys(True):
+            raise UserError(f"guide: it reads {key}, but the env has only {', '.join(map(_name, data.keys()))}")
+    try:
+        action = guide(data)["action"]
+    except ValueError as error:
+        raise UserError(f"guide: {error}") from error
+    shape, wanted = action.shape, env.action_spec.shape
+    if shape != wanted:
+        raise UserError(f"guide: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
+
+
+def _check_training(config: DictConfig) -> None:
+    if not config.method.observes:
+        raise UserError("method.observes=[] lets the agent see nothing; name entries of the env, or null for no agent")
+    env = build_env(config)
+    learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    frames = config.budget.cars * config.budget.steps
+    minibatches = getattr(learner, "minibatches", 1)  # not every learner has them
+    if minibatches > frames:
+        raise UserError(
+            f"learner.minibatches={minibatches} must be at most {frames}, the frames of a batch: cars x steps of budget"
+        )
+    if config.logger:
+        check_node(config.logger, "logger")
+    known = {_name(key): key for spec in (env.observation_spec, env.full_reward_spec) for key in spec.keys(True)}
+    for group, keys in config.watch.items():
+        if group not in ("episode", "step"):
+            raise UserError(f"there is no key watch.{group}; watch has episode, step{near(group, ('episode', 'step'))}")
+        for name, key in keys.items():
+            if _name(key) not in known:
+                raise UserError(
+                    f"watch.{group}.{name}={list(key)} is no entry of the env; it has "
+                    f"{', '.join(sorted(known))}{near(_name(key), known)}"
+                )
+
+
+def _name(key: str | Iterable[Any]) -> str:
+    return key if isinstance(key, str) else ".".join(map(str, key))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(None, "Permission denied")
+    except OSError as error:
+        raise UserError(
+            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with hydra.run.dir=FOLDER"
+        ) from error
