@@ -95,10 +95,7 @@ def _check_guide(guide: TensorDictModuleBase, env: EnvBase) -> None:
     for key in guide.in_keys:
         if key not in data.keys(True):
             raise UserError(f"guide: it reads {key}, but the env has only {', '.join(map(_name, data.keys()))}")
-    try:
-        action = guide(data)["action"]
-    except ValueError as error:
-        raise UserError(f"guide: {error}") from error
+    action = guide(data)["action"]
     shape, wanted = action.shape, env.action_spec.shape
     if shape != wanted:
         raise UserError(f"guide: its action has the shape {list(shape)}, but the env takes {list(wanted)}")

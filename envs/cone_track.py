@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
+from functools import partial, reduce
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -136,9 +136,19 @@ class ConeTrackEnv(EnvBase):
         for name, value in positive.items():
             if not value > 0:
                 raise ValueError(f"{name}={value} must be more than 0")
+        for name, value in {"held_steps": held_steps, "seed": seed}.items():
+            if value < 0:
+                raise ValueError(f"{name}={value} must be at least 0")
+        if round(time_limit * rate) < 1:
+            raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
+        if max_steering > 90:
+            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         unknown = set(reward or {}) - set(Reward._fields)
         if unknown:
             raise ValueError(f"reward has no weight {sorted(unknown)}; it has {', '.join(Reward._fields)}")
+        for name, value in (reward or {}).items():
+            if not abs(value) <= 1e6:
+                raise ValueError(f"reward.{name}={value} must be between -1e6 and 1e6")
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
         self.dtype_ = dtype
         self.rate, self.laps, self.held_steps, self.assignment = rate, laps, held_steps, assignment
@@ -386,11 +396,10 @@ class ConeTrackEnv(EnvBase):
 
 def _recent_mean(history: Tensor) -> Tensor:
     """Mean of the last actions [20, B], newest first, weighted exp(-0.1 k), in a fixed order of summation."""
-    decay = math.exp(-0.1)
-    total = history[-1]
-    for action in reversed(history.unbind(0)[:-1]):
-        total = torch.add(action, total, alpha=decay)
-    return total * ((1 - decay) / (1 - decay**HISTORY))
+    decay = math.exp(-0.1) ** torch.arange(HISTORY, dtype=history.dtype, device=history.device)
+    fours = (history * (decay / decay.sum()).unsqueeze(-1)).view(4, HISTORY // 4, -1)
+    pairs = fours[:2] + fours[2:]
+    return reduce(torch.add, (pairs[0] + pairs[1]).unbind(0))
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -65,6 +65,7 @@ class ZeroGuide(ConstantGuide):
     """
 
     def __init__(self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action") -> None:
+        _check_size(size)
         super().__init__([0.0] * size, in_key, out_key)
 
 
@@ -89,4 +90,10 @@ class RandomGuide(TensorDictModule):
         in_key: NestedKey = "observation",
         out_key: NestedKey = "action",
     ) -> None:
+        _check_size(size)
         super().__init__(_Random(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
+
+
+def _check_size(size: int) -> None:
+    if size < 1:
+        raise ValueError(f"size={size} must be at least 1")

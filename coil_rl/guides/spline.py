@@ -66,6 +66,14 @@ class SplineGuide(TensorDictModuleBase):
         super().__init__()
         if spline not in ("cubic", "quadratic"):
             raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
+        for name, value, low in (("cones", cones, 1), ("midpoints", midpoints, 2), ("targets", targets, 2)):
+            if value < low:
+                raise ValueError(f"{name}={value} must be at least {low}")
+        for name, number in {"smoothing": smoothing, "sharpness": sharpness}.items():
+            if not 0 <= number < math.inf:
+                raise ValueError(f"{name}={number} must be a finite number of at least 0")
+        if not 0 < max_steering < math.inf or not math.isfinite(gain):
+            raise ValueError(f"max_steering={max_steering} must be more than 0 and gain={gain} finite")
         self.fit = least_squares_parabola if spline == "quadratic" else partial(smoothing_spline, smoothing=smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
         self.cones, self.midpoints, self.targets = cones, midpoints, targets

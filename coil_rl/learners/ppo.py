@@ -6,6 +6,7 @@ passes over the batch in minibatches, held near the policy that collected it by 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -68,9 +69,21 @@ class PPO:
         for name, value in {"hidden": min(hidden, default=1), "epochs": epochs, "minibatches": minibatches}.items():
             if value < 1:
                 raise ValueError(f"{name}={value} must be at least 1")
+        for name, number, low, high in (
+            ("gamma", gamma, 0, 1), ("gae_lambda", gae_lambda, 0, 1), ("critic", critic, 0, math.inf),
+            ("seed", seed, 0, 2**63 - 1),
+        ):  # fmt: skip
+            if not low <= number <= high:
+                raise ValueError(f"{name}={number} must be at least {low} and at most {high}")
+        for name, number in {"action_scale": action_scale, "clip": clip, "max_grad_norm": max_grad_norm}.items():
+            if not 0 < number < math.inf:
+                raise ValueError(f"{name}={number} must be a finite number of more than 0")
         self.policy = networks.actor(env, in_keys, hidden, action_scale)
         self.critic = networks.critic(env, in_keys, hidden)
         self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
+        for name, number in {"learning_rate": self.learning_rate(0), "entropy": self.entropy(0)}.items():
+            if not 0 <= number < math.inf:
+                raise ValueError(f"{name}={number} must be a finite number of at least 0")
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
         self.advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=self.critic)
         self.loss = ClipPPOLoss(
@@ -82,6 +95,7 @@ class PPO:
             critic_coeff=critic,
             loss_critic_type="l2",
             normalize_advantage=True,
+            functional=False,
         )
         self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)

@@ -210,3 +210,13 @@ def test_guide_can_write_beside_the_action() -> None:
 def test_an_unknown_spline_is_named() -> None:
     with pytest.raises(ValueError, match="spline='linear' must be one of cubic, quadratic"):
         SplineGuide("linear")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("cones", 0), ("midpoints", 1), ("targets", 1), ("smoothing", -1), ("sharpness", math.nan), ("max_steering", 0),
+     ("gain", math.inf)],
+)  # fmt: skip
+def test_a_value_outside_its_range_is_named(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name}={value}"):
+        SplineGuide(**{name: value})  # type: ignore[arg-type]

@@ -105,3 +105,13 @@ def test_solves_cartpole():
 def test_counts_below_one_are_refused(name):
     with pytest.raises(ValueError, match=f"{name}=0 must be at least 1"):
         PPO(PendulumEnv(), ["th"], **{name: 0})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("gamma", 2), ("gae_lambda", -1), ("critic", -1), ("seed", -1), ("action_scale", 0), ("clip", 0),
+     ("max_grad_norm", -1), ("learning_rate", -1), ("entropy", -1)],
+)  # fmt: skip
+def test_numbers_outside_their_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name}={value} must be"):
+        PPO(PendulumEnv(), ["th"], **{name: value})

@@ -111,7 +111,7 @@ def refusal(name, *arguments):
         ("guide=constant guide.value=[1,2]", "guide: its action has the shape [1, 2], but the env takes [1, 1]"),
         # targets
         ("guide._target_=coil_rl.guides.Nope", "guide: there is no 'coil_rl.guides.Nope'; is it spelt right"),
-        ("guide._target_=coil_rl.guides.spline.FAR", "is 1000000.0, which cannot be called"),
+        ("guide._target_=coil_rl.guides.spline.FAR", "is 1000.0, which cannot be called"),
         ("guide=zero guide._target_=builtins.dict", "makes dict, but TensorDictModuleBase is wanted"),
         ("guide=zero guide._target_=subprocess.run", "guide: Target 'subprocess.run' is blocklisted"),
         ("~guide._target_", "names nothing to build; give it a _target_"),
