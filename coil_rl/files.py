@@ -1,8 +1,9 @@
-"""Files that appear whole or not at all."""
+"""Files that appear whole or not at all, also where the process is killed or the power fails."""
 
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +24,29 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     unfinished = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield unfinished
+        _to_disk(unfinished)
         unfinished.replace(path)
+        folder_to_disk(path.parent)
     finally:
         unfinished.unlink(missing_ok=True)
+
+
+def folder_to_disk(folder: Path) -> None:
+    """Wait until the names in a folder are on the disk."""
+    if os.name != "nt":  # where a folder cannot be opened
+        _to_disk(folder)
+
+
+def remove_unfinished(folder: Path) -> None:
+    """Remove what killed processes had not finished writing; nobody else may be writing there now."""
+    for path in folder.iterdir():
+        if re.fullmatch(r"\..+\.\d+(\.\w+)?", path.name):
+            path.unlink()
+
+
+def _to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
