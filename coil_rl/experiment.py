@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import csv
 import math
+import sys
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,6 +17,9 @@ from tensordict.utils import NestedKey
 from tqdm import tqdm
 
 from coil_rl import checkpoint
+from coil_rl.errors import UserError
+from coil_rl.finite import check_losses, check_state
+from coil_rl.metrics import Metrics
 from coil_rl.rollout import Rollout
 
 
@@ -38,7 +42,8 @@ class Experiment:
     """One training run in one folder.
 
     It leaves there `metrics.csv` (one row an update), `checkpoint.pt` (everything a later process needs to go on),
-    `policy_best.pt` and `policy_last.pt`.
+    `checkpoint_previous.pt` (the one before it), `policy_best.pt` and `policy_last.pt`. After `resume` in a new process
+    it ends on a CPU with the same files, to the bit, wherever the process before it was killed.
 
     Args:
         learner: learns.
@@ -64,49 +69,89 @@ class Experiment:
         checkpoint_every: int = 10,
     ) -> None:
         self.learner, self.rollout, self.frames, self.folder = learner, rollout, frames, folder
-        self.logger, self.checkpoint_every = logger, checkpoint_every
+        self.metrics, self.checkpoint_every = Metrics(folder / "metrics.csv", logger), checkpoint_every
         watch = watch or {}
         self.watch_episode = {name: ("next", *key) for name, key in watch.get("episode", {}).items()}
         self.watch_step = {name: ("next", *key) for name, key in watch.get("step", {}).items()}
         self.updates = 0
         self.best = -math.inf
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
+        self.rows: list[dict[str, float]] = []
+
+    def resume(self) -> None:
+        """Go on where the folder's last whole checkpoint was written, or from the beginning if there is none.
+
+        Raises:
+            UserError: if no checkpoint there can be used, or rows of `metrics.csv` are gone.
+        """
+        state = checkpoint.load_newest(self.folder)
+        if state is not None:
+            self.load_state_dict(state)
+        self.rows = self.metrics.keep(self.updates)
+        where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
+        print(f"{self.folder} goes on {where}", file=sys.stderr)
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
         """Train to the end and return the rows of `metrics.csv`.
 
         Args:
             guide_return: shown beside the agent's, to compare.
+
+        Raises:
+            UserError: at the first number from the env, the losses or the weights that is NaN.
         """
-        rows: list[dict[str, float]] = []
-        updates = math.ceil(self.frames / self.rollout.frames)
-        with tqdm(total=updates * self.rollout.frames, unit="frame", unit_scale=True, desc="train") as bar:
+        updates, frames = math.ceil(self.frames / self.rollout.frames), self.rollout.frames
+        with tqdm(
+            total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
+        ) as bar:
             while self.updates < updates:
-                rows.append(self.update(self.updates / updates))
-                bar.update(self.rollout.frames)
-                shown = {"return": f"{rows[-1]['train/return']:.0f}"}
+                row = self.update(self.updates / updates)
+                self.rows.append(row)
+                self.metrics.append(row)
+                bar.update(frames)
+                shown = {"return": f"{row['train/return']:.0f}"}
                 if guide_return is not None:
                     shown["guide"] = f"{guide_return:.0f}"
                 bar.set_postfix(shown)
-                self._write_row(rows[-1])
                 if self.updates % self.checkpoint_every == 0 or self.updates == updates:
-                    checkpoint.save(self.state_dict(), self.folder / "checkpoint.pt")
-        checkpoint.save(self.learner.policy.state_dict(), self.folder / "policy_last.pt")
-        if not (self.folder / "policy_best.pt").exists():
-            checkpoint.save(self.learner.policy.state_dict(), self.folder / "policy_best.pt")
-        return rows
+                    self._save()
+        policy = self.learner.policy.state_dict()
+        checkpoint.save(policy, self.folder / "policy_last.pt")
+        if self.best == -math.inf:
+            checkpoint.save(policy, self.folder / "policy_best.pt")
+        return self.rows
 
     def update(self, progress: float) -> dict[str, float]:
         """Collect one batch and learn from it; returns the row for the log."""
-        batch = self.rollout.collect()
+        with self._saying_how_to_go_on():
+            batch = self.rollout.collect()
         row = self._describe(batch)
         if len(self.returns) == self.EPISODES and row["train/return"] > self.best:
             # The policy that collected this batch, not the one that learned from it.
             self.best = row["train/return"]
             checkpoint.save(self.learner.policy.state_dict(), self.folder / "policy_best.pt")
-        row |= {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
+        learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
         self.updates += 1
-        return {"frames": self.updates * self.rollout.frames, **row}
+        with self._saying_how_to_go_on():
+            check_losses(learned, self.updates)
+        return {"frames": self.updates * self.rollout.frames, **row, **learned}
+
+    @contextmanager
+    def _saying_how_to_go_on(self) -> Iterator[None]:
+        try:
+            yield
+        except UserError as error:
+            raise UserError(
+                f"{error}; the last good checkpoint is kept: mend the cause and go on with "
+                f"coil-train resume={self.folder}, or train again with other values"
+            ) from error
+
+    def _save(self) -> None:
+        state = self.state_dict()
+        with self._saying_how_to_go_on():
+            check_state(state["learner"], self.updates)
+        self.metrics.flush()
+        checkpoint.save_newest(state, self.folder)
 
     def _describe(self, batch: TensorDictBase) -> dict[str, float]:
         after = batch["next"]
@@ -123,18 +168,6 @@ class Experiment:
             row[f"train/{name}"] = float(batch[key].float().mean())
         return row
 
-    def _write_row(self, row: dict[str, float]) -> None:
-        path = self.folder / "metrics.csv"
-        first = not path.exists()
-        with path.open("a", newline="") as file:
-            writer = csv.DictWriter(file, list(row))
-            if first:
-                writer.writeheader()
-            writer.writerow(row)
-        if self.logger is not None:
-            for name, value in row.items():
-                self.logger.log_scalar(name, value, step=int(row["frames"]))
-
     def state_dict(self) -> dict[str, Any]:
         """Everything the rest of the run depends on."""
         return {
@@ -144,6 +177,7 @@ class Experiment:
             "best": self.best,
             "returns": list(self.returns),
             "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -153,6 +187,8 @@ class Experiment:
         self.updates, self.best = state["updates"], state["best"]
         self.returns = deque(state["returns"], maxlen=self.EPISODES)
         torch.set_rng_state(state["torch_rng"])
+        if state["cuda_rng"]:
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
 def watched_keys(watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:

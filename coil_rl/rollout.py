@@ -12,6 +12,8 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.finite import check_batch
+
 
 class Rollout:
     """Batches of consecutive steps of every row of an env, resetting each row that is done.
@@ -35,6 +37,7 @@ class Rollout:
         self.env, self.policy, self.steps = env, policy, steps
         self.keys = None if keys is None else [*keys, *(("next", *_tuple(key)) for key in keys)]
         self.carrier: TensorDictBase | None = None
+        self.taken = 0  # steps of each row
 
     @property
     def frames(self) -> int:
@@ -43,15 +46,33 @@ class Rollout:
 
     @torch.no_grad()
     def collect(self) -> TensorDictBase:
-        """The next batch, [B, T]."""
+        """The next batch, [B, T].
+
+        Raises:
+            UserError: if a number in it is NaN or infinite, naming the entry, the step and the row.
+        """
         carrier = self.env.reset() if self.carrier is None else self.carrier
-        batch = []
-        with set_exploration_type(ExplorationType.RANDOM):
-            for _ in range(self.steps):
-                step, carrier = self.env.step_and_maybe_reset(self.policy(carrier))
-                batch.append(step if self.keys is None else step.select(*self.keys, strict=False))
+        steps: list[TensorDictBase] = []
+        time = len(self.env.batch_size)
+        try:
+            with set_exploration_type(ExplorationType.RANDOM):
+                for _ in range(self.steps):
+                    step, carrier = self.env.step_and_maybe_reset(self.policy(carrier))
+                    steps.append(self._kept(step))
+        except Exception:
+            # An env may break over the NaN that it wrote a step ago, and that NaN is what a person must hear of.
+            if steps:
+                check_batch(torch.stack(steps, time), self.taken)
+            check_batch(self._kept(carrier).unsqueeze(time), self.taken + len(steps))
+            raise
+        batch = torch.stack(steps, time)
+        check_batch(batch, self.taken)
         self.carrier = carrier
-        return torch.stack(batch, dim=len(self.env.batch_size))
+        self.taken += self.steps
+        return batch
+
+    def _kept(self, entries: TensorDictBase) -> TensorDictBase:
+        return entries if self.keys is None else entries.select(*self.keys, strict=False)
 
     def state_dict(self) -> dict[str, Any]:
         """Where the env and the collection stand."""
@@ -60,6 +81,7 @@ class Rollout:
             "env": env.state_dict(),
             "transforms": self.env.state_dict() if env is not self.env else {},
             "carrier": None if self.carrier is None else self.carrier.to_dict(),
+            "taken": self.taken,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -71,7 +93,7 @@ class Rollout:
         carrier = state["carrier"]
         if carrier is not None:
             carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
-        self.carrier = carrier
+        self.carrier, self.taken = carrier, state["taken"]
 
 
 def _tuple(key: NestedKey) -> tuple[str, ...]:
