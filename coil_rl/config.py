@@ -67,6 +67,7 @@ class Train(Common):
     logger: dict[str, Any] | None = None
     watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: int = 10
+    resume: str | None = None
 
 
 @dataclass

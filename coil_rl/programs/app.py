@@ -5,8 +5,10 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import hydra
@@ -23,9 +25,8 @@ from coil_rl.programs.refusal import refuse
 
 
 def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
-    """Run a task under Hydra; exit code 2 and one sentence on standard error for a mistake in what was given."""
+    """Run a task under Hydra as a program."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
     _check_options(config_name)
     of_task: list[Exception] = []
@@ -39,17 +40,30 @@ def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
             of_task.append(error)
             raise
 
+    with program(config_name):
+        try:
+            hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
+        except (HydraException, ValueError, OSError, yaml.YAMLError) as error:
+            # Until the task runs there is only what was given to go wrong; in it, the same error is a bug of ours.
+            if error in of_task:
+                raise
+            refuse(config_name, error)
+
+
+@contextmanager
+def program(name: str) -> Iterator[None]:
+    """Around all that a process does: one sentence on standard error instead of a traceback.
+
+    A mistake in what was given ends the process with exit code 2, Ctrl-C and SIGTERM with 130.
+    """
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
-        hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
+        yield
     except (UserError, OmegaConfBaseException) as error:
-        refuse(config_name, error)
-    except (HydraException, ValueError, OSError, yaml.YAMLError) as error:
-        # Until the task runs there is only what was given to go wrong; in it, the same error is a bug of ours.
-        if error in of_task:
-            raise
-        refuse(config_name, error)
-    except KeyboardInterrupt:
-        print(f"{config_name}: interrupted", file=sys.stderr)
+        refuse(name, error)
+    except KeyboardInterrupt as stop:
+        print(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}", file=sys.stderr)
         sys.exit(130)
 
 

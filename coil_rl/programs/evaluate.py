@@ -3,35 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
-import yaml
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl import checkpoint
 from coil_rl.build import build, build_env
-from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.programs import app
-from coil_rl.programs.judge import judge
-from coil_rl.programs.sentence import sentence
+from coil_rl.programs.judge import judge, outcome
+from coil_rl.programs.run_folder import configuration
 
 
 def evaluate(config: DictConfig) -> float:
     """Judge what the configuration names; returns the mean reward of its deterministic policy."""
     torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    agent = None
+    seed, agent = config.seed, None
     if config.run is not None:
         config, agent = restore(Path(config.run), config)
-    table = judge(config, agent, folder)
-    mean = next(row for row in reversed(table) if row["track"] == "mean" and row["actions"] == "deterministic")
-    print(f"{mean['driver']}: mean reward {mean['reward']:.1f}, {mean['completed']:.0%} completed; see {folder}")
-    return float(mean["reward"])
+    # After the networks, so that a run's own sampled numbers come out again where its seed is given.
+    torch.manual_seed(seed)
+    judge(config, agent, folder)
+    return outcome(folder)
 
 
 def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module | None]:
@@ -40,19 +35,9 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
     Raises:
         UserError: if the folder holds no run, or one that does not fit together.
     """
-    path = run / "config.yaml"
-    if not path.is_file():
-        raise UserError(f"run={run} is not the folder of a run: it has no config.yaml")
-    try:
-        kept = OmegaConf.load(path)
-        if not isinstance(kept, DictConfig):
-            raise UserError(f"{path} is not the configuration of a run, but a list")
-        for key in ("track", "evaluation", "device"):
-            kept[key] = OmegaConf.to_container(asked[key], resolve=True) if key != "device" else asked[key]
-        config: Any = OmegaConf.merge(OmegaConf.structured(Train), kept)
-        OmegaConf.to_container(config, throw_on_missing=True)
-    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
+    config = configuration(run, "run")
+    for key in ("track", "evaluation", "device"):
+        config[key] = OmegaConf.to_container(asked[key], resolve=True) if key != "device" else asked[key]
     if config.method.observes is None:
         return config, None
     env = build_env(config)
@@ -62,7 +47,7 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
         learner.policy.load_state_dict(checkpoint.load(weights, config.device))
     except (RuntimeError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{weights} does not fit the networks that {path} describes; give the folder as it was"
+            f"{weights} does not fit the networks that {run / 'config.yaml'} describes; give the folder as it was"
         ) from error
     return config, learner.policy
 

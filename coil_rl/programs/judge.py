@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from tqdm import tqdm
 
 from coil_rl.build import build, build_env, build_guide
 from coil_rl.evaluation import Drive, drive, summarise
+from coil_rl.files import whole_file
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 
 COLUMNS = {
@@ -27,8 +29,8 @@ COLUMNS = {
 }
 
 
-def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) -> list[dict[str, Any]]:
-    """Evaluate, print and write `evaluation.csv` and `.md` (means), `episodes.csv`, `lines.png` and `lines.gif`.
+def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) -> None:
+    """Evaluate and write `episodes.csv`, `lines.png`, `lines.gif`, `evaluation.md` (means) and, last, `evaluation.csv`.
 
     The guide drives each track once; an agent once by its deterministic action and `evaluation.repeats` times by
     sampled ones.
@@ -37,9 +39,6 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         config: of a run.
         agent: its policy; None for the guide alone.
         folder: where the files go.
-
-    Returns:
-        The rows of the table: driver, actions, track or `mean`, and the measures.
     """
     tracks = build(config.track.test, "track.test")
     names = [track.name for track in tracks]
@@ -61,14 +60,27 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
             episodes += [label | row for row in driven.episodes]
             if actions == "deterministic":
                 drives[driver] = driven
-    write_csv(table, folder / "evaluation.csv")
     write_csv(episodes, folder / "episodes.csv")
-    text = markdown_table(table, COLUMNS)
-    (folder / "evaluation.md").write_text(text + "\n")
     lines = {driver: driven.lines for driver, driven in drives.items()}
     crashed = {driver: [row["crashed"] for row in driven.episodes] for driver, driven in drives.items()}
     draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
     if config.evaluation.gif:
         animate_lines(tracks, lines, folder / "lines.gif", rate=config.env.rate, crashed=crashed)
-    print(text)
-    return table
+    with whole_file(folder / "evaluation.md") as unfinished:
+        unfinished.write_text(markdown_table(table, COLUMNS) + "\n")
+    write_csv(table, folder / "evaluation.csv")
+
+
+def is_judged(folder: Path) -> bool:
+    """Whether all that `judge` writes is there."""
+    return (folder / "evaluation.csv").exists()
+
+
+def outcome(folder: Path) -> float:
+    """Print what `judge` found; returns the mean reward of the deterministic agent, or else of the guide."""
+    with (folder / "evaluation.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row["track"] == "mean" and row["actions"] == "deterministic"]
+    driver, reward, completed = rows[-1]["driver"], float(rows[-1]["reward"]), float(rows[-1]["completed"])
+    print((folder / "evaluation.md").read_text().rstrip())
+    print(f"{driver}: mean test reward {reward:.1f}, {completed:.0%} completed; see {folder}")
+    return reward

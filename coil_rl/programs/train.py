@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tqdm import tqdm
 
 from coil_rl import checkpoint
@@ -14,35 +15,53 @@ from coil_rl.build import build, build_env, build_guide
 from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
 from coil_rl.experiment import Experiment, watched_keys
-from coil_rl.programs import app
-from coil_rl.programs.judge import judge
-from coil_rl.programs.versions import versions
+from coil_rl.files import whole_file
+from coil_rl.programs import app, run_folder
+from coil_rl.programs.judge import is_judged, judge, outcome
 from coil_rl.report import draw_learning_curves
 from coil_rl.rollout import Rollout
 
 
 def train(config: DictConfig) -> float:
     """Run one configuration; returns the mean test reward of its deterministic policy."""
-    torch.set_num_threads(config.threads)
-    torch.manual_seed(config.seed)
+    if config.resume is not None:
+        raise UserError(f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER")
     folder = Path(config.run_dir)
-    if (folder / "config.yaml").exists():
-        raise UserError(f"{folder} already holds a run; choose another folder with hydra.run.dir=FOLDER")
-    folder.mkdir(parents=True, exist_ok=True)
-    OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml")
-    (folder / "versions.json").write_text(json.dumps(versions(), indent=2) + "\n")
-
-    agent = None
-    if config.method.observes is not None:
-        agent = learn(config, folder)
-    table = judge(config, agent, folder)
-    mean = next(row for row in reversed(table) if row["track"] == "mean" and row["actions"] == "deterministic")
-    print(f"{mean['driver']}: mean test reward {mean['reward']:.1f}, {mean['completed']:.0%} completed; see {folder}")
-    return float(mean["reward"])
+    with run_folder.claimed(folder):
+        run_folder.begin(config, folder)
+        return finish(config, folder)
 
 
-def learn(config: DictConfig, folder: Path) -> torch.nn.Module:
+def resume(folder: Path) -> float:
+    """Go on with a run that was stopped; returns what `train` would have, after the same numbers.
+
+    Raises:
+        UserError: if the folder holds no run, or one that cannot go on.
+    """
+    config = run_folder.configuration(folder, "resume")
+    folder = folder.absolute()
+    config.run_dir = str(folder)
+    with run_folder.claimed(folder):
+        return outcome(folder) if is_judged(folder) else finish(config, folder, resumed=True)
+
+
+def finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float:
+    """Do what is left of a run."""
+    torch.set_num_threads(config.threads)
+    try:
+        agent = None if config.method.observes is None else learn(config, folder, resumed)
+        torch.manual_seed(config.seed)
+        judge(config, agent, folder)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(f"go on with: coil-train resume={folder}") from None
+    return outcome(folder)
+
+
+def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     """Train, draw the learning curve and return the policy to judge."""
+    guide_return = guide_on_training_tracks(config, folder / "guide_return.json")
+    # After the guide, which another process may have driven already.
+    torch.manual_seed(config.seed)
     env = build_env(config)
     learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
     keys = [*learner.keys, "episode_reward", *watched_keys(config.watch)]
@@ -55,25 +74,41 @@ def learn(config: DictConfig, folder: Path) -> torch.nn.Module:
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
     )
-    guide_return = guide_on_training_tracks(config)
+    if resumed:
+        experiment.resume()
     rows = experiment.run(guide_return)
     draw_learning_curves({config.method.name: [rows]}, folder / "learning_curve.png", guide=guide_return)
     learner.policy.load_state_dict(checkpoint.load(folder / f"policy_{config.evaluation.policy}.pt", config.device))
     return learner.policy
 
 
-def guide_on_training_tracks(config: DictConfig) -> float:
-    """The guide's own mean return where the agent trains: the line to beat."""
+def guide_on_training_tracks(config: DictConfig, file: Path) -> float:
+    """The guide's own mean return where the agent trains: the line to beat. A file remembers it."""
+    if file.exists():
+        return float(json.loads(file.read_text()))
     tracks = build(config.track.train, "track.train")
     env = build_env(config, {"assignment": "cyclic", "num_cars": len(tracks)}, observed=False)
     with tqdm(unit="step", desc="guide on the training tracks", leave=False, mininterval=0.5) as bar:
         episodes = drive(env, build_guide(config), tick=bar.update).episodes
-    return sum(episode["reward"] for episode in episodes) / len(episodes)
+    mean = float(sum(episode["reward"] for episode in episodes) / len(episodes))
+    with whole_file(file) as unfinished:
+        unfinished.write_text(f"{mean}\n")
+    return mean
 
 
 def main() -> None:
     """Entry point."""
-    app.run(train, "train")
+    words = sys.argv[1:]
+    run = next((word for word in words if word.startswith("resume=")), None)
+    if run is None:
+        app.run(train, "train")
+    else:
+        # Without Hydra, which would compose another configuration and make another folder.
+        with app.program("train"):
+            if len(words) > 1:
+                others = " ".join(word for word in words if word != run)
+                raise UserError(f"{run} goes alone: that run's own config.yaml says the rest; leave out {others}")
+            resume(Path(run.removeprefix("resume=")).expanduser())
 
 
 if __name__ == "__main__":

@@ -29,12 +29,10 @@ def started(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     names = []
     monkeypatch.setattr(train, "train", lambda config: names.append("train"))
-    monkeypatch.setattr(evaluate, "judge", lambda *_: [{"track": "mean", "actions": "deterministic", **ROW}])
+    monkeypatch.setattr(evaluate, "judge", lambda *_: None)
+    monkeypatch.setattr(evaluate, "outcome", lambda folder: 0.0)
     yield names
     logging.getLogger().handlers.clear()
-
-
-ROW = {"driver": "guide", "reward": 0.0, "completed": 1.0}
 
 
 def outcome(name, *arguments):

@@ -2,6 +2,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -50,8 +51,7 @@ def test_train_shows_progress_and_nothing_alarming(run):
 def test_evaluate_gives_the_same_numbers_again(run):
     folder, trained = run
     again = program("evaluate", "run=run", *TINY[3:6], "evaluation.repeats=1", cwd=folder)
-    deterministic = [line for line in trained.stdout.splitlines() if "deterministic" in line]
-    assert [line for line in again.stdout.splitlines() if "deterministic" in line] == deterministic
+    assert again.stdout.splitlines()[:-1] == trained.stdout.splitlines()[:-1], "also what is sampled"
 
 
 def test_guide_alone_is_a_method_and_an_evaluation(tmp_path):
@@ -65,8 +65,39 @@ def test_guide_alone_is_a_method_and_an_evaluation(tmp_path):
 def test_a_folder_that_holds_a_run_is_refused(run):
     folder, _ = run
     done = program("train", *TINY, "hydra.run.dir=run", cwd=folder, code=2)
-    sentence = f"train: {folder / 'run'} already holds a run; choose another folder with hydra.run.dir=FOLDER"
-    assert done.stderr.strip() == sentence
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith(f"train: {folder / 'run'} already holds a run; go on with it by coil-train resume=")
+
+
+def test_a_finished_run_prints_its_outcome_again(run):
+    folder, done = run
+    before = {file: file.stat().st_mtime_ns for file in (folder / "run").iterdir() if file.name != ".lock"}
+    again = program("train", "resume=run", cwd=folder)
+    assert again.stdout == done.stdout
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+
+
+def test_a_run_ended_while_it_is_judged_goes_on_to_the_same_numbers(run, tmp_path):
+    folder, _ = run
+    command = [sys.executable, "-m", "coil_rl.programs.train", *TINY, "logger=tensorboard", "hydra.run.dir=run"]
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    first = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    while first.poll() is None and not (tmp_path / "run" / "policy_best.pt").exists():
+        time.sleep(0.01)
+    second = program("train", "resume=run", cwd=tmp_path, code=2)
+    (sentence,) = second.stderr.splitlines()
+    assert sentence == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
+    first.terminate()
+    _, said = first.communicate(timeout=60)
+    assert first.returncode == 130
+    assert said.splitlines()[-1] == f"train: interrupted; go on with: coil-train resume={tmp_path / 'run'}"
+    assert not (tmp_path / "run" / "evaluation.csv").exists()
+
+    (tmp_path / "run").rename(tmp_path / "moved")
+    program("train", "resume=moved", cwd=tmp_path)
+    for name in ("metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt", "policy_best.pt"):
+        assert (tmp_path / "moved" / name).read_bytes() == (folder / "run" / name).read_bytes(), name
+    assert not (tmp_path / "run").exists(), "the logger should have followed the folder"
 
 
 # Many more of them, in one process, are in test_mistakes.py.
@@ -75,10 +106,15 @@ def test_a_folder_that_holds_a_run_is_refused(run):
     [
         ("train", ["learner.gamma=abc"], "train: learner: gamma='abc' must be a finite number"),
         ("evaluate", ["run=/nowhere"], "evaluate: run=/nowhere is not the folder of a run: it has no config.yaml"),
+        (
+            "train",
+            ["-m", "resume=run,other"],
+            "train: resume=run,other goes alone: that run's own config.yaml says the rest; leave out -m",
+        ),
     ],
 )
 def test_mistakes_are_one_sentence_exit_code_2_and_no_folder(name, arguments, sentence, tmp_path):
-    done = program(name, *arguments, *TINY[3:5], cwd=tmp_path, code=2)
+    done = program(name, *arguments, *([] if "-m" in arguments else TINY[3:5]), cwd=tmp_path, code=2)
     assert done.stderr == sentence + "\n"
     assert not list(tmp_path.iterdir())
 
