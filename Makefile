@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate test test-all check format wheel clean
+.PHONY: help venv train evaluate test test-all kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -32,6 +32,9 @@ test: $(INSTALLED) ## run the fast tests
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m '' $(ARGS)
+
+kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
+	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)
 
 check: $(INSTALLED) ## lint, formatting, types and import directions
 	$(BIN)/ruff check .
