@@ -35,9 +35,8 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
     Raises:
         UserError: if the folder holds no run, or one that does not fit together.
     """
-    config = configuration(run, "run")
-    for key in ("track", "evaluation", "device"):
-        config[key] = OmegaConf.to_container(asked[key], resolve=True) if key != "device" else asked[key]
+    resolved = OmegaConf.to_container(asked, resolve=True)
+    config = configuration(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
     if config.method.observes is None:
         return config, None
     env = build_env(config)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -56,12 +56,13 @@ def begin(config: DictConfig, folder: Path) -> None:
         OmegaConf.save(kept, unfinished)
 
 
-def configuration(folder: Path, key: str) -> DictConfig:
+def configuration(folder: Path, key: str, instead: Mapping[str, Any] | None = None) -> DictConfig:
     """The configuration of the run in a folder.
 
     Args:
         folder: of the run.
         key: by which a person named it, for the message.
+        instead: top-level keys that get other values.
 
     Raises:
         UserError: if the folder holds no run, or a configuration that cannot be read.
@@ -73,6 +74,8 @@ def configuration(folder: Path, key: str) -> DictConfig:
         kept = OmegaConf.load(path)
         if not isinstance(kept, DictConfig):
             raise UserError(f"{path} is not the configuration of a run, but a list")
+        for name, value in (instead or {}).items():
+            kept[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(Train), kept)
         OmegaConf.to_container(config, throw_on_missing=True)
     except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:

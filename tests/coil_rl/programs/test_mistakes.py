@@ -68,7 +68,7 @@ def refusal(name, *arguments):
     [
         # keys
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, method"),
-        ("sed=1", "checkpoint_every; did you mean seed?"),
+        ("sed=1", "resume; did you mean seed?"),
         ("budget.car=1", "no key budget.car; budget has frames, cars, steps; did you mean cars?"),
         ("learner.learning_rat=1", "+learner.learning_rat=VALUE adds it; did you mean learning_rate?"),
         ("env.speed=3", "+env.speed=VALUE adds it"),
