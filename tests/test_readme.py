@@ -8,7 +8,7 @@ README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["cone world", "own env"])
+@pytest.mark.parametrize("example", EXAMPLES, ids=["cone world", "own env", "gymnasium"])
 def test_examples_run_as_printed(example):
     found: dict = {}
     exec(compile(example, "README.md", "exec"), found)

@@ -1,0 +1,172 @@
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
+from tensordict import TensorDict
+
+from coil_rl.envs import ConeTrackEnv, Track, gym, shipped_tracks
+from coil_rl.guides import ConstantGuide, SplineGuide
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_one_car_passes_the_checker_of_gymnasium():
+    env = gymnasium.make(gym.ID)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    assert env.observation_space == gymnasium.spaces.Box(-1, 1, (20,), np.float32)
+
+
+def test_one_car_passes_the_checker_of_stable_baselines3():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(gymnasium.make(gym.ID).unwrapped)
+
+
+def test_stable_baselines3_learns_on_it():
+    sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
+    env = gymnasium.make(gym.ID, advice=SplineGuide())
+    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(64)
+    assert model.num_timesteps == 64
+    assert len(model.logger.name_to_value) > 0
+
+
+def episode(env, seed, steps=40):
+    observation, info = env.reset(seed=seed)
+    rng = np.random.default_rng(0)
+    rows = [observation]
+    for _ in range(steps):
+        observation, reward, *_ = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
+        rows.append(np.concatenate([observation, np.reshape(reward, (*observation.shape[:-1], 1))], -1))
+    return info["track"], rows
+
+
+@pytest.mark.parametrize("cars", [None, 3])
+def test_a_seed_decides_the_tracks_and_all_that_follows(cars):
+    env = gymnasium.make(gym.ID) if cars is None else gymnasium.make_vec(gym.ID, num_envs=cars)
+    track, rows = episode(env, 3)
+    again, same = episode(env, 3)
+    np.testing.assert_array_equal(track, again)
+    for one, other in zip(rows, same, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert len({np.asarray(episode(env, seed, 0)[0]).tobytes() for seed in range(8)}) > 1
+
+
+def test_without_a_seed_no_two_envs_draw_alike():
+    draws = [gymnasium.make_vec(gym.ID, num_envs=32).reset()[1]["track"].tolist() for _ in range(2)]
+    assert draws[0] != draws[1]
+
+
+def test_vector_rows_are_those_of_the_batched_env():
+    cars = 6
+    envs = gymnasium.make_vec(gym.ID, num_envs=cars)
+    ours = ConeTrackEnv(shipped_tracks("train"), cars, seed=5)
+    observation, _ = envs.reset(seed=5)
+    state = ours.reset()
+    np.testing.assert_array_equal(observation, state["observation"])
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(120):
+        action = torch.rand(cars, 1, generator=generator) * 2 - 1
+        step, state = ours.step_and_maybe_reset(state.set("action", action))
+        observation, reward, terminated, truncated, info = envs.step(action.numpy())
+        np.testing.assert_array_equal(observation, state["observation"])
+        after = step["next"]
+        for array, key in [(reward, "reward"), (terminated, "terminated"), (truncated, "truncated")]:
+            np.testing.assert_array_equal(array, after[key].squeeze(-1))
+        np.testing.assert_array_equal(info["track"], state["info", "track"].squeeze(-1))
+    assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+
+
+def drive_to_the_end(envs):
+    envs.reset(seed=0)
+    while True:
+        before = envs.unwrapped.cars.env.track.clone()
+        observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
+        if (terminated | truncated).any():
+            return before, observation, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("advice", [None, ConstantGuide(0.25)])
+def test_autoreset_gives_the_last_observation_of_the_episode_and_the_first_of_the_next(advice):
+    envs = gymnasium.make_vec(gym.ID, num_envs=16, advice=advice)
+    _, observation, reward, terminated, _, info = drive_to_the_end(envs)
+    done = info["_final_obs"]
+    assert done.tolist() == terminated.tolist() == info["_final_info"].tolist()
+    assert not done.all()
+    assert [last is not None for last in info["final_obs"]] == done.tolist()
+    last = np.stack(info["final_obs"][done])
+    assert last.shape == (done.sum(), 20 + (advice is not None))
+    cars = envs.unwrapped.cars.env
+    start = cars.start_observation[cars.track].numpy()
+    np.testing.assert_array_equal(observation[done, :20], start[done])
+    assert (last[:, :20] != start[done]).any()
+    assert info["final_info"]["crashed"][done].all()
+    assert (reward[done] == -100).all()
+    assert not info["crashed"][done].any()
+    if advice is not None:
+        assert (observation[:, 20] == 0.25).all()
+        assert (last[:, 20] == 0.25).all()
+
+
+def test_time_limit_truncates_and_a_crash_terminates(ring: Track):
+    env = gymnasium.make(gym.ID, tracks=[ring], time_limit=0.25, rate=8)
+    env.reset(seed=0)
+    straight = np.zeros(1, np.float32)
+    assert env.step(straight)[2:4] == (False, False)
+    assert env.step(straight)[2:4] == (False, True)
+    env = gymnasium.make(gym.ID, tracks=[ring])
+    env.reset(seed=0)
+    while not (step := env.step(straight))[2]:
+        pass
+    assert (step[1], step[3], step[4]["crashed"], step[4]["reward"]["crash"]) == (-100, False, True, -100)
+
+
+def test_advice_is_what_the_guide_says():
+    envs = gymnasium.make_vec(gym.ID, num_envs=4, advice=SplineGuide())
+    ours = ConeTrackEnv(shipped_tracks("train"), 4, seed=1)
+    observation, _ = envs.reset(seed=1)
+    advice = SplineGuide()(ours.reset())["action"]
+    np.testing.assert_array_equal(observation[:, 20:], advice)
+    assert envs.single_observation_space.shape == (21,)
+
+
+def test_arrays_are_the_callers_own():
+    envs = gymnasium.make_vec(gym.ID, num_envs=4)
+    observation, info = envs.reset(seed=0)
+    observation[:], info["pose"][:] = 7, 7
+    assert not (envs.unwrapped.cars.env.pose == 7).any()
+    again, _ = envs.reset(seed=0)
+    assert not (again == 7).any()
+    assert isinstance(envs.unwrapped.cars.reset(), TensorDict)
+
+
+def test_vector_wrappers_of_gymnasium_work_on_it():
+    envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.make_vec(gym.ID, num_envs=8))
+    envs = gymnasium.wrappers.vector.DictInfoToList(envs)
+    _, infos = envs.reset(seed=0)
+    while not any("final_info" in info for info in infos):
+        *_, infos = envs.step(envs.action_space.sample())
+    ended = next(info for info in infos if "final_info" in info)
+    assert ended["final_info"]["crashed"]
+    assert ended["final_obs"].shape == (20,)
+    assert ended["episode"]["l"] > 1
+
+
+def test_envs_do_without_gymnasium_and_the_module_names_the_extra():
+    program = (
+        "import sys; sys.modules['gymnasium'] = None\nimport coil_rl.envs\n"
+        "try:\n    import coil_rl.envs.gym\nexcept ImportError as error:\n    print(error)"
+    )
+    env = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "coil_rl.envs.gym needs Gymnasium: python -m pip install 'coil-rl[gym]'"
