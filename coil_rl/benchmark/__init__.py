@@ -1,0 +1,1 @@
+"""What `coil-benchmark` measures, and the yardsticks it measures with."""
