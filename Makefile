@@ -4,7 +4,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate test test-all kill-test check format wheel clean
+.PHONY: help venv train evaluate bench test test-all kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -26,6 +26,11 @@ train: $(INSTALLED) ## train an agent with a guide's advice, e.g. ARGS='seed=1'
 
 evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
 	$(BIN)/coil-evaluate $(ARGS)
+
+# Stable-Baselines3 is only a yardstick, so .venv has it from here on and not before.
+bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='device=cuda'
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	$(BIN)/coil-benchmark $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)

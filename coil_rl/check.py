@@ -51,7 +51,7 @@ def check(config: DictConfig) -> None:
     for part in ("train", "test") if training else ("test",):
         if not build(config.track.get(part), f"track.{part}"):
             raise UserError(f"track.{part} gives no tracks; give at least one")
-    if training or config.run is None:
+    if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
         env = build_env(config, {**config.evaluation.env, "num_cars": 1}, observed=False)
         _check_guide(build_guide(config), env)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -35,7 +36,7 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
     Raises:
         UserError: if the folder holds no run, or one that does not fit together.
     """
-    resolved = OmegaConf.to_container(asked, resolve=True)
+    resolved: Any = OmegaConf.to_container(asked, resolve=True)
     config = configuration(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
     if config.method.observes is None:
         return config, None

@@ -9,7 +9,10 @@ from pathlib import Path
 
 import torch
 
-PACKAGES = ("coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "numpy", "scipy", "matplotlib")
+PACKAGES = (
+    "coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "stable-baselines3", "numpy", "scipy",
+    "matplotlib",
+)  # fmt: skip
 
 
 def versions() -> dict[str, str]:

@@ -1,0 +1,120 @@
+"""How fast agents train: our loop beside the hand-written one, with and without the guide, and where its time goes."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from coil_rl.benchmark.plain_ppo import PlainPPO
+from coil_rl.benchmark.turns import Sections, Turns, median_ratio
+from coil_rl.build import build, build_env, build_guide
+from coil_rl.experiment import Experiment
+from coil_rl.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+SECTIONS = ("env", "guide", "policy", "update", "framework")
+UPDATES = 2
+
+
+class Training:
+    """Our training as `coil-train` runs it, without the files; a call is one update and returns its frames.
+
+    Args:
+        config: with `env`, `learner` and `methods`.
+        method: one of `methods`.
+        cars: B.
+        steps: T.
+    """
+
+    def __init__(self, config: DictConfig, method: str, cars: int, steps: int) -> None:
+        observed: Any = OmegaConf.merge(config, {"method": config.methods[method]})
+        env = build_env(observed, {"num_cars": cars})
+        learner = build(config.learner, "learner", env=env, in_keys=list(observed.method.observes))
+        rollout = Rollout(env, learner.policy, steps, [*learner.keys, "episode_reward"])
+        # The experiment keeps its best policy in a file; that belongs to what it costs.
+        self.folder = tempfile.TemporaryDirectory()
+        self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
+
+    def __call__(self) -> int:
+        """Collect and learn once."""
+        self.experiment.update(0.0)
+        return self.experiment.rollout.frames
+
+    def watch(self, sections: Sections) -> None:
+        """Charge the parts of every later update to `SECTIONS`."""
+        env = self.experiment.rollout.env
+        for method in ("_step", "_reset"):
+            sections.wrap(env.base_env, method, "env")
+        for transform in env.transform:
+            if isinstance(transform, GuideActions):
+                for method in ("_call", "_reset"):
+                    sections.wrap(transform, method, "guide")
+        sections.wrap(self.experiment.learner.policy, "forward", "policy")
+        sections.wrap(self.experiment.learner, "update", "update")
+
+
+def plain(config: DictConfig, method: str, cars: int, steps: int) -> Callable[[], int]:
+    """The hand-written loop on the same env, with the same hyper-parameters."""
+    env = build(config.env, "env", num_cars=cars)
+    guide = build_guide(config) if method == "coil" else None
+    node = OmegaConf.merge(config.learner, {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"})
+    learner: PlainPPO = build(node, "learner", env=env, guide=guide, steps=steps)
+
+    def update() -> int:
+        learner.update(learner.collect())
+        return cars * steps
+
+    return update
+
+
+def measure_training(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:
+    """One row a batch: frames per second of PPO and COIL, ours and by hand, and what the differences cost."""
+    rows = []
+    for batch in config.batches:
+        cars, steps = batch.cars, batch.steps
+        rates = turns.rates(
+            {
+                "ppo": Training(config, "ppo", cars, steps),
+                "plain ppo": plain(config, "ppo", cars, steps),
+                "coil": Training(config, "coil", cars, steps),
+                "plain coil": plain(config, "coil", cars, steps),
+            },
+            f"training {cars} x {steps}, ",
+        )
+        medians = {f"{name.replace(' ', '_')}_frames_per_s": statistics.median(rate) for name, rate in rates.items()}
+        rows.append(
+            {
+                "cars": cars,
+                "steps": steps,
+                **medians,
+                "coil_frame_cost_over_ppo": median_ratio(rates["ppo"], rates["coil"]),
+                "ppo_over_plain": median_ratio(rates["ppo"], rates["plain ppo"]),
+                "coil_over_plain": median_ratio(rates["coil"], rates["plain coil"]),
+                "rounds": rates,
+            }
+        )
+    return rows
+
+
+def measure_shares(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:
+    """One row a method and batch: the shares of `SECTIONS` in an update, collecting included."""
+    rows = []
+    for batch in config.batches:
+        for method in ("ppo", "coil"):
+            turns.tick(f"shares, {method} {batch.cars} x {batch.steps}")
+            training = Training(config, method, batch.cars, batch.steps)
+            training()
+            sections = Sections(config.device)
+            training.watch(sections)
+            for _ in range(UPDATES):
+                with sections.section("framework"):
+                    training()
+            total = sum(sections.seconds.values())
+            shares = {name: sections.seconds.get(name, 0.0) / total for name in SECTIONS}
+            rows.append({"method": method, "cars": batch.cars, "steps": batch.steps, **shares})
+    return rows

@@ -1,0 +1,74 @@
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+ROOT = Path(__file__).parents[3]
+PARTS = ["start", "memory", "env", "training", "shares", "oracle", "sb3", "profile"]
+
+
+def program(*arguments, cwd, code=0):
+    command = [sys.executable, "-m", "coil_rl.programs.benchmark", *arguments]
+    # One after the other, as PYTHONPATH may hold packages that the tests were given.
+    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
+    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == code, done.stderr
+    return done
+
+
+@pytest.mark.slow
+def test_quick_benchmark_measures_everything(tmp_path):
+    done = program("quick=true", "track=generated", "track.train.count=1", "hydra.run.dir=run", cwd=tmp_path)
+    found = json.loads((tmp_path / "run" / "benchmark.json").read_text())
+    assert set(found) == {"versions", "settings", "goals", *PARTS}
+    assert found["settings"]["repeats"] == 2
+
+    for row in found["env"]:
+        assert row["ms_per_batched_step"] * row["steps_per_s"] == pytest.approx(1e3 * row["cars"])
+        assert all(len(rounds) == 2 and min(rounds) > 0 for rounds in row["rounds"].values())
+    assert [row["cars"] for row in found["env"]] == [16, 64]
+    for row in found["training"]:
+        assert row["ppo_over_plain"] > 0
+        assert row["coil_frame_cost_over_ppo"] > 0
+    for row in found["shares"]:
+        shares = [row[key] for key in ("env", "guide", "policy", "update", "framework")]
+        assert sum(shares) == pytest.approx(1)
+        assert all(share > 0 or (key, row["method"]) == (1, "ppo") for key, share in enumerate(shares))
+    assert found["start"]["total_s"] > found["start"]["import_s"] > 0
+    assert 172 < found["memory"]["state_bytes_per_car"] < 2000
+    assert found["oracle"]["ratio"] > 0
+    assert found["profile"]["operators"][0]["ms_per_step"] > 0
+    if importlib.util.find_spec("stable_baselines3"):
+        assert [row["envs"] for row in found["sb3"]["stable_baselines3"]] == [1, 8]
+        assert all(row["ratio"] > 0 for row in found["sb3"]["stable_baselines3"])
+    else:
+        assert "not installed" in found["sb3"]["not_measured"]
+
+    assert done.stdout.startswith("## Goals")
+    assert (tmp_path / "run" / "benchmark.md").read_text().strip() in done.stdout
+    assert done.stdout.splitlines()[-1].endswith("goals met; see " + str(tmp_path / "run"))
+    assert "Traceback" not in done.stderr
+    with Image.open(tmp_path / "run" / "benchmark.png") as image:
+        assert image.width >= 600
+    again = program("parts=[start]", "hydra.run.dir=run", cwd=tmp_path, code=2)
+    assert "already holds a benchmark" in again.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["parts=[envy]"], "parts: there is no envy; there are start, memory, env, training"),
+        (["device=cuda:77"], "device=cuda:77: PyTorch finds no such device here"),
+        (["repeat=3"], "Key 'repeat' not in 'Benchmark'"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_exit_code_2(arguments, words, tmp_path):
+    done = program(*arguments, cwd=tmp_path, code=2)
+    (sentence,) = done.stderr.strip().splitlines()
+    assert words in sentence
