@@ -94,12 +94,18 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
         overrides: what to change in `env`.
         observed: False leaves the method's transforms out: a guide drives in the bare env.
     """
-    with open_dict(config):  # which keys the env takes is its own to say
-        node = OmegaConf.merge(config.env, dict(overrides or {}))
-    env: EnvBase = build(node, "env", EnvBase)
+    env = build_bare_env(config, overrides)
     parts = config.method.transforms if observed else []
     transforms = [build(part, f"method.transforms[{i}]", Transform) for i, part in enumerate(parts)]
     return TransformedEnv(env, Compose(*transforms, RewardSum()))
+
+
+def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
+    """The env of a configuration without any transform; `overrides` as in `build_env`."""
+    with open_dict(config):  # which keys the env takes is its own to say
+        node = OmegaConf.merge(config.env, dict(overrides or {}))
+    env: EnvBase = build(node, "env", EnvBase)
+    return env
 
 
 def build_guide(config: DictConfig) -> TensorDictModuleBase:

@@ -192,5 +192,6 @@ class Experiment:
 
 
 def watched_keys(watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:
-    """The entries that a rollout must keep for `Experiment`."""
-    return [tuple(key) for group in watch.values() for key in group.values()]
+    """The entries that a rollout must keep for `Experiment`, besides those of the learner."""
+    watched = (tuple(key) for group in watch.values() for key in group.values())
+    return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *watched)]

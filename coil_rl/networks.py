@@ -6,12 +6,13 @@ import math
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal, ValueOperator
+from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 
 
 class Network(nn.Module):
@@ -67,6 +68,31 @@ class NormalHead(nn.Module):
         return loc, self.log_scale.exp().expand_as(loc)
 
 
+class Keyed(TensorDictModuleBase):
+    """A module from some entries of a tensordict to others.
+
+    What `TensorDictModule` is, without its search for optional packages at every call, which takes as long as a small
+    network does.
+
+    Args:
+        module: from tensors to a tensor or several.
+        in_keys: its arguments.
+        out_keys: its results.
+    """
+
+    def __init__(self, module: nn.Module, in_keys: Sequence[str], out_keys: Sequence[str]) -> None:
+        self.in_keys, self.out_keys = list(in_keys), list(out_keys)
+        super().__init__()
+        self.module = module
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the results into the tensordict that is read."""
+        results = self.module(*(tensordict[key] for key in self.in_keys))
+        for key, result in zip(self.out_keys, results if isinstance(results, tuple) else (results,), strict=True):
+            tensordict.set(key, result)
+        return tensordict
+
+
 def actor(
     env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5
 ) -> ProbabilisticActor:
@@ -89,10 +115,10 @@ def actor(
     network = Network(env, in_keys, hidden, size, gain=0.01)
     common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
     if discrete:
-        module = TensorDictModule(network, list(in_keys), ["logits"])
+        module = Keyed(network, in_keys, ["logits"])
         kind = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
         return ProbabilisticActor(module, ["logits"], distribution_class=kind, **common)
-    module = TensorDictModule(NormalHead(network, size, scale), list(in_keys), ["loc", "scale"])
+    module = Keyed(NormalHead(network, size, scale), in_keys, ["loc", "scale"])
     return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
 
 
@@ -104,6 +130,6 @@ def _distribution(spec: TensorSpec) -> dict[str, object]:
     return {"distribution_class": TanhNormal, "distribution_kwargs": bounds | {"tanh_loc": False}}
 
 
-def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> ValueOperator:
+def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> Keyed:
     """A state-value network over the same entries; writes `state_value` [*batch, 1]."""
-    return ValueOperator(Network(env, in_keys, hidden, 1, gain=1.0), in_keys=list(in_keys))
+    return Keyed(Network(env, in_keys, hidden, 1, gain=1.0), in_keys, ["state_value"])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -22,7 +23,7 @@ class Rollout:
         env: batched env.
         policy: writes the action; it samples.
         steps: T, length of a batch.
-        keys: entries to keep, under `next` too where they exist there; all of them by default.
+        keys: entries to keep, of those after a step as `("next", ...)`; all of them by default.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -35,7 +36,7 @@ class Rollout:
         self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
     ) -> None:
         self.env, self.policy, self.steps = env, policy, steps
-        self.keys = None if keys is None else [*keys, *(("next", *_tuple(key)) for key in keys)]
+        self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
 
@@ -52,27 +53,31 @@ class Rollout:
             UserError: if a number in it is NaN or infinite, naming the entry, the step and the row.
         """
         carrier = self.env.reset() if self.carrier is None else self.carrier
-        steps: list[TensorDictBase] = []
-        time = len(self.env.batch_size)
+        columns: dict[NestedKey, list[Tensor]] = {}
         try:
             with set_exploration_type(ExplorationType.RANDOM):
                 for _ in range(self.steps):
                     step, carrier = self.env.step_and_maybe_reset(self.policy(carrier))
-                    steps.append(self._kept(step))
+                    for key in self.keys or step.keys(True, True):
+                        columns.setdefault(key, []).append(step[key])
         except Exception:
             # An env may break over the NaN that it wrote a step ago, and that NaN is what a person must hear of.
-            if steps:
-                check_batch(torch.stack(steps, time), self.taken)
-            check_batch(self._kept(carrier).unsqueeze(time), self.taken + len(steps))
+            check_batch(self._stacked(columns), self.taken)
+            check_batch(carrier.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0))
             raise
-        batch = torch.stack(steps, time)
+        batch = self._stacked(columns)
         check_batch(batch, self.taken)
         self.carrier = carrier
         self.taken += self.steps
         return batch
 
-    def _kept(self, entries: TensorDictBase) -> TensorDictBase:
-        return entries if self.keys is None else entries.select(*self.keys, strict=False)
+    def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
+        time = len(self.env.batch_size)
+        steps = min(map(len, columns.values()), default=0)
+        batch = TensorDict({}, (*self.env.batch_size, steps), device=self.env.device)
+        for key, column in columns.items():
+            batch[key] = torch.stack(column[:steps], time)
+        return batch
 
     def state_dict(self) -> dict[str, Any]:
         """Where the env and the collection stand."""
@@ -94,7 +99,3 @@ class Rollout:
         if carrier is not None:
             carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
         self.carrier, self.taken = carrier, state["taken"]
-
-
-def _tuple(key: NestedKey) -> tuple[str, ...]:
-    return (key,) if isinstance(key, str) else key

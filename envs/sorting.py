@@ -46,6 +46,8 @@ def _sorted(keys: Tensor, kept: int) -> Tensor:
     smaller and a larger half, and by parting each half likewise down to single wires. A larger half that lies beyond
     `kept` is dropped.
     """
+    if kept == 1:
+        return keys.amin(0, keepdim=True)
     run = 1
     while run < len(keys):
         first, second = keys.view(-1, 2, run, keys.shape[1]).unbind(1)

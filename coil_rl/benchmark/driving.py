@@ -12,7 +12,7 @@ from torch.profiler import ProfilerActivity, profile
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from coil_rl.benchmark.turns import Turns, synchronise
-from coil_rl.build import build
+from coil_rl.build import build, build_bare_env
 
 OPERATORS = 10
 
@@ -56,7 +56,7 @@ class Driving:
 
 def drive_env(config: DictConfig, cars: int, guide: bool) -> EnvBase:
     """The configured env, with or without the configured guide asked at every step."""
-    env: EnvBase = build(config.env, "env", num_cars=cars)
+    env = build_bare_env(config, {"num_cars": cars})
     if not guide:
         return env
     transforms = [build(part, f"methods.coil.transforms[{i}]") for i, part in enumerate(config.methods.coil.transforms)]

@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.benchmark.plain_ppo import PlainPPO
 from coil_rl.benchmark.turns import Sections, Turns, median_ratio
-from coil_rl.build import build, build_env, build_guide
-from coil_rl.experiment import Experiment
+from coil_rl.build import build, build_bare_env, build_env, build_guide
+from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -35,7 +35,7 @@ class Training:
         observed: Any = OmegaConf.merge(config, {"method": config.methods[method]})
         env = build_env(observed, {"num_cars": cars})
         learner = build(config.learner, "learner", env=env, in_keys=list(observed.method.observes))
-        rollout = Rollout(env, learner.policy, steps, [*learner.keys, "episode_reward"])
+        rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys({})])
         # The experiment keeps its best policy in a file; that belongs to what it costs.
         self.folder = tempfile.TemporaryDirectory()
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
@@ -60,9 +60,10 @@ class Training:
 
 def plain(config: DictConfig, method: str, cars: int, steps: int) -> Callable[[], int]:
     """The hand-written loop on the same env, with the same hyper-parameters."""
-    env = build(config.env, "env", num_cars=cars)
+    env = build_bare_env(config, {"num_cars": cars})
     guide = build_guide(config) if method == "coil" else None
-    node = OmegaConf.merge(config.learner, {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"})
+    node = {key: value for key, value in config.learner.items() if key != "compile"}
+    node |= {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"}
     learner: PlainPPO = build(node, "learner", env=env, guide=guide, steps=steps)
 
     def update() -> int:

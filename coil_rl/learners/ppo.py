@@ -12,12 +12,11 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
-from torchrl.objectives.value import GAE
 
 from coil_rl import networks
+from coil_rl.learners.advantages import Advantages
 from coil_rl.schedules import Schedule, schedule
 
 
@@ -38,6 +37,8 @@ class PPO:
         entropy: weight of the entropy bonus, a number or a schedule.
         critic: weight of the critic's loss.
         max_grad_norm: gradients are scaled down to this norm.
+        compile: the loss by `torch.compile`, which takes some ten seconds and pays in long runs. The numbers then
+            differ in their last digits.
         seed: of the order of minibatches.
 
     Example:
@@ -64,6 +65,7 @@ class PPO:
         entropy: float | Schedule = 0.0,
         critic: float = 0.5,
         max_grad_norm: float = 0.5,
+        compile: bool = False,
         seed: int = 0,
     ) -> None:
         for name, value in {"hidden": min(hidden, default=1), "epochs": epochs, "minibatches": minibatches}.items():
@@ -85,7 +87,7 @@ class PPO:
             if not 0 <= number < math.inf:
                 raise ValueError(f"{name}={number} must be a finite number of at least 0")
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
-        self.advantage = GAE(gamma=gamma, lmbda=gae_lambda, value_network=self.critic)
+        self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss = ClipPPOLoss(
             self.policy,
             self.critic,
@@ -97,11 +99,13 @@ class PPO:
             normalize_advantage=True,
             functional=False,
         )
+        self.losses = torch.compile(self.loss.__call__) if compile else self.loss
         self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
         self.learned_from = [*in_keys, "action", "action_log_prob", "advantage", "value_target"]
-        self.keys = [*in_keys, "action", "action_log_prob", "reward", "done", "terminated"]
+        after = [*in_keys, "reward", "done", "terminated"]
+        self.keys = [*in_keys, "action", "action_log_prob", *(("next", key) for key in after)]
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts.
@@ -118,15 +122,14 @@ class PPO:
             group["lr"] = self.learning_rate(progress)
         if self.loss.entropy_bonus:
             self.loss.entropy_coeff.fill_(self.entropy(progress))
-        with torch.no_grad():
-            self.advantage(batch)
+        self.advantage(batch)
         flat = batch.select(*self.learned_from).reshape(-1)
-        sums: dict[str, Tensor] = {}
+        reports = []
         size = len(flat) // self.minibatches
         for _ in range(self.epochs):
             order = torch.randperm(len(flat), generator=self.generator)[: size * self.minibatches]
             for minibatch in flat[order.to(flat.device)].split(size):
-                losses = self.loss(minibatch)
+                losses = self.losses(minibatch)
                 total = losses["loss_objective"] + losses["loss_critic"]
                 if self.loss.entropy_bonus:
                     total = total + losses["loss_entropy"]
@@ -134,10 +137,9 @@ class PPO:
                 total.backward()
                 torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
                 self.optimiser.step()
-                for key, value in losses.items():
-                    sums[key] = sums.get(key, 0) + value.detach().mean()
-        steps = self.epochs * self.minibatches
-        means = {key: float(value) / steps for key, value in sums.items()}
+                reports.append(losses.detach())
+        names = list(reports[0].keys())
+        means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
         return means | {"learning_rate": self.learning_rate(progress)}
 
     def state_dict(self) -> dict[str, Any]:

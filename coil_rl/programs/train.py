@@ -64,7 +64,7 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     torch.manual_seed(config.seed)
     env = build_env(config)
     learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
-    keys = [*learner.keys, "episode_reward", *watched_keys(config.watch)]
+    keys = [*learner.keys, *watched_keys(config.watch)]
     experiment = Experiment(
         learner,
         Rollout(env, learner.policy, config.budget.steps, keys),

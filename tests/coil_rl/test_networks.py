@@ -1,11 +1,14 @@
 import pytest
 import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch.nn import Linear
 from torchrl.envs import GymEnv, PendulumEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ZeroGuide
-from coil_rl.networks import actor, critic
+from coil_rl.networks import Keyed, actor, critic
 from coil_rl.transforms import GuideActions
 
 
@@ -47,3 +50,12 @@ def test_unknown_entry_is_named_beside_those_that_exist():
     env = ConeTrackEnv(shipped_tracks("test"), 3)
     with pytest.raises(KeyError, match=r"no entry guide_action to observe; it has .*observation"):
         actor(env, ["observation", "guide_action"])
+
+
+def test_a_keyed_module_is_a_tensordict_module():
+    split = Linear(3, 4)
+    ours, theirs = (
+        kind(lambda x: tuple(split(x).chunk(2, -1)), ["x"], ["a", "b"]) for kind in (Keyed, TensorDictModule)
+    )
+    data = TensorDict({"x": torch.randn(5, 3)}, [5])
+    assert (ours(data.clone()) == theirs(data.clone())).all()
