@@ -73,6 +73,7 @@ class ConeTrackEnv(EnvBase):
         speed: m/s.
         car_length: m.
         max_steering: degrees of an action of 1.
+        info: False leaves `info` out, where nobody reads it.
         seed: of the draw of tracks.
         device: where everything lives.
         dtype: of everything that is not a count.
@@ -122,6 +123,7 @@ class ConeTrackEnv(EnvBase):
         speed: float = 2.0,
         car_length: float = 2.0,
         max_steering: float = 80.0,
+        info: bool = True,
         seed: int = 0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
@@ -152,6 +154,7 @@ class ConeTrackEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
         self.dtype_ = dtype
         self.rate, self.laps, self.held_steps, self.assignment = rate, laps, held_steps, assignment
+        self.info = info
         self.max_steps = round(time_limit * rate)
         self.weights = Reward(**(reward or {}))
         self.every_sighting = cone_bonus == "every_sighting"
@@ -229,8 +232,10 @@ class ConeTrackEnv(EnvBase):
         )  # fmt: skip
         self.observation_spec = Composite(
             observation=bounded(4 * SAMPLES), cones=real(2, self.kept_cones, 2), cone_count=whole(2),
-            steering=bounded(1), info=info, shape=self.batch_size,
+            steering=bounded(1), shape=self.batch_size,
         )  # fmt: skip
+        if self.info:
+            self.observation_spec["info"] = info
         self.action_spec = bounded(1)
         self.reward_spec = real(1)
         self.done_spec = Composite(
@@ -370,7 +375,9 @@ class ConeTrackEnv(EnvBase):
 
     def _info(
         self, lap_time: Tensor, crashed: Tensor, clearance: Tensor, smoothness: Tensor, terms: dict[str, Tensor]
-    ) -> TensorDict:
+    ) -> dict[str, TensorDict]:
+        if not self.info:
+            return {}
         columns = {
             "track": self.track, "lap": self.lap.long(), "lap_time": lap_time, "crashed": crashed,
             "clearance": clearance, "smoothness": smoothness,
@@ -378,16 +385,16 @@ class ConeTrackEnv(EnvBase):
         paid = {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}
         entries: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
         entries |= {"pose": self.pose.t(), "reward": TensorDict(paid, self.batch_size, device=self.device)}
-        return TensorDict(entries, self.batch_size, device=self.device)
+        return {"info": TensorDict(entries, self.batch_size, device=self.device)}
 
-    def _tensordict(self, observation: Tensor, cones: Tensor, count: Tensor, info: TensorDict) -> TensorDict:
+    def _tensordict(self, observation: Tensor, cones: Tensor, count: Tensor, info: dict[str, TensorDict]) -> TensorDict:
         return TensorDict(
             {
                 "observation": observation,
                 "cones": cones.permute(3, 2, 1, 0),
                 "cone_count": count.t(),
                 "steering": self.history[0].unsqueeze(-1),
-                "info": info,
+                **info,
             },
             self.batch_size,
             device=self.device,

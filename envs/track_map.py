@@ -1,7 +1,7 @@
 """Tracks as lookup tables: what a car at a pose could see, and how far it is from a crash.
 
 A step of thousands of cars cannot look at every cone of their tracks. Everything that does not move is therefore
-worked out once: for each square metre and each eighth of a turn the cones that a car there may see, and on a fine grid
+worked out once: for each square metre and each twelfth of a turn the cones that a car there may see, and on a fine grid
 the distance to the nearest boundary. A step then reads a few numbers per car.
 """
 
@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from coil_rl.envs.splines import slots_in_use
 from coil_rl.envs.track import Track
 
-SECTORS = 8
+SECTORS = 12
 FAR = 3.0  # m: the distance field stops here, wider than any track
 EXACT = 1.0  # m: a clearance up to this counts every cone, a larger one perhaps only the boundaries
 
@@ -86,6 +87,7 @@ class TrackMap(nn.Module):
     finish: Tensor
     starts: Tensor
     candidate: Tensor
+    listed: Tensor
     block: Tensor
     near: Tensor
     field: Tensor
@@ -139,7 +141,10 @@ class TrackMap(nn.Module):
     def _list_candidates(
         self, rings: list[tuple[NDArray[np.float64], NDArray[np.float64]]], sight: float, half_field_of_view: float
     ) -> None:
-        """Fill `candidate` [blocks * SECTORS, 2 * most], `block` (its block for each cell) and `near`."""
+        """Fill `candidate` [blocks * SECTORS, 2 * most], `listed`, `block` (its block for each cell) and `near`.
+
+        `listed` says how many candidates the side that has more of them really has.
+        """
         half_diagonal = self.cells.cell * np.sqrt(0.5)
         heading = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
         padding = np.array([[self.slots - 1], [2 * self.slots - 1]])
@@ -169,6 +174,7 @@ class TrackMap(nn.Module):
         candidate = _stack(seen, padding)
         self.most = candidate.shape[-1]
         self._keep("candidate", candidate.reshape(-1, 2 * self.most), torch.int16)
+        self._keep("listed", (candidate != padding).sum(-1).max(-1).reshape(-1), torch.int16)
         self._keep("block", np.concatenate(blocks), torch.int64)
         self._keep("near", _stack(nears, np.array([self.slots - 1])), torch.int32)
 
@@ -185,12 +191,14 @@ class TrackMap(nn.Module):
             heading: [B], radians.
 
         Returns:
-            Slot of each candidate among its track's cones [most, 2, B] (left then right, rings padded to `slots`),
-            ascending, and its position [2, most, 2, B] in m; padding lies 10 km away.
+            Slot of each candidate among its track's cones [N, 2, B] (left then right, rings padded to `slots`),
+            ascending, and its position [2, N, 2, B] in m; padding lies 10 km away.
         """
         sector = (heading * (SECTORS / (2 * np.pi))).floor_().remainder_(SECTORS).long()
-        slot = self.candidate.index_select(0, torch.add(sector, self.block.index_select(0, cell), alpha=SECTORS))
-        slot = slot.view(-1, 2, self.most).permute(2, 1, 0).contiguous().int()
+        row = torch.add(sector, self.block.index_select(0, cell), alpha=SECTORS)
+        most = slots_in_use(self.listed.index_select(0, row), self.most)
+        slot = self.candidate.index_select(0, row).view(-1, 2, self.most)[..., :most]
+        slot = slot.permute(2, 1, 0).contiguous().int()
         return slot, self._positions(track, slot)
 
     def clearance(self, track: Tensor, cell: Tensor, position: Tensor) -> Tensor:

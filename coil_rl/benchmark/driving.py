@@ -1,4 +1,4 @@
-"""How fast cars drive: env steps per second under random steering, with and without the guide, and what bounds it."""
+"""How fast cars drive: env steps per second, with and without the guide's advice, and what bounds it."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ OPERATORS = 10
 
 
 class Driving:
-    """Random steering, with resets as in training; a call returns how many cars made a step.
+    """Cars that steer at random or as they are advised, with resets; a call returns how many cars made a step.
 
     Args:
         env: batched env.
+        advised: follow the advice.
     """
 
-    def __init__(self, env: EnvBase) -> None:
-        self.env, self.cars = env, env.batch_size.numel()
+    def __init__(self, env: EnvBase, advised: bool = False) -> None:
+        self.env, self.advised, self.cars = env, advised, env.batch_size.numel()
         self.steps = 0
         self.ended = torch.zeros((), dtype=torch.int64, device=env.device)
         with torch.no_grad():
@@ -34,7 +35,8 @@ class Driving:
     @torch.no_grad()
     def __call__(self) -> int:
         """One step of all cars."""
-        self.state["action"] = torch.rand(*self.env.batch_size, 1, device=self.env.device) * 2 - 1
+        drawn = torch.rand(*self.env.batch_size, 1, device=self.env.device) * 2 - 1
+        self.state["action"] = self.state["guide_action"][..., 0, :] if self.advised else drawn
         step, self.state = self.env.step_and_maybe_reset(self.state)
         self.ended += step["next", "done"].sum()
         self.steps += 1
@@ -64,20 +66,22 @@ def drive_env(config: DictConfig, cars: int, guide: bool) -> EnvBase:
 
 
 def measure_driving(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:
-    """One row a batch size: steps per second with and without the guide, and their quotient."""
+    """One row a batch size: steps per second without advice, with it, and where the guide drives."""
     rows = []
     for cars in config.cars:
         turns.tick(f"{cars} cars, until some crash")
         subjects = {name: Driving(drive_env(config, cars, name == "guide")) for name in ("bare", "guide")}
         for subject in subjects.values():
             subject.until_some_crash()
+        subjects["driven"] = Driving(drive_env(config, cars, True), advised=True)
         rates = turns.rates(subjects, f"{cars} cars, ")
-        without, with_guide = (statistics.median(rates[name]) for name in ("bare", "guide"))
+        without, with_guide, driven = (statistics.median(rates[name]) for name in ("bare", "guide", "driven"))
         rows.append(
             {
                 "cars": cars,
                 "steps_per_s": without,
                 "steps_per_s_with_guide": with_guide,
+                "steps_per_s_guide_drives": driven,
                 "ms_per_batched_step": 1e3 * cars / without,
                 "ms_per_batched_step_with_guide": 1e3 * cars / with_guide,
                 "resets_per_1000_steps": 1e3 * subjects["guide"].resets,

@@ -109,6 +109,21 @@ def test_a_car_of_thousands_drives_as_if_alone(tracks: list[Track]) -> None:
         )
 
 
+def test_without_info_the_rest_is_the_same(tracks: list[Track]) -> None:
+    whole, bare = ConeTrackEnv(tracks, 8), ConeTrackEnv(tracks, 8, info=False)
+    check_env_specs(bare)
+    whole.set_seed(3)
+    bare.set_seed(3)
+    states = [whole.reset(), bare.reset()]
+    for action in steering(60, 8, seed=3):
+        emitted = []
+        for i, env in enumerate((whole, bare)):
+            after, states[i] = advance(env, states[i], action)
+            emitted.append(after)
+        assert "info" not in emitted[1]
+        assert (emitted[0].exclude("info") == emitted[1]).all()
+
+
 @pytest.mark.parametrize("assignment", ["random", "cyclic"])
 def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track], assignment: str) -> None:
     env = ConeTrackEnv(rings, 12, assignment=assignment)
