@@ -13,13 +13,16 @@ from torch.nn import functional as F
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
+from coil_rl.transforms.answers import Answers
+
 
 class GuideActions(Transform):
     """Asks each guide what it would do and writes the answers next to the observation.
 
     The agent is free to use them: nothing ties its action to them. A guide is any TensorDictModule that reads what the
     env writes and writes an action; it runs without gradients, on its own copy of the data, so that nothing but its
-    action gets through.
+    action gets through. If every guide says `pure = True`, that its action follows from what it reads of the same row
+    and from nothing else, what they say of the states in which episodes begin is remembered.
 
     Where the env's actions are numbers of a finite set (`Categorical`), the advice is one-hot.
 
@@ -56,6 +59,7 @@ class GuideActions(Transform):
         self.guides = nn.ModuleDict(guides)
         self._reads = {name: guide.in_keys for name, guide in guides.items()}
         self.action_key = action_key
+        self._answers = Answers() if all(getattr(guide, "pure", False) for guide in guides.values()) else None
         # Asking the env costs as much as a step, so it is asked once.
         self._choices: int | None = None
 
@@ -74,8 +78,9 @@ class GuideActions(Transform):
             return self._call(tensordict_reset)
         # The other rows are thrown away, and in a large batch nearly every step resets a few.
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
+        asked = tensordict_reset.select(*self.in_keys, strict=False)[rows]
         with torch.no_grad():
-            advice = self._advice(tensordict_reset.select(*self.in_keys, strict=False)[rows])
+            advice = self._advice(asked) if self._answers is None else self._answers(asked, self._advice)
         everything = advice.new_zeros((*tensordict_reset.batch_size, *advice.shape[1:]))
         return tensordict_reset.set(self.out_keys[0], everything.index_put(rows, advice))
 

@@ -49,6 +49,8 @@ class ConstantGuide(TensorDictModule):
         out_key: where to write the action, [*batch, A].
     """
 
+    pure = True
+
     def __init__(
         self, value: float | Sequence[float], in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:

@@ -49,6 +49,8 @@ class SplineGuide(TensorDictModuleBase):
         torch.Size([4, 5, 1])
     """
 
+    pure = True
+
     def __init__(
         self,
         spline: Literal["cubic", "quadratic"] = "cubic",

@@ -1,6 +1,7 @@
 import copy
 import math
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -412,6 +413,24 @@ def test_few_kept_cones_change_nothing_but_the_room(rings: list[Track]) -> None:
         assert emitted[1]["cones"].shape == (8, 2, 30, 2)
         assert torch.equal(emitted[1]["cones"][:, :, :16], emitted[0]["cones"])
         assert same(emitted[0].exclude("cones"), emitted[1].exclude("cones"))
+
+
+@pytest.mark.slow
+def test_a_hundred_million_random_steps_stay_finite_in_the_same_memory() -> None:
+    cars = 16_384
+    env = ConeTrackEnv(shipped_tracks("all"), cars)
+    draw = torch.Generator().manual_seed(0)
+    state, driven, resident = env.reset(), 0, []
+    while driven < 100_000_000:
+        # What a car was told before decides where it drives, so the steering wanders instead of trembling.
+        noise = torch.randn(cars, 1, generator=draw)
+        state["action"] = (0.9 * state["steering"] + 0.3 * noise).clamp(-1, 1)
+        step, state = env.step_and_maybe_reset(state)
+        driven += cars
+        if driven // cars % 100 == 0:
+            assert all(value.isfinite().all() for value in leaves(step["next"]).values())
+            resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096)
+    assert max(resident[len(resident) // 2 :]) < 1.02 * max(resident[: len(resident) // 2])
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
