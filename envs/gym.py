@@ -77,9 +77,14 @@ def _numpy(tensor: torch.Tensor) -> NDArray[Any]:
     return array
 
 
-def _info(info: TensorDictBase) -> dict[str, Any]:
+def _info(state: TensorDictBase) -> dict[str, Any]:
+    """What the env wrote under `info`; empty where it was told not to."""
+    return _arrays(state["info"]) if "info" in state else {}
+
+
+def _arrays(info: TensorDictBase) -> dict[str, Any]:
     """[B] or, for vectors, [B, n] each, nested as the env nests them."""
-    return {k: _info(v) if isinstance(v, TensorDictBase) else _numpy(v.squeeze(-1)) for k, v in info.items()}
+    return {k: _arrays(v) if isinstance(v, TensorDictBase) else _numpy(v.squeeze(-1)) for k, v in info.items()}
 
 
 def _of_one(info: dict[str, Any]) -> dict[str, Any]:
@@ -124,13 +129,13 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
         if first or seed is not None:
             self.cars.env.set_seed(self.np_random_seed % 2**63)
         state = self.cars.reset()
-        return self.cars.observe(state)[0], _of_one(_info(state["info"]))
+        return self.cars.observe(state)[0], _of_one(_info(state))
 
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Drive for one step."""
         state = self.cars.step(action)
         ends = (bool(state[key]) for key in ("terminated", "truncated"))
-        return self.cars.observe(state)[0], float(state["reward"]), *ends, _of_one(_info(state["info"]))
+        return self.cars.observe(state)[0], float(state["reward"]), *ends, _of_one(_info(state))
 
 
 class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
@@ -173,7 +178,7 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         if first or seed is not None:
             self.cars.env.set_seed((self.np_random_seed or 0) % 2**63)
         state = self.cars.reset()
-        return self.cars.observe(state), _info(state["info"])
+        return self.cars.observe(state), _info(state)
 
     def step(
         self, actions: Floats
@@ -187,13 +192,11 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
             rows = after["done"].squeeze(-1)
             last = np.full(self.num_envs, None, dtype=object)
             last[done] = np.fromiter(self.cars.observe(after[rows]), dtype=object, count=int(done.sum()))
-            ends = {"final_obs": last, "final_info": _info(after["info"])} | dict.fromkeys(
-                ("_final_obs", "_final_info"), done
-            )
+            ends = {"final_obs": last, "final_info": _info(after)} | dict.fromkeys(("_final_obs", "_final_info"), done)
             fresh = self.cars.reset(after["done"])
             state = after.select(*fresh.keys()).clone()
             state[rows] = fresh[rows]
-        return self.cars.observe(state), reward, terminated, truncated, _info(state["info"]) | ends
+        return self.cars.observe(state), reward, terminated, truncated, _info(state) | ends
 
 
 if ID not in gymnasium.registry:

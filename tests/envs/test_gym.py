@@ -107,7 +107,7 @@ def test_autoreset_gives_the_last_observation_of_the_episode_and_the_first_of_th
     last = np.stack(info["final_obs"][done])
     assert last.shape == (done.sum(), 20 + (advice is not None))
     cars = envs.unwrapped.cars.env
-    start = cars.start_observation[cars.track].numpy()
+    start = cars.start_observation[:, cars.track].t().numpy()
     np.testing.assert_array_equal(observation[done, :20], start[done])
     assert (last[:, :20] != start[done]).any()
     assert info["final_info"]["crashed"][done].all()
@@ -170,3 +170,9 @@ def test_envs_do_without_gymnasium_and_the_module_names_the_extra():
     env = os.environ | {"PYTHONPATH": str(ROOT)}
     done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "coil_rl.envs.gym needs Gymnasium: python -m pip install 'coil-rl[gym]'"
+
+
+def test_without_info_there_is_none():
+    envs = gymnasium.make_vec(gym.ID, num_envs=2, info=False)
+    assert envs.reset(seed=0)[1] == {}
+    assert envs.step(np.zeros((2, 1), dtype=np.float32))[4] == {}
