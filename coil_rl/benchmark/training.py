@@ -62,7 +62,8 @@ def plain(config: DictConfig, method: str, cars: int, steps: int) -> Callable[[]
     """The hand-written loop on the same env, with the same hyper-parameters."""
     env = build_bare_env(config, {"num_cars": cars})
     guide = build_guide(config) if method == "coil" else None
-    node = {key: value for key, value in config.learner.items() if key != "compile"}
+    learned: Any = OmegaConf.to_container(config.learner, resolve=True)
+    node = {key: value for key, value in learned.items() if key != "compile"}
     node |= {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"}
     learner: PlainPPO = build(node, "learner", env=env, guide=guide, steps=steps)
 

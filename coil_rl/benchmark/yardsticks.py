@@ -11,7 +11,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 import coil_rl
@@ -28,11 +27,11 @@ SB3_ENVS = (1, 8)
 def measure_oracle(config: DictConfig, turns: Turns) -> dict[str, Any]:
     """Env steps per second with the guide: one car in NumPy and SciPy, and ours at `compare_cars`.
 
-    Both steer at random and ask the guide at every step.
+    In both the guide drives.
     """
     if not ORACLE.is_file():
         return {"not_measured": "no checkout: tests/oracle.py is not part of the installed package"}
-    ours = Driving(drive_env(config, config.compare_cars, guide=True)).until_some_crash()
+    ours = Driving(drive_env(config, config.compare_cars, guide=True), advised=True)
     rates = turns.rates({"oracle": one_car(_load(ORACLE), config), "ours": ours}, "one car in NumPy and SciPy: ")
     return {
         "cars": config.compare_cars,
@@ -44,19 +43,17 @@ def measure_oracle(config: DictConfig, turns: Turns) -> dict[str, Any]:
 
 
 def one_car(oracle: ModuleType, config: DictConfig) -> Callable[[], int]:
-    """Drives `tests/oracle.py` on the training tracks in turn, each until it crashes."""
+    """Drives `tests/oracle.py` on the training tracks in turn, each to the end."""
     options = {key: config.env[key] for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")}
     guide = {key: config.guide[key] for key in ("spline", "smoothing", "gain") if key in config.guide}
     cars = [oracle.OneCar(t.left, t.right, t.start, **options) for t in build(config.track.train, "track.train")]
-    rng = np.random.default_rng(0)
     driven = 0
 
     def steps() -> int:
         nonlocal driven
         for _ in range(ORACLE_STEPS):
             car = cars[driven % len(cars)]
-            oracle.guide_action(*car.cones(), car.steering, **guide)
-            outcome = car.step(rng.uniform(-1, 1))
+            outcome = car.step(oracle.guide_action(*car.cones(), car.steering, **guide))
             if outcome.terminated or outcome.truncated:
                 driven += 1
                 cars[driven % len(cars)].reset()

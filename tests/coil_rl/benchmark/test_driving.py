@@ -17,5 +17,5 @@ def test_driving_counts_steps_and_resets(ring):
 
 def test_a_car_that_crashed_drives_on_from_the_start(ring):
     driving = Driving(ConeTrackEnv([ring], 1)).until_some_crash()
-    start = driving.env.start_observation[0]
+    start = driving.env.start_observation[:, 0]
     torch.testing.assert_close(driving.state["observation"][0], start)
