@@ -45,8 +45,6 @@ def benchmark(config: DictConfig) -> None:
         raise UserError(f"parts: there is no {', '.join(unknown)}; there are {', '.join(PARTS)}")
     if config.quick:
         config.merge_with(config.when_quick)
-    if config.device.startswith("cuda") and not torch.cuda.is_available():
-        raise UserError(f"device={config.device}: PyTorch finds no such device here; there is cpu")
     torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     folder = Path(config.run_dir)

@@ -159,7 +159,7 @@ def test_seed_that_is_no_whole_number_is_refused(seed):
 
 
 def test_no_tracks_at_all_are_refused():
-    with pytest.raises(ValueError, match="ask for at least 1"):
+    with pytest.raises(ValueError, match="ask for 1 to 10000"):
         random_tracks(0, seed=1)
 
 
