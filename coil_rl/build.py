@@ -108,6 +108,11 @@ def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = Non
     return env
 
 
+def build_learner(config: DictConfig, env: EnvBase) -> Any:
+    """The learner of a configuration, observing what its method says of this env."""
+    return build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+
+
 def build_guide(config: DictConfig) -> TensorDictModuleBase:
     """The guide of a configuration."""
     guide: TensorDictModuleBase = build(config.guide, "guide", TensorDictModuleBase)

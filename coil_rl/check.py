@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.build import build, build_env, build_guide, check_node
+from coil_rl.build import build, build_env, build_guide, build_learner, check_node
 from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.signature import near
@@ -105,7 +105,7 @@ def _check_training(config: DictConfig) -> None:
     if not config.method.observes:
         raise UserError("method.observes=[] lets the agent see nothing; name entries of the env, or null for no agent")
     env = build_env(config)
-    learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    learner = build_learner(config, env)
     frames = config.budget.cars * config.budget.steps
     minibatches = getattr(learner, "minibatches", 1)  # not every learner has them
     if minibatches > frames:

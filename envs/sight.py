@@ -66,6 +66,18 @@ def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     return distance, torch.lerp(acute, obtuse, x.clone().lt_(0))
 
 
+def ahead(x: Tensor, square: Tensor, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> Tensor:
+    """1 where a point lies within the field of view, else 0.
+
+    Args:
+        x: how far ahead of the car it is, m.
+        square: of its distance, m^2.
+        half_field_of_view: radians to either side, at most pi / 2.
+    """
+    # Not behind the car, so x |x| instead of the square of x.
+    return torch.addcmul(square * -(math.cos(half_field_of_view) ** 2), x, x.abs()).ge_(0)
+
+
 def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> View:
     """Sort out which cones are in sight: at most `sight` m away and `half_field_of_view` to either side.
 
@@ -77,9 +89,7 @@ def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: flo
     """
     x, y = local
     square = torch.addcmul(x * x, y, y)
-    # Ahead of the car, so x |x| instead of the square of x.
-    ahead = torch.addcmul(square * -(math.cos(half_field_of_view) ** 2), x, x.abs()).ge_(0)
-    visible = square.clone().le_(sight**2).mul_(ahead)
+    visible = square.clone().le_(sight**2).mul_(ahead(x, square, half_field_of_view))
     count = visible.sum(0).clamp_(max=kept)
     kept = slots_in_use(count, min(kept, len(x)))
     slots = torch.arange(kept, dtype=x.dtype, device=x.device).view(-1, 1, 1)

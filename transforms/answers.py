@@ -33,7 +33,8 @@ class Answers:
             [leaf.reshape(len(data), leaf.shape[1:].numel()).double() for leaf in data.values(True, True)], 1
         )
         known, answers = self.known or (rows[:0], None)
-        new = ~_same(rows, known).any(1)
+        same = _same(rows, known)
+        new = ~same.any(1)
         if len(known) + int(new.sum()) > self.limit:
             return ask(data)
         if new.any():
@@ -41,8 +42,8 @@ class Answers:
             first = _same(fresh, fresh).int().argmax(1) == torch.arange(len(fresh), device=rows.device)
             given = ask(data[new])[first]
             known, answers = torch.cat([known, fresh[first]]), given if answers is None else torch.cat([answers, given])
-            self.known = known, answers
-        return ask(data) if answers is None else answers[_same(rows, known).int().argmax(1)]
+            self.known, same = (known, answers), _same(rows, known)
+        return ask(data) if answers is None else answers[same.int().argmax(1)]
 
 
 def _same(rows: Tensor, others: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.benchmark.plain_ppo import PlainPPO
 from coil_rl.benchmark.turns import Sections, Turns, median_ratio
-from coil_rl.build import build, build_bare_env, build_env, build_guide
+from coil_rl.build import build, build_bare_env, build_env, build_guide, build_learner
 from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -34,7 +34,7 @@ class Training:
     def __init__(self, config: DictConfig, method: str, cars: int, steps: int) -> None:
         observed: Any = OmegaConf.merge(config, {"method": config.methods[method]})
         env = build_env(observed, {"num_cars": cars})
-        learner = build(config.learner, "learner", env=env, in_keys=list(observed.method.observes))
+        learner = build_learner(observed, env)
         rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys({})])
         # The experiment keeps its best policy in a file; that belongs to what it costs.
         self.folder = tempfile.TemporaryDirectory()

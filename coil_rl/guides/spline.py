@@ -13,14 +13,13 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from coil_rl.envs.sight import flat_index, polar
+from coil_rl.envs.sight import ahead, flat_index, polar
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import least_squares_parabola, slots_in_use, smoothing_spline
 
 PAIR_DISTANCE = 4.0
 TARGET_SPACING = 1.0
 TARGET_REACHED = 0.625
-HALF_FIELD_OF_VIEW = math.radians(60)
 FAR = 1e3  # m
 
 
@@ -130,9 +129,7 @@ class SplineGuide(TensorDictModuleBase):
         number = torch.arange(targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
         x, y = path.sample(path.length * (number / steps).clamp(max=1))
         square = torch.addcmul(x * x, y, y)
-        # Ahead of the car, so x |x| instead of the square of x.
-        ahead = torch.addcmul(square * -(math.cos(HALF_FIELD_OF_VIEW) ** 2), x, x.abs()).ge_(0)
-        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead).mul_((count - 1).clamp(0, 1))
+        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead(x, square)).mul_((count - 1).clamp(0, 1))
         nearest = flat_index(smallest(square, wanted, 1))
         target = torch.stack([x.flatten().index_select(0, nearest), y.flatten().index_select(0, nearest)])
         return target, wanted.amax(0) > 0

@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl import checkpoint
-from coil_rl.build import build, build_env
+from coil_rl.build import build_env, build_learner
 from coil_rl.errors import UserError
 from coil_rl.programs import app
 from coil_rl.programs.judge import judge, outcome
@@ -41,7 +41,7 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
     if config.method.observes is None:
         return config, None
     env = build_env(config)
-    learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    learner = build_learner(config, env)
     weights = run / f"policy_{config.evaluation.policy}.pt"
     try:
         learner.policy.load_state_dict(checkpoint.load(weights, config.device))

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from coil_rl import checkpoint
-from coil_rl.build import build, build_env, build_guide
+from coil_rl.build import build, build_env, build_guide, build_learner
 from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
 from coil_rl.experiment import Experiment, watched_keys
@@ -63,7 +63,7 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     # After the guide, which another process may have driven already.
     torch.manual_seed(config.seed)
     env = build_env(config)
-    learner = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    learner = build_learner(config, env)
     keys = [*learner.keys, *watched_keys(config.watch)]
     experiment = Experiment(
         learner,
