@@ -18,7 +18,6 @@ from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import least_squares_parabola, slots_in_use, smoothing_spline
 
 PAIR_DISTANCE = 4.0
-TARGET_SPACING = 1.0
 TARGET_REACHED = 0.625
 FAR = 1e3  # m
 
@@ -49,6 +48,7 @@ class SplineGuide(TensorDictModuleBase):
     """
 
     pure = True
+    spacing = 1.0  # m from target to target
 
     def __init__(
         self,
@@ -94,14 +94,17 @@ class SplineGuide(TensorDictModuleBase):
         Returns:
             [B, 1], fraction of `max_steering`.
         """
-        points, count = self._midpoints(cones, cone_count)
-        target, found = self._target(points, count)
+        targets, square, wanted = self._targets(*self._midpoints(cones, cone_count))
+        advice = self._pursuit(pick(targets, square, wanted))
+        return torch.where(wanted.amax(0) > 0, advice, steering.squeeze(-1)).unsqueeze(-1)
+
+    def _pursuit(self, target: Tensor) -> Tensor:
+        """Equation 103 for targets [2, B] m: [B], fraction of `max_steering`."""
         distance, angle = polar(*target)
         # As exp and log, because a power rounds differently at the end of a tensor.
         sharp = (distance.clamp(min=TARGET_REACHED).log() * -self.sharpness).exp()
         advice = (angle * (180 / math.pi) * sharp).atan() * (2 * self.max_steering / math.pi)
-        advice = advice.clamp(-self.max_steering, self.max_steering) * (self.gain / self.max_steering)
-        return torch.where(found, advice, steering.squeeze(-1)).unsqueeze(-1)
+        return advice.clamp(-self.max_steering, self.max_steering) * (self.gain / self.max_steering)
 
     def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Midpoints of close left-right pairs, nearest first: [2, M, B] m, and how many there are [B]."""
@@ -121,15 +124,18 @@ class SplineGuide(TensorDictModuleBase):
         points = torch.stack([axis.flatten().index_select(0, nearest).view(kept, -1) for axis in (x, y)])
         return points * 0.5, total
 
-    def _target(self, points: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest target that is ahead and not reached: [2, B] m, and whether there is one [B]."""
+    def _targets(self, points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Targets along the path [2, T, B] m, their squared distances and 1 if ahead and not reached [T, B]."""
         path = self.fit(points, count)
-        steps = (path.polyline_length / TARGET_SPACING).round().clamp(1, self.targets - 1)
+        steps = (path.polyline_length / self.spacing).round().clamp(1, self.targets - 1)
         targets = slots_in_use(steps + 1, self.targets)
         number = torch.arange(targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
-        x, y = path.sample(path.length * (number / steps).clamp(max=1))
+        x, y = found = path.sample(path.length * (number / steps).clamp(max=1))
         square = torch.addcmul(x * x, y, y)
         wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead(x, square)).mul_((count - 1).clamp(0, 1))
-        nearest = flat_index(smallest(square, wanted, 1))
-        target = torch.stack([x.flatten().index_select(0, nearest), y.flatten().index_select(0, nearest)])
-        return target, wanted.amax(0) > 0
+        return found, square, wanted
+
+
+def pick(targets: Tensor, order: Tensor, wanted: Tensor) -> Tensor:
+    """The first one wanted by order [T, B] of the targets [2, T, B]: [2, B]."""
+    return targets.flatten(1).index_select(1, flat_index(smallest(order, wanted, 1)))
