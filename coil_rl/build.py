@@ -11,7 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
+from coil_rl.guides.simple import FollowAdvice
 from coil_rl.signature import check_call, shown
+from coil_rl.transforms import GuideActions
 
 
 def build(node: Any, name: str, kind: type | None = None, **given: Any) -> Any:
@@ -86,18 +88,40 @@ def _target(target: Any, name: str) -> Callable[..., Any]:
     return called
 
 
-def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, observed: bool = True) -> EnvBase:
-    """The env of a configuration, inside the transforms of its method, which adds up `episode_reward`.
+def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
+    """The env of a configuration as its agent sees it, which also adds up the task's reward as `episode_reward`.
 
     Args:
-        config: with `env` and `method`.
+        config: with `env`, `method` and `degrade`.
         overrides: what to change in `env`.
-        observed: False leaves the method's transforms out: a guide drives in the bare env.
+        advice: which of `evaluation.advice` comes last, and degrades the advice once more.
     """
     env = build_bare_env(config, overrides)
-    parts = config.method.transforms if observed else []
-    transforms = [build(part, f"method.transforms[{i}]", Transform) for i, part in enumerate(parts)]
-    return TransformedEnv(env, Compose(*transforms, RewardSum()))
+    transforms = build_transforms(config)
+    if advice:
+        transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
+    # The sum comes first, before a method changes what the agent is paid.
+    return TransformedEnv(env, Compose(RewardSum(), *transforms))
+
+
+def build_transforms(config: DictConfig) -> list[Transform]:
+    """The transforms of a method, and after them those that degrade what its guides say."""
+    return [*build_all(config.method.transforms, "method.transforms"), *build_all(config.degrade, "degrade")]
+
+
+def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
+    """Transforms in the order in which they stand in the configuration."""
+    return [build(node, f"{name}.{key}", Transform) for key, node in nodes.items()]
+
+
+def build_guided_env(
+    config: DictConfig, overrides: Mapping[str, Any] | None = None
+) -> tuple[EnvBase, TensorDictModuleBase]:
+    """The env of a configuration, and a policy by which its guide drives there, degraded as the configuration says."""
+    env = build_bare_env(config, overrides)
+    transforms = [GuideActions({"guide": build_guide(config)}), *build_all(config.degrade, "degrade")]
+    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    return env, FollowAdvice(env)
 
 
 def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:

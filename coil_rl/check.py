@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.build import build, build_env, build_guide, build_learner, check_node
+from coil_rl.build import build, build_all, build_bare_env, build_env, build_guide, build_learner, check_node
 from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.signature import near
@@ -34,7 +34,7 @@ LIMITS = {
     "checkpoint_every": (1, LARGEST),
 }
 LARGEST_BATCH = 2**28
-POLICIES = ("last", "best")
+CHOICES = {"evaluation.policy": ("last", "best"), "existing": ("refuse", "resume")}
 
 
 def check(config: DictConfig) -> None:
@@ -53,8 +53,10 @@ def check(config: DictConfig) -> None:
             raise UserError(f"track.{part} gives no tracks; give at least one")
     if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
-        env = build_env(config, {**config.evaluation.env, "num_cars": 1}, observed=False)
+        env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
         _check_guide(build_guide(config), env)
+        build_all(config.degrade, "degrade")
+    build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
         _check_training(config)
     _make_folder(Path(config.run_dir))
@@ -71,8 +73,10 @@ def _check_values(config: DictConfig) -> None:
         value = OmegaConf.select(config, name)
         if value is not None and not low <= value <= high:
             raise UserError(f"{name}={value} must be {f'at least {low}' if value < low else f'at most {high}'}")
-    if config.evaluation.policy not in POLICIES:
-        raise UserError(f"evaluation.policy={config.evaluation.policy} must be one of {', '.join(POLICIES)}")
+    for name, choices in CHOICES.items():
+        value = OmegaConf.select(config, name)
+        if value is not None and value not in choices:
+            raise UserError(f"{name}={value} must be one of {', '.join(choices)}")
     frames = config.budget.cars * config.budget.steps
     if frames > LARGEST_BATCH:
         raise UserError(f"budget.cars x budget.steps={frames} must be at most {LARGEST_BATCH}")

@@ -27,6 +27,7 @@ class Evaluation:
     """How a policy is judged."""
 
     env: dict[str, Any] = field(default_factory=dict)
+    advice: dict[str, Any] = field(default_factory=dict)
     repeats: int = 5
     policy: str = "last"
     gif: bool = True
@@ -38,7 +39,8 @@ class Method:
 
     name: str = MISSING
     observes: list[str] | None = MISSING
-    transforms: list[Any] = field(default_factory=list)
+    transforms: dict[str, Any] = field(default_factory=dict)
+    needs_guide: bool = MISSING
 
 
 @dataclass
@@ -50,6 +52,7 @@ class Common:
     track: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
+    degrade: dict[str, Any] = field(default_factory=dict)
     method: Method = field(default_factory=Method)
     budget: Budget = field(default_factory=Budget)
     evaluation: Evaluation = field(default_factory=Evaluation)
@@ -63,10 +66,12 @@ class Common:
 class Train(Common):
     """Configuration of `coil-train`."""
 
+    label: str = MISSING
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
     watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: int = 10
+    existing: str = "refuse"
     resume: str | None = None
 
 

@@ -45,14 +45,14 @@ def drive(
     """One episode of every row of the env.
 
     Args:
-        env: batched env, [B].
+        env: batched env, [B]; its transforms go into evaluation mode.
         policy: writes the action.
         sampled: draw actions instead of taking the deterministic one.
         names: of the tracks.
         tick: called every step.
     """
     history: list[dict[str, Tensor]] = []
-    carrier = env.reset()
+    carrier = env.eval().reset()
     running = torch.ones_like(env.full_done_spec["done"].zero())
     mode = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
     with set_exploration_type(mode):

@@ -14,6 +14,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl import checkpoint
@@ -47,7 +48,8 @@ class Experiment:
 
     Args:
         learner: learns.
-        rollout: collects; its env must write `episode_reward` (TorchRL's RewardSum).
+        rollout: collects; its env must write `episode_reward` (TorchRL's RewardSum). Where something is added to the
+            reward for learning only, the env must write the task's as `task_reward`.
         frames: length of the run; the last batch may go beyond it.
         folder: exists.
         logger: any TorchRL logger, besides the CSV.
@@ -124,7 +126,7 @@ class Experiment:
     def update(self, progress: float) -> dict[str, float]:
         """Collect one batch and learn from it; returns the row for the log."""
         with self._saying_how_to_go_on():
-            batch = self.rollout.collect()
+            batch = self.rollout.collect(progress)
         row = self._describe(batch)
         if len(self.returns) == self.EPISODES and row["train/return"] > self.best:
             # The policy that collected this batch, not the one that learned from it.
@@ -160,7 +162,7 @@ class Experiment:
         row = {
             "train/return": sum(self.returns) / len(self.returns) if self.returns else math.nan,
             "train/episodes": float(done.sum()),
-            "train/reward": float(after["reward"].mean()),
+            "train/reward": float(after["task_reward" if "task_reward" in after else "reward"].mean()),
         }
         for name, key in self.watch_episode.items():
             row[f"train/{name}"] = float(batch[key][done].float().mean()) if row["train/episodes"] else math.nan
@@ -191,7 +193,8 @@ class Experiment:
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
-def watched_keys(watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:
+def watched_keys(env: EnvBase, watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:
     """The entries that a rollout must keep for `Experiment`, besides those of the learner."""
     watched = (tuple(key) for group in watch.values() for key in group.values())
-    return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *watched)]
+    task = [("task_reward",)] if "task_reward" in env.observation_spec else []
+    return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)]

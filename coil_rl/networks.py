@@ -94,7 +94,7 @@ class Keyed(TensorDictModuleBase):
 
 
 def actor(
-    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5
+    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5, gain: float = 0.01
 ) -> ProbabilisticActor:
     """A stochastic policy for the env's action: a squashed normal where actions are bounded, else a normal or a choice.
 
@@ -105,6 +105,7 @@ def actor(
         in_keys: what the agent observes.
         hidden: widths of the hidden layers.
         scale: standard deviation at the start, before squashing.
+        gain: size of the last layer's weights at the start.
 
     Returns:
         A module that writes `action` and `action_log_prob`.
@@ -112,7 +113,7 @@ def actor(
     spec = env.action_spec
     discrete = isinstance(spec, (Categorical, OneHot))
     size = spec.space.n if discrete else spec.shape[-1]
-    network = Network(env, in_keys, hidden, size, gain=0.01)
+    network = Network(env, in_keys, hidden, size, gain)
     common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
     if discrete:
         module = Keyed(network, in_keys, ["logits"])

@@ -14,13 +14,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.finite import check_batch
+from coil_rl.transforms.guided import Guided
 
 
 class Rollout:
     """Batches of consecutive steps of every row of an env, resetting each row that is done.
 
     Args:
-        env: batched env.
+        env: batched env; its transforms go into training mode.
         policy: writes the action; it samples.
         steps: T, length of a batch.
         keys: entries to keep, of those after a step as `("next", ...)`; all of them by default.
@@ -35,7 +36,8 @@ class Rollout:
     def __init__(
         self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
     ) -> None:
-        self.env, self.policy, self.steps = env, policy, steps
+        self.env, self.policy, self.steps = env.train(), policy, steps
+        self.guided = [module for module in env.modules() if isinstance(module, Guided)]
         self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
@@ -46,12 +48,17 @@ class Rollout:
         return self.env.batch_size.numel() * self.steps
 
     @torch.no_grad()
-    def collect(self) -> TensorDictBase:
+    def collect(self, progress: float = 0.0) -> TensorDictBase:
         """The next batch, [B, T].
+
+        Args:
+            progress: share of the run that is over, for the schedules of transforms.
 
         Raises:
             UserError: if a number in it is NaN or infinite, naming the entry, the step and the row.
         """
+        for transform in self.guided:
+            transform.progress = progress
         carrier = self.env.reset() if self.carrier is None else self.carrier
         columns: dict[NestedKey, list[Tensor]] = {}
         try:

@@ -1,5 +1,6 @@
 """TorchRL transforms that bring guides to any env, and that spoil their advice on purpose."""
 
+from coil_rl.transforms.combined_actions import MixedAction, ResidualAction
 from coil_rl.transforms.degraded_advice import (
     BiasedAdvice,
     DegradedAdvice,
@@ -9,15 +10,22 @@ from coil_rl.transforms.degraded_advice import (
 )
 from coil_rl.transforms.displaced_advice import DelayedAdvice, RemovedAdvice, ShuffledAdvice
 from coil_rl.transforms.guide_actions import GuideActions
+from coil_rl.transforms.reward_coupling import RewardCoupling
+from coil_rl.transforms.takeover import JumpStart, Takeover
 
 __all__ = [
     "BiasedAdvice",
     "DegradedAdvice",
     "DelayedAdvice",
     "GuideActions",
+    "JumpStart",
+    "MixedAction",
     "NoisyAdvice",
     "PartialAdvice",
     "RemovedAdvice",
+    "ResidualAction",
+    "RewardCoupling",
     "ScaledAdvice",
     "ShuffledAdvice",
+    "Takeover",
 ]

@@ -9,10 +9,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.nn import functional as F
-from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
+from torchrl.data import TensorSpec
 from torchrl.envs import Transform
 
+from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.answers import Answers
 
 
@@ -54,6 +54,8 @@ class GuideActions(Transform):
         for name, guide in guides.items():
             if action_key not in guide.out_keys:
                 raise ValueError(f"guide {name!r} must write {action_key!r}; it writes {guide.out_keys}")
+            if not name or "." in name or hasattr(nn.ModuleDict, name):
+                raise ValueError(f"{name!r} cannot be the name of a guide: PyTorch keeps it for itself; take another")
         in_keys = dict.fromkeys(key for guide in guides.values() for key in guide.in_keys)
         super().__init__(in_keys=list(in_keys), out_keys=[out_key])
         self.guides = nn.ModuleDict(guides)
@@ -61,12 +63,22 @@ class GuideActions(Transform):
         self.action_key = action_key
         self._answers = Answers() if all(getattr(guide, "pure", False) for guide in guides.values()) else None
         # Asking the env costs as much as a step, so it is asked once.
-        self._choices: int | None = None
+        self._space: ActionSpace | None = None
 
     @property
     def names(self) -> list[str]:
         """The guides' names, one per row of the advice."""
         return list(self.guides)
+
+    def train(self, mode: bool = True) -> GuideActions:
+        """Switch to training: the guides stay as they are when they are used."""
+        super().train(mode)
+        self.guides.eval()
+        return self
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the advice on data that an env of this kind wrote before."""
+        return self._call(tensordict)
 
     @torch.no_grad()
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -86,38 +98,27 @@ class GuideActions(Transform):
 
     def _advice(self, tensordict: TensorDictBase) -> Tensor:
         """[*batch, n_guides, A]."""
-        if self._choices is None:
-            self._choices = _choices(self._action_spec())
-        rows = []
+        space, rows = self.space, []
         for name, guide in self.guides.items():
-            action = guide(tensordict.select(*self._reads[name], strict=False))[self.action_key]
-            if self._choices:
-                action = F.one_hot(action.reshape(tensordict.batch_size).long(), self._choices)
-            rows.append(action if action.dtype.is_floating_point else action.float())
+            rows.append(space.vectors(guide(tensordict.select(*self._reads[name], strict=False))[self.action_key]))
         return torch.stack(rows, tensordict.batch_dims)
 
-    def _action_spec(self) -> TensorSpec:
-        if self.parent is None:
-            raise RuntimeError("GuideActions gives advice inside a TransformedEnv only: it needs the env's action spec")
-        return self.parent.full_action_spec[self.action_key]
+    @property
+    def space(self) -> ActionSpace:
+        """The env's actions.
+
+        Raises:
+            RuntimeError: outside an env.
+        """
+        if self._space is None:
+            if self.parent is None:
+                raise RuntimeError(
+                    "GuideActions gives advice inside a TransformedEnv only: it needs the env's action spec"
+                )
+            self._space = ActionSpace(self.parent.full_action_spec[self.action_key], self.parent.batch_dims)
+        return self._space
 
     def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the advice: bounded like the action, and within 0 and 1 where it is one-hot."""
-        spec = self._action_spec()
-        batch = self.parent.batch_size
-        size = _choices(spec) or spec.shape[-1]
-        shape = (*batch, len(self.guides), size)
-        dtype = spec.dtype if spec.dtype.is_floating_point else torch.float32
-        advice: TensorSpec = Unbounded(shape, device=spec.device, dtype=dtype)
-        if not spec.dtype.is_floating_point:
-            advice = Bounded(0, 1, shape, device=spec.device, dtype=dtype)
-        elif isinstance(spec, Bounded):
-            low, high = (bound.unsqueeze(len(batch)).expand(shape) for bound in (spec.space.low, spec.space.high))
-            advice = Bounded(low, high, shape, device=spec.device, dtype=dtype)
-        observation_spec[self.out_keys[0]] = advice
+        """Add the advice."""
+        observation_spec[self.out_keys[0]] = self.space.advice_spec(self.parent.batch_size, len(self.guides))
         return observation_spec
-
-
-def _choices(spec: TensorSpec) -> int:
-    """How many choices a `Categorical` action has; 0 for actions that are already vectors."""
-    return spec.n if isinstance(spec, Categorical) else 0

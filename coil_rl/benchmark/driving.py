@@ -12,7 +12,7 @@ from torch.profiler import ProfilerActivity, profile
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from coil_rl.benchmark.turns import Turns, synchronise
-from coil_rl.build import build, build_bare_env
+from coil_rl.build import build_all, build_bare_env
 
 OPERATORS = 10
 
@@ -61,8 +61,7 @@ def drive_env(config: DictConfig, cars: int, guide: bool) -> EnvBase:
     env = build_bare_env(config, {"num_cars": cars})
     if not guide:
         return env
-    transforms = [build(part, f"methods.coil.transforms[{i}]") for i, part in enumerate(config.methods.coil.transforms)]
-    return TransformedEnv(env, Compose(*transforms))
+    return TransformedEnv(env, Compose(*build_all(config.methods.coil.method.transforms, "methods.coil.transforms")))
 
 
 def measure_driving(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:

@@ -32,10 +32,10 @@ class Training:
     """
 
     def __init__(self, config: DictConfig, method: str, cars: int, steps: int) -> None:
-        observed: Any = OmegaConf.merge(config, {"method": config.methods[method]})
+        observed: Any = OmegaConf.merge(config, config.methods[method])
         env = build_env(observed, {"num_cars": cars})
         learner = build_learner(observed, env)
-        rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys({})])
+        rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
         # The experiment keeps its best policy in a file; that belongs to what it costs.
         self.folder = tempfile.TemporaryDirectory()
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
@@ -63,7 +63,7 @@ def plain(config: DictConfig, method: str, cars: int, steps: int) -> Callable[[]
     env = build_bare_env(config, {"num_cars": cars})
     guide = build_guide(config) if method == "coil" else None
     learned: Any = OmegaConf.to_container(config.learner, resolve=True)
-    node = {key: value for key, value in learned.items() if key != "compile"}
+    node = {key: value for key, value in learned.items() if key not in ("compile", "action_gain")}
     node |= {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"}
     learner: PlainPPO = build(node, "learner", env=env, guide=guide, steps=steps)
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict.nn import TensorDictModule
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from coil_rl.transforms.action_space import ActionSpace
 
 
 class _Constant(nn.Module):
@@ -94,6 +98,29 @@ class RandomGuide(TensorDictModule):
     ) -> None:
         _check_size(size)
         super().__init__(_Random(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
+
+
+class FollowAdvice(TensorDictModuleBase):
+    """Does what the advice says that `GuideActions` wrote: so a guide drives, whatever else happened to its advice.
+
+    Args:
+        env: for its actions.
+        guide: which row of the advice.
+        in_key: of the advice, [*batch, n_guides, A].
+        out_key: where to write the action.
+    """
+
+    def __init__(
+        self, env: EnvBase, guide: int = 0, in_key: NestedKey = "guide_action", out_key: NestedKey = "action"
+    ) -> None:
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        super().__init__()
+        self.space, self.guide = ActionSpace(env.full_action_spec[out_key], env.batch_dims), guide
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        advice = tensordict[self.in_keys[0]][..., self.guide, :]
+        return tensordict.set(self.out_keys[0], self.space.actions(advice))
 
 
 def _check_size(size: int) -> None:

@@ -17,6 +17,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from coil_rl import networks
 from coil_rl.learners.advantages import Advantages
+from coil_rl.learners.guide_loss import AuxiliaryLoss
 from coil_rl.schedules import Schedule, schedule
 
 
@@ -28,6 +29,7 @@ class PPO:
         in_keys: what policy and critic observe. COIL is PPO with `guide_action` among them.
         hidden: widths of the hidden layers of both networks.
         action_scale: standard deviation of the policy at the start.
+        action_gain: size of the weights behind the mean of the policy at the start; with 0 the mean is 0 everywhere.
         learning_rate: of Adam, a number or a schedule over the run.
         gamma: discount.
         gae_lambda: lambda of generalised advantage estimation.
@@ -37,6 +39,7 @@ class PPO:
         entropy: weight of the entropy bonus, a number or a schedule.
         critic: weight of the critic's loss.
         max_grad_norm: gradients are scaled down to this norm.
+        auxiliary: more losses of the policy.
         compile: the loss by `torch.compile`, which takes some ten seconds and pays in long runs. The numbers then
             differ in their last digits.
         seed: of the order of minibatches.
@@ -56,6 +59,7 @@ class PPO:
         *,
         hidden: Sequence[int] = (64, 64),
         action_scale: float = 0.5,
+        action_gain: float = 0.01,
         learning_rate: float | Schedule = 3e-4,
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
@@ -65,6 +69,7 @@ class PPO:
         entropy: float | Schedule = 0.0,
         critic: float = 0.5,
         max_grad_norm: float = 0.5,
+        auxiliary: Sequence[AuxiliaryLoss] = (),
         compile: bool = False,
         seed: int = 0,
     ) -> None:
@@ -73,14 +78,14 @@ class PPO:
                 raise ValueError(f"{name}={value} must be at least 1")
         for name, number, low, high in (
             ("gamma", gamma, 0, 1), ("gae_lambda", gae_lambda, 0, 1), ("critic", critic, 0, math.inf),
-            ("seed", seed, 0, 2**63 - 1),
+            ("action_gain", action_gain, 0, math.inf), ("seed", seed, 0, 2**63 - 1),
         ):  # fmt: skip
             if not low <= number <= high:
                 raise ValueError(f"{name}={number} must be at least {low} and at most {high}")
         for name, number in {"action_scale": action_scale, "clip": clip, "max_grad_norm": max_grad_norm}.items():
             if not 0 < number < math.inf:
                 raise ValueError(f"{name}={number} must be a finite number of more than 0")
-        self.policy = networks.actor(env, in_keys, hidden, action_scale)
+        self.policy = networks.actor(env, in_keys, hidden, action_scale, action_gain)
         self.critic = networks.critic(env, in_keys, hidden)
         self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
         for name, number in {"learning_rate": self.learning_rate(0), "entropy": self.entropy(0)}.items():
@@ -103,9 +108,14 @@ class PPO:
         self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
-        self.learned_from = [*in_keys, "action", "action_log_prob", "advantage", "value_target"]
+        self.auxiliary = list(auxiliary)
+        # Where a guide acts in some of the steps, the env says in which.
+        self.shares_control = "agent_acts" in env.observation_spec
+        beside = [key for auxiliary in self.auxiliary for key in auxiliary.keys]
+        before = [*in_keys, "action", "action_log_prob", *beside, *(["agent_acts"] if self.shares_control else [])]
         after = [*in_keys, "reward", "done", "terminated"]
-        self.keys = [*in_keys, "action", "action_log_prob", *(("next", key) for key in after)]
+        self.keys = [*before, *(("next", key) for key in after)]
+        self.learned_from = [*before, "advantage", "value_target"]
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts.
@@ -129,10 +139,13 @@ class PPO:
         for _ in range(self.epochs):
             order = torch.randperm(len(flat), generator=self.generator)[: size * self.minibatches]
             for minibatch in flat[order.to(flat.device)].split(size):
-                losses = self.losses(minibatch)
+                losses = self._losses(minibatch)
                 total = losses["loss_objective"] + losses["loss_critic"]
                 if self.loss.entropy_bonus:
                     total = total + losses["loss_entropy"]
+                for auxiliary in self.auxiliary:
+                    losses[f"loss_{auxiliary.name}"] = auxiliary(self.policy, minibatch)
+                    total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
                 self.optimiser.zero_grad()
                 total.backward()
                 torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
@@ -141,6 +154,20 @@ class PPO:
         names = list(reports[0].keys())
         means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
         return means | {"learning_rate": self.learning_rate(progress)}
+
+    def _losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """TorchRL's losses; where a guide acted instead of the agent, only the critic learns."""
+        if not self.shares_control:
+            return self.losses(minibatch)
+        acted = minibatch[minibatch["agent_acts"].squeeze(-1)]
+        if len(acted) < 2:  # one advantage cannot be standardised
+            losses = self.losses(minibatch)
+            for name in {"loss_objective", "loss_entropy"}.intersection(losses.keys()):
+                losses[name] = losses[name] * 0
+            return losses
+        losses = self.losses(acted)
+        losses["loss_critic"] = self.loss.loss_critic(minibatch)[0].mean()
+        return losses
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an update depends on besides the batch."""

@@ -8,12 +8,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl import checkpoint
-from coil_rl.build import build_env, build_learner
-from coil_rl.errors import UserError
+from coil_rl.build import build_env
 from coil_rl.programs import app
 from coil_rl.programs.judge import judge, outcome
-from coil_rl.programs.run_folder import configuration
+from coil_rl.trained import configuration, policy
 
 
 def evaluate(config: DictConfig) -> float:
@@ -37,19 +35,12 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
         UserError: if the folder holds no run, or one that does not fit together.
     """
     resolved: Any = OmegaConf.to_container(asked, resolve=True)
+    # The run was trained with advice of its own; this is what else to show it.
+    resolved["evaluation"]["advice"] |= resolved["degrade"]
     config = configuration(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
     if config.method.observes is None:
         return config, None
-    env = build_env(config)
-    learner = build_learner(config, env)
-    weights = run / f"policy_{config.evaluation.policy}.pt"
-    try:
-        learner.policy.load_state_dict(checkpoint.load(weights, config.device))
-    except (RuntimeError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{weights} does not fit the networks that {run / 'config.yaml'} describes; give the folder as it was"
-        ) from error
-    return config, learner.policy
+    return config, policy(run, config, build_env(config), config.evaluation.policy)
 
 
 def main() -> None:

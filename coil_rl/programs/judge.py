@@ -11,13 +11,14 @@ from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
-from coil_rl.build import build, build_env, build_guide
+from coil_rl.build import build, build_env, build_guided_env
 from coil_rl.evaluation import Drive, drive, summarise
 from coil_rl.files import whole_file
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 
 COLUMNS = {
     "driver": ("driver", ""),
+    "advice": ("advice", ""),
     "actions": ("actions", ""),
     "track": ("track", ""),
     "reward": ("reward", ".1f"),
@@ -32,8 +33,8 @@ COLUMNS = {
 def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) -> None:
     """Evaluate and write `episodes.csv`, `lines.png`, `lines.gif`, `evaluation.md` (means) and, last, `evaluation.csv`.
 
-    The guide drives each track once; an agent once by its deterministic action and `evaluation.repeats` times by
-    sampled ones.
+    The guide drives each track once; an agent once by its deterministic action, `evaluation.repeats` times by sampled
+    ones if it samples, and once with each advice of `evaluation.advice` in place of what it was trained with.
 
     Args:
         config: of a run.
@@ -42,24 +43,29 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
     """
     tracks = build(config.track.test, "track.test")
     names = [track.name for track in tracks]
-    plan: list[tuple[str, str, TensorDictModuleBase, int]] = [("guide", "deterministic", build_guide(config), 1)]
+    plan = [("guide", "", "deterministic", 1)]
     if agent is not None:
-        plan.append((config.method.name, "deterministic", agent, 1))
-        plan.append((config.method.name, "sampled", agent, config.evaluation.repeats))
+        plan.append((config.label, "", "deterministic", 1))
+        if hasattr(agent, "get_dist"):
+            plan.append((config.label, "", "sampled", config.evaluation.repeats))
+        plan += [(config.label, advice, "deterministic", 1) for advice in config.evaluation.advice]
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     drives: dict[str, Drive] = {}
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
-        for driver, actions, policy, repeats in plan:
-            bar.set_postfix_str(f"{driver}, {actions}")
+        for index, (driver, advice, actions, repeats) in enumerate(plan):
+            bar.set_postfix_str(", ".join(filter(None, (driver, advice, actions))))
             overrides: Mapping[str, Any] = {**config.evaluation.env, "num_cars": repeats * len(tracks)}
-            env = build_env(config, overrides, observed=policy is agent)
+            if agent is None or index == 0:
+                env, policy = build_guided_env(config, overrides)
+            else:
+                env, policy = build_env(config, overrides, advice=advice), agent
             driven = drive(env, policy, sampled=actions == "sampled", names=names, tick=bar.update)
-            label = {"driver": driver, "actions": actions}
+            label = {"driver": driver, "advice": advice, "actions": actions}
             table += [label | row for row in summarise(driven.episodes)]
             episodes += [label | row for row in driven.episodes]
             if actions == "deterministic":
-                drives[driver] = driven
+                drives[f"{driver}, {advice}" if advice else driver] = driven
     write_csv(episodes, folder / "episodes.csv")
     lines = {driver: driven.lines for driver, driven in drives.items()}
     crashed = {driver: [row["crashed"] for row in driven.episodes] for driver, driven in drives.items()}
@@ -67,7 +73,8 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
     if config.evaluation.gif:
         animate_lines(tracks, lines, folder / "lines.gif", rate=config.env.rate, crashed=crashed)
     with whole_file(folder / "evaluation.md") as unfinished:
-        unfinished.write_text(markdown_table(table, COLUMNS) + "\n")
+        columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
+        unfinished.write_text(markdown_table(table, columns) + "\n")
     write_csv(table, folder / "evaluation.csv")
 
 
@@ -79,7 +86,8 @@ def is_judged(folder: Path) -> bool:
 def outcome(folder: Path) -> float:
     """Print what `judge` found; returns the mean reward of the deterministic agent, or else of the guide."""
     with (folder / "evaluation.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["track"] == "mean" and row["actions"] == "deterministic"]
+        means = [row for row in csv.DictReader(file) if row["track"] == "mean" and row["actions"] == "deterministic"]
+    rows = [row for row in means if not row["advice"]]
     driver, reward, completed = rows[-1]["driver"], float(rows[-1]["reward"]), float(rows[-1]["completed"])
     print((folder / "evaluation.md").read_text().rstrip())
     print(f"{driver}: mean test reward {reward:.1f}, {completed:.0%} completed; see {folder}")

@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.errors import UserError
-from coil_rl.programs.sentence import sentence
+from coil_rl.sentence import sentence
 
 
 class Refusal(Callback):

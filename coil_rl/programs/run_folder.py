@@ -8,16 +8,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import yaml
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.files import remove_unfinished, whole_file
-from coil_rl.programs.sentence import sentence
 from coil_rl.programs.versions import versions
+from coil_rl.trained import configuration
 
 
 @contextmanager
@@ -56,28 +53,28 @@ def begin(config: DictConfig, folder: Path) -> None:
         OmegaConf.save(kept, unfinished)
 
 
-def configuration(folder: Path, key: str, instead: Mapping[str, Any] | None = None) -> DictConfig:
-    """The configuration of the run in a folder.
-
-    Args:
-        folder: of the run.
-        key: by which a person named it, for the message.
-        instead: top-level keys that get other values.
+def holds(folder: Path, config: DictConfig) -> bool:
+    """Whether the folder holds a run of just this configuration.
 
     Raises:
-        UserError: if the folder holds no run, or a configuration that cannot be read.
+        UserError: if it holds one of another, naming the first value that is different.
     """
-    path = folder / "config.yaml"
-    if not path.is_file():
-        raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
-    try:
-        kept = OmegaConf.load(path)
-        if not isinstance(kept, DictConfig):
-            raise UserError(f"{path} is not the configuration of a run, but a list")
-        for name, value in (instead or {}).items():
-            kept[name] = value
-        config: Any = OmegaConf.merge(OmegaConf.structured(Train), kept)
-        OmegaConf.to_container(config, throw_on_missing=True)
-    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
-    return config
+    if not (folder / "config.yaml").exists():
+        return False
+    kept, wanted = (
+        _flat(OmegaConf.to_container(each, resolve=True)) for each in (configuration(folder, "run_dir"), config)
+    )
+    for key in dict.fromkeys([*kept, *wanted]):
+        if kept.get(key) != wanted.get(key) and key.split(".")[0] not in ("run_dir", "logger", "existing"):
+            raise UserError(
+                f"{folder} holds a run with {key}={kept.get(key)}, not {wanted.get(key)}; "
+                "choose another folder, or remove that one"
+            )
+    return True
+
+
+def _flat(node: Any, name: str = "") -> dict[str, Any]:
+    """The values of a configuration by their full names."""
+    if not isinstance(node, Mapping) or not node:
+        return {name: node}
+    return {key: value for k, v in node.items() for key, value in _flat(v, f"{name}.{k}" if name else str(k)).items()}

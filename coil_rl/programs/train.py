@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from coil_rl import checkpoint
-from coil_rl.build import build, build_env, build_guide, build_learner
+from coil_rl.build import build, build_env, build_guided_env, build_learner
 from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
 from coil_rl.experiment import Experiment, watched_keys
@@ -20,6 +20,7 @@ from coil_rl.programs import app, run_folder
 from coil_rl.programs.judge import is_judged, judge, outcome
 from coil_rl.report import draw_learning_curves
 from coil_rl.rollout import Rollout
+from coil_rl.trained import configuration
 
 
 def train(config: DictConfig) -> float:
@@ -28,6 +29,8 @@ def train(config: DictConfig) -> float:
         raise UserError(f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER")
     folder = Path(config.run_dir)
     with run_folder.claimed(folder):
+        if config.existing == "resume" and run_folder.holds(folder, config):
+            return outcome(folder) if is_judged(folder) else finish(config, folder, resumed=True)
         run_folder.begin(config, folder)
         return finish(config, folder)
 
@@ -38,7 +41,7 @@ def resume(folder: Path) -> float:
     Raises:
         UserError: if the folder holds no run, or one that cannot go on.
     """
-    config = run_folder.configuration(folder, "resume")
+    config = configuration(folder, "resume")
     folder = folder.absolute()
     config.run_dir = str(folder)
     with run_folder.claimed(folder):
@@ -64,7 +67,7 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     torch.manual_seed(config.seed)
     env = build_env(config)
     learner = build_learner(config, env)
-    keys = [*learner.keys, *watched_keys(config.watch)]
+    keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(
         learner,
         Rollout(env, learner.policy, config.budget.steps, keys),
@@ -77,7 +80,7 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     if resumed:
         experiment.resume()
     rows = experiment.run(guide_return)
-    draw_learning_curves({config.method.name: [rows]}, folder / "learning_curve.png", guide=guide_return)
+    draw_learning_curves({config.label: [rows]}, folder / "learning_curve.png", guide=guide_return)
     learner.policy.load_state_dict(checkpoint.load(folder / f"policy_{config.evaluation.policy}.pt", config.device))
     return learner.policy
 
@@ -87,9 +90,9 @@ def guide_on_training_tracks(config: DictConfig, file: Path) -> float:
     if file.exists():
         return float(json.loads(file.read_text()))
     tracks = build(config.track.train, "track.train")
-    env = build_env(config, {"assignment": "cyclic", "num_cars": len(tracks)}, observed=False)
+    env, guide = build_guided_env(config, {"assignment": "cyclic", "num_cars": len(tracks)})
     with tqdm(unit="step", desc="guide on the training tracks", leave=False, mininterval=0.5) as bar:
-        episodes = drive(env, build_guide(config), tick=bar.update).episodes
+        episodes = drive(env, guide, tick=bar.update).episodes
     mean = float(sum(episode["reward"] for episode in episodes) / len(episodes))
     with whole_file(file) as unfinished:
         unfinished.write_text(f"{mean}\n")

@@ -22,7 +22,7 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
     env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
     env = TransformedEnv(env, Compose(*extra, GuideActions({"guide": guide or SplineGuide()}), RewardSum()))
     learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
-    rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(WATCH)])
+    rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
     return Experiment(learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2)
 

@@ -80,3 +80,5 @@ def test_no_guide_and_a_guide_without_an_action_are_refused():
     mute = TensorDictModule(lambda x: x, in_keys=["observation"], out_keys=["thought"])
     with pytest.raises(ValueError, match=r"guide 'mute' must write 'action'; it writes \['thought'\]"):
         GuideActions({"mute": mute})
+    with pytest.raises(ValueError, match="'half' cannot be the name of a guide"):
+        GuideActions({"half": ZeroGuide()})

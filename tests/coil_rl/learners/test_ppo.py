@@ -2,12 +2,14 @@ import copy
 
 import pytest
 import torch
+import worlds
 from torchrl.envs import GymEnv, PendulumEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import PPO
 from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.transforms import JumpStart, Takeover
 
 
 def learner(cars=8, **changes):
@@ -115,3 +117,53 @@ def test_counts_below_one_are_refused(name):
 def test_numbers_outside_their_range_are_refused(name, value):
     with pytest.raises(ValueError, match=f"{name}={value} must be"):
         PPO(PendulumEnv(), ["th"], **{name: value})
+
+
+def learned(transforms, progress=0.0, updates=2):
+    """Weights and metrics after learning among cones with a guide."""
+    torch.manual_seed(0)
+    env = worlds.cones(*transforms)
+    ppo = PPO(env, epochs=2, minibatches=4)
+    rollout = Rollout(env, ppo.policy, 16, ppo.keys)
+    metrics = [ppo.update(rollout.collect(), progress) for _ in range(updates)]
+    return weights(ppo), metrics[-1]
+
+
+@pytest.mark.parametrize("transform", [JumpStart(0), JumpStart(0, random=True), Takeover(0.0)])
+def test_a_guide_that_never_acts_changes_nothing_to_the_bit(transform):
+    (plain, _), (shared, metrics) = learned([]), learned([transform])
+    assert torch.equal(plain, shared)
+    assert metrics["loss_objective"] != 0
+
+
+def test_steps_in_which_the_guide_acts_teach_the_critic_alone():
+    torch.manual_seed(0)
+    env = worlds.cones(Takeover(1.0))
+    ppo = PPO(env, epochs=1, minibatches=2)
+    policy, critic = ([p.clone() for p in net.parameters()] for net in (ppo.policy, ppo.critic))
+    ppo.update(Rollout(env, ppo.policy, 16, ppo.keys).collect())
+    assert all(torch.equal(old, new) for old, new in zip(policy, ppo.policy.parameters(), strict=True))
+    assert not any(torch.equal(old, new) for old, new in zip(critic, ppo.critic.parameters(), strict=True))
+
+
+def test_the_policys_loss_is_that_of_the_steps_in_which_it_acts():
+    torch.manual_seed(0)
+    env = worlds.cones(Takeover(0.5))
+    ppo = PPO(env)
+    batch = Rollout(env, ppo.policy, 16, ppo.keys).collect()
+    ppo.advantage(batch)
+    flat = batch.select(*ppo.learned_from).reshape(-1)
+    acted = flat["agent_acts"].squeeze(-1)
+    losses = ppo._losses(flat)
+    other = flat.clone()
+    other["advantage"][~acted] = 1e6
+    other["action_log_prob"][~acted] = -1e6
+    assert torch.equal(ppo._losses(other)["loss_objective"], losses["loss_objective"])
+    other["value_target"][~acted] += 1
+    assert not torch.equal(ppo._losses(other)["loss_critic"], losses["loss_critic"])
+
+
+def test_a_gain_of_zero_begins_with_the_action_zero():
+    ppo, rollout = learner(action_gain=0.0)
+    batch = rollout.collect()
+    assert (ppo.policy.get_dist(batch.select("observation")).deterministic_sample == 0).all()

@@ -1,0 +1,54 @@
+"""The policy of a run as a guide: today's agent can advise tomorrow's."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coil_rl.build import build_bare_env, build_transforms
+from coil_rl.trained import configuration, policy
+
+
+class LearnedGuide(TensorDictModuleBase):
+    """What a trained policy would do, its action being the deterministic one.
+
+    It brings along what the policy needs: a policy of COIL asks its own guide, a residual policy adds to it.
+
+    Args:
+        run: the folder that `coil-train` left.
+        which: the last policy, or the one with the best return of a training batch.
+        device: where it runs.
+
+    Raises:
+        UserError: if the folder holds no finished run.
+    """
+
+    def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
+        super().__init__()
+        folder = Path(run).expanduser()
+        config = configuration(folder, "guide.run", {"device": device})
+        if config.method.observes is None:
+            raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
+        # One car is enough: what the transforms need of an env are its specs.
+        env = TransformedEnv(build_bare_env(config, {"num_cars": 1}), Compose(*build_transforms(config)))
+        shown = [key for key in env.base_env.observation_spec if key != "info"]
+        self.in_keys, self.out_keys = shown, ["action"]
+        self.transforms, self.policy = env.transform, policy(folder, config, env, which)
+        # Transforms know their env by a weak reference; in a tuple it is no module of this one.
+        self._kept = (env,)
+        self.requires_grad_(False)
+        self.eval()
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`, as the env gets it in the end."""
+        seen = self.transforms(tensordict.select(*self.in_keys))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            chosen = self.policy(seen)
+        return tensordict.set("action", self.transforms.inv(chosen)["action"])

@@ -1,0 +1,70 @@
+"""What a run left behind: its configuration and its policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from coil_rl import checkpoint
+from coil_rl.build import build_learner
+from coil_rl.config import Train
+from coil_rl.errors import UserError
+from coil_rl.sentence import sentence
+
+
+def configuration(folder: Path, key: str, instead: Mapping[str, Any] | None = None) -> DictConfig:
+    """The configuration of the run in a folder.
+
+    Args:
+        folder: of the run.
+        key: by which a person named it, for the message.
+        instead: top-level keys that get other values.
+
+    Raises:
+        UserError: if the folder holds no run, or a configuration that cannot be read.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
+    try:
+        kept = OmegaConf.load(path)
+        if not isinstance(kept, DictConfig):
+            raise UserError(f"{path} is not the configuration of a run, but a list")
+        for name, value in (instead or {}).items():
+            kept[name] = value
+        config: Any = OmegaConf.merge(OmegaConf.structured(Train), kept)
+        OmegaConf.to_container(config, throw_on_missing=True)
+    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
+    return config
+
+
+def policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
+    """The policy of the run in a folder.
+
+    Args:
+        folder: of the run.
+        config: its configuration.
+        env: as its agent sees it.
+        which: last, or best: with the highest mean return of a training batch.
+
+    Raises:
+        UserError: if it has no such policy, or one that does not fit.
+    """
+    learner = build_learner(config, env)
+    weights = folder / f"policy_{which}.pt"
+    try:
+        learner.policy.load_state_dict(checkpoint.load(weights, config.device))
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{weights} does not fit the networks that {folder / 'config.yaml'} describes; give the folder as it was"
+        ) from error
+    restored: TensorDictModuleBase = learner.policy
+    return restored

@@ -1,0 +1,60 @@
+import pytest
+from hydra import compose, initialize_config_module
+
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.build import build_env, build_guide
+from coil_rl.errors import UserError
+from coil_rl.evaluation import drive
+from coil_rl.guides.learned import LearnedGuide
+from coil_rl.programs.evaluate import restore
+from coil_rl.programs.train import train
+from coil_rl.testing import check_guide
+
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=2",
+        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
+        "budget.frames=128"]  # fmt: skip
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*overrides])
+
+
+@pytest.fixture(scope="module", params=["ppo", "coil", "residual_coil", "jump_start"])
+def run(request, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / request.param
+    folder.mkdir()
+    train(composed(*TINY, f"method={request.param}", f"run_dir={folder}"))
+    return folder
+
+
+def test_it_drives_as_the_policy_does_in_the_env_it_was_trained_in(run):
+    config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
+    overrides = {"num_cars": 3, "assignment": "cyclic"}
+    alone = drive(build_env(config, overrides), agent)
+    guided = composed(*TINY, "method=guide", "guide=learned", f"guide.run={run}", "run_dir=unused")
+    learned = drive(build_env(guided, overrides), build_guide(guided))
+    assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in alone.episodes]
+
+
+def test_it_is_a_guide_even_while_others_explore(run):
+    env = build_env(composed(*TINY, "method=ppo", "run_dir=unused"))
+    data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
+    check_guide(guide, data, tolerance=1e-6)
+    assert not any(p.requires_grad for p in guide.parameters())
+    assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
+
+
+def test_it_may_guide_another_agent(run, tmp_path):
+    (tmp_path / "next").mkdir()
+    config = composed(*TINY, "method=coil", "guide=learned", f"guide.run={run}", f"run_dir={tmp_path / 'next'}")
+    train(config)
+    assert (tmp_path / "next" / "evaluation.csv").exists()
+
+
+def test_a_folder_without_an_agent_is_refused(tmp_path):
+    with pytest.raises(UserError, match=r"guide.run=.* is not the folder of a run: it has no config.yaml"):
+        LearnedGuide(str(tmp_path))
+    train(composed(*TINY, "method=guide", f"run_dir={tmp_path}"))
+    with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):
+        LearnedGuide(str(tmp_path))

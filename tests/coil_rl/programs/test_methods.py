@@ -1,0 +1,123 @@
+"""Every method is trained, judged, stopped, resumed and judged again by the same programs."""
+
+import csv
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.check import check
+from coil_rl.errors import UserError
+from coil_rl.evaluation import drive
+from coil_rl.programs import evaluate
+from coil_rl.programs.train import resume, train
+
+METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
+TINY = ["track=generated", "track.train.count=1", "track.test.count=2", "env.laps=1", "env.time_limit=2",
+        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "checkpoint_every=1",
+        "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
+IMITATION = {"oil": ["learner=linear", "+learner.validate=false"], "dagger": ["learner=linear"]}
+
+
+def trained(folder, *overrides):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*TINY, *overrides, f"run_dir={folder}"])
+    check(config)
+    train(config)
+    return folder
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, tmp_path, capsys):
+    run = trained(tmp_path / "run", f"method={method}", *IMITATION.get(method, []))
+    stopped = tmp_path / "stopped"
+    shutil.copytree(run, stopped)
+    for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
+        (stopped / name).unlink(missing_ok=True)
+    resume(stopped)
+    for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
+        assert (run / name).exists() == (stopped / name).exists() == (method != "guide" or name[0] == "e")
+        if (run / name).exists():
+            assert (run / name).read_bytes() == (stopped / name).read_bytes()
+    assert method == "guide" or "goes on after update 1" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def residual(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("runs") / "residual", "method=residual", "label=mine")
+
+
+def rows(folder, **where):
+    with (folder / "evaluation.csv").open(newline="") as file:
+        return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in where.items())]
+
+
+def test_a_run_goes_by_its_label(residual):
+    assert {row["driver"] for row in rows(residual)} == {"guide", "mine"}
+
+
+def test_a_run_that_is_there_is_not_trained_again_where_that_is_asked_for(residual, capsys):
+    before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
+    trained(residual, "method=residual", "label=mine", "existing=resume")
+    assert {file: file.stat().st_mtime_ns for file in before} == before
+    assert "mine: mean test reward" in capsys.readouterr().out
+    with pytest.raises(UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9; choose another"):
+        trained(residual, "method=residual", "label=mine", "existing=resume", "learner.gamma=0.9")
+
+
+def test_a_trained_agent_is_judged_with_other_advice_too(residual, tmp_path):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("evaluate", [*TINY[:3], f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
+                                      "degrade=[zeroed,adversarial]"])  # fmt: skip
+    evaluate.evaluate(config)
+    normal, zeroed, adversarial = (
+        rows(tmp_path, driver="mine", actions="deterministic", advice=name) for name in ("", "zeroed", "adversarial")
+    )
+    trained_rows = rows(residual, driver="mine", actions="deterministic")
+    assert [row["reward"] for row in normal] == [row["reward"] for row in trained_rows]
+    assert len({row["reward"] for row in (normal[-1], zeroed[-1], adversarial[-1])}) == 3
+
+
+def test_a_degraded_guide_is_judged_as_it_advises(tmp_path):
+    run = trained(tmp_path / "run", "method=guide", "degrade=[adversarial]")
+    alone = trained(tmp_path / "alone", "method=guide")
+    assert rows(run)[0]["reward"] != rows(alone)[0]["reward"]
+
+
+def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path):
+    """Its numbers before the first update are plain PPO's, whatever the coupling costs."""
+    coupled = trained(tmp_path / "rfc", "method=rfc", "method.transforms.coupling.beta=1000")
+    plain = trained(tmp_path / "ppo", "method=ppo")
+    first, other = (next(csv.DictReader((run / "metrics.csv").open(newline=""))) for run in (coupled, plain))
+    same = [key for key in other if key.startswith("train/")]
+    assert {key: first[key] for key in same} == {key: other[key] for key in same}
+    assert float(first["train/guide_distance"]) > 0
+    assert first["learner/loss_critic"] != other["learner/loss_critic"]
+
+
+def test_jump_start_of_no_steps_is_ppo_to_the_bit(tmp_path):
+    jumped = trained(tmp_path / "jump", "method=jump_start", "method.transforms.jump_start.horizon=0")
+    plain = trained(tmp_path / "ppo", "method=ppo")
+    first, other = (torch.load(run / "policy_last.pt", weights_only=True) for run in (jumped, plain))
+    assert all(torch.equal(first[key], other[key]) for key in other)
+
+
+def test_residual_of_scale_zero_is_the_guide_exactly(tmp_path):
+    run = trained(tmp_path / "run", "method=residual", "method.transforms.residual.scale=0")
+    guide, agent = rows(run, driver="guide"), rows(run, driver="residual", actions="deterministic")
+    assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
+
+
+def test_driving_leaves_what_is_only_for_learning_out(residual):
+    config, agent = evaluate.restore(residual, compose_evaluate(residual))
+    env = evaluate.build_env(config, {"num_cars": 2})
+    drive(env, agent)
+    assert not env.transform.training
+
+
+def compose_evaluate(run):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("evaluate", [*TINY[:3], f"run={run}", "run_dir=unused"])

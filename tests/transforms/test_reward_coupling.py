@@ -1,0 +1,73 @@
+import pytest
+import torch
+import worlds
+from torchrl.envs import RewardSum
+from torchrl.envs.utils import step_mdp
+
+from coil_rl.schedules import Linear
+from coil_rl.testing import check_env
+from coil_rl.transforms import RewardCoupling
+
+
+@pytest.mark.parametrize(("norm", "order"), [("l1", 1), ("l2", 2), ("linf", torch.inf)])
+def test_reward_is_the_tasks_less_beta_times_the_distance(norm, order):
+    env = worlds.cones(RewardCoupling(0.3, norm)).train()
+    rollout = env.rollout(30, break_when_any_done=False)
+    after = rollout["next"]
+    distance = torch.linalg.vector_norm(rollout["action"] - rollout["guide_action"][..., 0, :], order, -1, True)
+    assert torch.equal(after["guide_distance"], distance)
+    assert torch.equal(after["reward"], after["task_reward"] - 0.3 * distance)
+    assert (distance > 0.01).any()
+
+
+def test_task_reward_is_to_the_bit_what_the_env_pays():
+    coupled, plain = worlds.cones(RewardCoupling(5.0)).train(), worlds.cones()
+    actions = torch.rand(40, 6, 1, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    one, other = coupled.reset(), plain.reset()
+    for action in actions:
+        ours, theirs = coupled.step(one.set("action", action)), plain.step(other.set("action", action))
+        assert torch.equal(ours["next", "task_reward"], theirs["next", "reward"])
+        assert not torch.equal(ours["next", "reward"], theirs["next", "reward"])
+        one, other = step_mdp(ours), step_mdp(theirs)
+
+
+def test_evaluation_pays_the_tasks_reward_alone():
+    env = worlds.cones(RewardCoupling(5.0)).eval()
+    after = env.rollout(5, break_when_any_done=False)["next"]
+    assert torch.equal(after["reward"], after["task_reward"])
+    assert (after["guide_distance"] > 0).any()
+
+
+def test_a_sum_of_rewards_before_the_coupling_is_the_tasks():
+    env = worlds.cones(RewardCoupling(5.0))
+    env.transform.insert(0, RewardSum())
+    after = env.train().rollout(10)["next"]
+    torch.testing.assert_close(after["episode_reward"][:, -1], after["task_reward"].sum(1))
+
+
+def test_beta_follows_its_schedule():
+    coupling = RewardCoupling(Linear(1.0, 0.0))
+    env = worlds.cones(coupling).train()
+    for progress in (0.0, 0.25, 1.0):
+        coupling.progress = progress
+        after = env.rollout(3)["next"]
+        torch.testing.assert_close(after["task_reward"] - after["reward"], (1 - progress) * after["guide_distance"])
+
+
+def test_a_choice_costs_where_it_is_not_the_guides():
+    env = worlds.carts(RewardCoupling(0.5, "l1")).train()
+    rollout = env.rollout(5)
+    differs = rollout["action"] != rollout["guide_action"].argmax(-1).squeeze(-1)
+    assert torch.equal(rollout["next", "guide_distance"].squeeze(-1), 2.0 * differs)
+
+
+@pytest.mark.parametrize("env", worlds.everywhere(lambda: RewardCoupling(0.5)), ids=["cones", "pendulum", "carts"])
+def test_specs_hold_around_every_world(env):
+    check_env(env.train())
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(ValueError, match="norm='l3' must be one of l1, l2, linf"):
+        RewardCoupling(0.5, "l3")
+    with pytest.raises(KeyError, match="RewardCoupling reads row 1 of 'guide_action', but finds only 1 rows of advice"):
+        worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1)

@@ -1,0 +1,40 @@
+"""Envs with a guide, for tests of what uses its advice."""
+
+import torch
+from tensordict.nn import TensorDictModule
+from torchrl.envs import Compose, EnvBase, GymEnv, PendulumEnv, SerialEnv, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import SplineGuide
+from coil_rl.transforms import GuideActions
+
+
+def cones(*transforms, cars=6) -> TransformedEnv:
+    """Cars with the spline guide's advice."""
+    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6)
+    return TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), *transforms))
+
+
+def pendulum(*transforms) -> TransformedEnv:
+    """One pendulum, no batch, its torque in [-2, 2]; the guide damps it."""
+    damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
+    return TransformedEnv(PendulumEnv(), Compose(GuideActions({"damp": damp}), *transforms))
+
+
+def carts(*transforms, categorical=True) -> TransformedEnv:
+    """Two carts that are pushed left or right; the guide pushes to where the pole leans."""
+
+    def lean(observation):
+        choice = (observation[..., 2] > 0).long()
+        return choice if categorical else torch.nn.functional.one_hot(choice, 2)
+
+    def make() -> EnvBase:
+        return GymEnv("CartPole-v1", categorical_action_encoding=categorical)
+
+    guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
+    return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
+
+
+def everywhere(*transforms) -> list[TransformedEnv]:
+    """Each of these worlds with the transforms that the given functions make for it."""
+    return [world(*(make() for make in transforms)) for world in (cones, pendulum, carts)]
