@@ -110,8 +110,21 @@ class Benchmark(Common):
     when_quick: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass
+class Report:
+    """Configuration of `coil-report`."""
+
+    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
+    folder: Any = MISSING
+    actions: str = "deterministic"
+    against: str | None = None
+    resamples: int = 2000
+    seed: int = 0
+
+
 REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
 ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
 ConfigStore.instance().store(name="schema", node=Train)
 ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
 ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
+ConfigStore.instance().store(name="report_schema", node=Report)

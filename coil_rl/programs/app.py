@@ -24,8 +24,8 @@ from coil_rl.errors import UserError
 from coil_rl.programs.refusal import refuse
 
 
-def run(task: Callable[[DictConfig], Any], config_name: str) -> None:
-    """Run a task under Hydra as a program."""
+def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check) -> None:
+    """Run a task under Hydra as a program, after a check of its configuration."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
     _check_options(config_name)

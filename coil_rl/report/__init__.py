@@ -1,7 +1,18 @@
 """Tables and pictures from finished runs."""
 
 from coil_rl.report.curve import draw_learning_curves
+from coil_rl.report.curve_grid import draw_curve_grid
+from coil_rl.report.intervals import Interval, draw_intervals
 from coil_rl.report.lines import animate_lines, draw_lines
 from coil_rl.report.table import markdown_table, write_csv
 
-__all__ = ["animate_lines", "draw_learning_curves", "draw_lines", "markdown_table", "write_csv"]
+__all__ = [
+    "Interval",
+    "animate_lines",
+    "draw_curve_grid",
+    "draw_intervals",
+    "draw_learning_curves",
+    "draw_lines",
+    "markdown_table",
+    "write_csv",
+]

@@ -57,11 +57,13 @@ def draw_learning_curves(
     """
     if not any(len(of_label) for of_label in runs.values()):
         raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
-    means = {label: {key: _mean(of_label, key) for key in (TRAINING, EVALUATION)} for label, of_label in runs.items()}
+    means = {
+        label: {key: mean_curve(of_label, key) for key in (TRAINING, EVALUATION)} for label, of_label in runs.items()
+    }
     reached = max(
         (frames[-1] for of_label in means.values() for frames, *_ in of_label.values() if len(frames)), default=0.0
     )
-    size, unit = next(((size, unit) for size, unit in UNITS.items() if reached >= size), (1.0, "frames"))
+    size, unit = unit_of_frames(reached)
     strokes = style.strong_strokes(runs)
     with mpl.rc_context(style.LETTERS):
         figure = Figure(figsize=(style.WIDTH, HEIGHT), dpi=style.RESOLUTION)
@@ -112,7 +114,12 @@ def _handles(runs: Mapping[str, Sequence[Run]], strokes: Mapping[str, style.Stro
     return handles
 
 
-def _mean(runs: Sequence[Run], key: str) -> tuple[Array, Array, Array, Array]:
+def unit_of_frames(reached: float) -> tuple[float, str]:
+    """How many frames the unit of the axis is, and its name, where it goes up to `reached`."""
+    return next(((size, unit) for size, unit in UNITS.items() if reached >= size), (1.0, "frames"))
+
+
+def mean_curve(runs: Sequence[Run], key: str) -> tuple[Array, Array, Array, Array]:
     """Frames, mean over the runs, and the ends of the mean's 95 % interval, each [P]; P is 0 if no run has the key."""
     curves = [curve for curve in (_curve(run, key) for run in runs) if len(curve)]
     none = np.empty(0)

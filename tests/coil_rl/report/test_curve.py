@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from coil_rl.report.curve import EVALUATION, TRAINING, _mean, draw_learning_curves
+from coil_rl.report.curve import EVALUATION, TRAINING, draw_learning_curves, mean_curve
 
 Row = dict[str, object]
 
@@ -56,7 +56,7 @@ def test_rows_may_be_few_or_without_values(rows: list[Row], tmp_path: Path) -> N
 
 def test_a_single_run_is_shown_as_it_is() -> None:
     rows: list[Row] = [{"frames": f, TRAINING: v} for f, v in ((20, 2.0), (10, 1.0), (30, math.nan), (40, 4.0))]
-    frames, mean, low, high = _mean([rows], TRAINING)
+    frames, mean, low, high = mean_curve([rows], TRAINING)
     np.testing.assert_array_equal(frames, [10, 20, 40])
     np.testing.assert_array_equal(mean, [1, 2, 4])
     np.testing.assert_array_equal(low, mean)
@@ -66,7 +66,7 @@ def test_a_single_run_is_shown_as_it_is() -> None:
 def test_runs_are_averaged_where_all_of_them_are() -> None:
     first: list[Row] = [{"frames": f, TRAINING: 1.0 * f} for f in (0, 10, 20, 30)]
     second: list[Row] = [{"frames": f, TRAINING: 3.0 * f} for f in (5, 15, 25)]
-    frames, mean, low, high = _mean([first, second, []], TRAINING)
+    frames, mean, low, high = mean_curve([first, second, []], TRAINING)
     np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
     np.testing.assert_allclose(mean, 2 * frames)
     np.testing.assert_allclose(low, 1 * frames)
@@ -79,14 +79,14 @@ def test_the_band_covers_the_true_mean_about_as_often_as_it_says() -> None:
     hits = 0
     for of_repeat in values:
         runs: list[list[Row]] = [[{"frames": 1, TRAINING: float(value)}] for value in of_repeat]
-        _, _, low, high = _mean(runs, TRAINING)
+        _, _, low, high = mean_curve(runs, TRAINING)
         hits += bool(low[0] <= 0 <= high[0])
     assert 0.88 < hits / len(values) < 0.97
 
 
-def test_runs_that_never_overlap_have_no_mean(tmp_path: Path) -> None:
+def test_runs_that_never_overlap_have_nomean_curve(tmp_path: Path) -> None:
     early, late = run(0, rows=3), [{**row, "frames": 1e9} for row in run(1, rows=3)]
-    assert len(_mean([early, late], TRAINING)[0]) == 0
+    assert len(mean_curve([early, late], TRAINING)[0]) == 0
     draw_learning_curves({"COIL": [early, late]}, tmp_path / "curve.png")
 
 

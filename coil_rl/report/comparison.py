@@ -1,0 +1,204 @@
+"""Compares drivers over their seeds: agents by the label of their runs, and the guides beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coil_rl.errors import UserError
+from coil_rl.report.runs import GUIDE, MEASURES, Drive, Run
+from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap
+
+Array = NDArray[np.float64]
+
+NAMED = 2  # labels in the name of a guide that several of them have
+
+
+@dataclass(frozen=True)
+class Group:
+    """All drives of one driver.
+
+    Attributes:
+        name: the label, or "guide" and, where there are several, whose.
+        advice: what was done to the advice; empty if nothing was.
+        tracks: their names.
+        values: [seeds, tracks, MEASURES].
+        guide: the drives of the guide beside which it drove; None for a guide.
+        needs_guide: whether it needs the guide when it drives; None where that is no question.
+    """
+
+    name: str
+    advice: str
+    tracks: tuple[str, ...]
+    values: Array
+    guide: Group | None = None
+    needs_guide: bool | None = None
+
+    @property
+    def title(self) -> str:
+        """Name and, if it was altered, what was done to the advice."""
+        return f"{self.name}, {self.advice}" if self.advice else self.name
+
+    @property
+    def seeds(self) -> int | None:
+        """How many; None for a guide that drives alike with each."""
+        return None if self.guide is None and len(self.values) == 1 else len(self.values)
+
+    @property
+    def scores(self) -> Array:
+        """The rewards, [seeds, tracks]."""
+        return self.values[..., MEASURES.index("reward")]
+
+    @cached_property
+    def iqm(self) -> float:
+        """The interquartile mean of all rewards."""
+        return float(iqm(self.scores))
+
+    def means(self, track: int | None = None) -> dict[str, float]:
+        """The mean of each measure, over all tracks or on one; of `clearance` the smallest, of `lap_time` where any."""
+        values = self.values if track is None else self.values[:, [track]]
+        columns = {measure: values[..., place] for place, measure in enumerate(MEASURES)}
+        laps = columns["lap_time"][np.isfinite(columns["lap_time"])]
+        means = {measure: float(column.mean()) for measure, column in columns.items()}
+        return means | {
+            "lap_time": float(laps.mean()) if laps.size else float("nan"),
+            "clearance": float(columns["clearance"].min()),
+        }
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What finished runs say under one kind of actions.
+
+    Attributes:
+        guides: the best first.
+        agents: the best first, each followed by what it does when its advice is altered.
+    """
+
+    guides: tuple[Group, ...]
+    agents: tuple[Group, ...]
+
+    def table(self, against: str | None = None, resamples: int = 2000, seed: int = 0) -> list[dict[str, Any]]:
+        """One row a driver, guides first.
+
+        Args:
+            against: label of the agent over which improvement is reported, or "guide" for each agent's own.
+            resamples: of the bootstrap.
+            seed: of the bootstrap.
+        """
+        rows = []
+        for group in (*self.guides, *self.agents):
+            low, high = stratified_bootstrap(group.scores, resamples=resamples, seed=seed)
+            means = group.means()
+            rows.append({
+                "driver": group.name, "advice": group.advice, "guide": group.guide.name if group.guide else None,
+                "seeds": group.seeds, "iqm": group.iqm, "low": low, "high": high, "mean": means.pop("reward"),
+                **means, "improvement": self._improvement(group, against), "needs_guide": group.needs_guide,
+            })  # fmt: skip
+        return rows
+
+    def track_table(self) -> list[dict[str, Any]]:
+        """One row a driver and track."""
+        return [
+            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "track": track} | group.means(place)
+            for group in (*self.guides, *self.agents)
+            for place, track in enumerate(group.tracks)
+        ]
+
+    def _improvement(self, group: Group, against: str | None) -> float | None:
+        others = {other.name: other for other in self.agents if not other.advice}
+        other = group.guide if against == GUIDE else others.get(against or "")
+        if other is None or other is group or other.tracks != group.tracks:
+            return None
+        return probability_of_improvement(group.scores, other.scores)
+
+
+def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
+    """Group the finished runs among some.
+
+    Args:
+        runs: at least one of them finished.
+        actions: "deterministic" or "sampled", of the agents; a guide drives in one way only.
+
+    Raises:
+        UserError: if two runs are the same seed of one label, or runs of one label drove different tracks.
+    """
+    labels = dict.fromkeys(run.label for run in runs if run.finished)
+    of_label = {label: [run for run in runs if run.finished and run.label == label] for label in labels}
+    for label, alike in of_label.items():
+        _check_seeds(label, alike)
+    guides = _guides(of_label)
+    agents: list[Group] = []
+    for label, alike in of_label.items():
+        drives = [drive for run in alike for drive in run.drives if drive.driver != GUIDE and drive.actions == actions]
+        variants = [
+            Group(label, advice, *_stack(label, [drive for drive in drives if drive.advice == advice]),
+                  guides[label], None if advice else alike[0].needs_guide)
+            for advice in dict.fromkeys(drive.advice for drive in drives)
+        ]  # fmt: skip
+        agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
+    own = {group.name: group.iqm for group in reversed(agents)}  # the first of each label: its advice is not altered
+    agents.sort(key=lambda group: (-own[group.name], group.name))
+    different = {id(group): group for group in guides.values()}
+    return Comparison(tuple(sorted(different.values(), key=lambda group: -group.iqm)), tuple(agents))
+
+
+def _check_seeds(label: str, runs: Sequence[Run]) -> None:
+    first: dict[int, Run] = {}
+    for run in runs:
+        if run.seed in first:
+            raise UserError(
+                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {label}; "
+                "take one out of the folder, or give runs that differ labels of their own (coil-train label=TEXT)"
+            )
+        first[run.seed] = run
+
+
+def _stack(name: str, drives: Sequence[Drive]) -> tuple[tuple[str, ...], Array]:
+    tracks = drives[0].tracks
+    for drive in drives:
+        if drive.tracks != tracks:
+            raise UserError(
+                f"runs of {name} drove different tracks ({', '.join(tracks)}, and {', '.join(drive.tracks)}); "
+                "judge them on the same ones, or give them labels of their own (coil-train label=TEXT)"
+            )
+    return tracks, np.stack([drive.values for drive in drives])
+
+
+def _guides(of_label: dict[str, list[Run]]) -> dict[str, Group]:
+    """From label to its guide: labels whose guides drove alike share one, each different drive of which counts once.
+
+    A guide that draws at random drives otherwise with every seed. Then labels share it whose seeds all drove alike, as
+    far as both have them.
+    """
+    families: list[tuple[list[str], dict[Any, Drive]]] = []
+    for label, runs in of_label.items():
+        drives = {
+            (drive.tracks, *np.round(drive.values[:, 0], 3)): drive
+            for run in runs
+            for drive in run.drives
+            if drive.driver == GUIDE
+        }
+        family = next((f for f in families if f[1].keys() <= drives.keys() or drives.keys() <= f[1].keys()), None)
+        if family is None:
+            families.append(([label], drives))
+        else:
+            family[0].append(label)
+            family[1].update(drives)
+    groups: dict[str, Group] = {}
+    for labels, drives in families:
+        name = GUIDE if len(families) == 1 else f"{GUIDE} ({_listed(labels)})"
+        group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())))
+        groups |= dict.fromkeys(labels, group)
+    return groups
+
+
+def _listed(labels: Sequence[str]) -> str:
+    if len(labels) <= NAMED + 1:
+        return ", ".join(labels)
+    return f"{', '.join(labels[:NAMED])} and {len(labels) - NAMED} more"

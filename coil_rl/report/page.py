@@ -1,0 +1,88 @@
+"""From a comparison to Markdown: a table of drivers, one of tracks, and how to read them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from coil_rl.report.comparison import Comparison
+from coil_rl.report.runs import GUIDE
+from coil_rl.report.table import markdown_table
+
+IN_ONE_TABLE = 8  # tracks
+
+COLUMNS = {
+    "driver": ("driver", ""),
+    "advice": ("advice", ""),
+    "seeds": ("seeds", ""),
+    "iqm": ("reward (IQM)", ".1f"),
+    "interval": ("95 % interval", ""),
+    "mean": ("mean", ".1f"),
+    "completed": ("completed", ".0%"),
+    "crashed": ("crashed", ".0%"),
+    "lap_time": ("lap (s)", ".2f"),
+    "smoothness": ("smoothness", ".3f"),
+    "clearance": ("smallest clearance (m)", ".2f"),
+    "improvement": ("better than {other}", ".0%"),
+    "needs_guide": ("guide at test time", ""),
+}
+
+
+def section(heading: str, found: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
+    """What was compared under one kind of actions.
+
+    Args:
+        heading: above it.
+        found: the comparison.
+        rows: its `table`.
+        against: over which improvement is reported, if over any.
+    """
+    columns = {key: (text.format(other=whose(against)), spec) for key, (text, spec) in COLUMNS.items()}
+    if not any(row["advice"] for row in rows):
+        del columns["advice"]
+    if against is None:
+        del columns["improvement"]
+    table = markdown_table([{**row, "interval": _interval(row["low"], row["high"])} for row in rows], columns)
+    return "\n\n".join([f"## {heading}", table, _tracks(found)])
+
+
+def notes(resamples: int, against: str | None) -> str:
+    """How to read the tables."""
+    text = (
+        "IQM: the mean of the middle half of the rewards of all seeds on all tracks. Its interval: percentile "
+        f"bootstrap, {resamples} resamples of whole seeds; with few seeds it is too narrow (with five it holds the "
+        "mean in about 85 of 100 cases)."
+    )
+    if against is not None:
+        text += f" Better than {whose(against)}: the probability of more reward on a track, any run against any run."
+    return text
+
+
+def progress(finished: int, begun: int) -> str:
+    """How many runs the tables are about, and how to get the rest."""
+    if finished == begun:
+        return f"{finished} of {begun} runs are finished."
+    return f"{finished} of {begun} runs are finished; the command that began them goes on with the rest."
+
+
+def whose(against: str | None) -> str:
+    """What improvement is over, in words."""
+    return "its guide" if against == GUIDE else str(against)
+
+
+def _interval(low: float, high: float) -> str | None:
+    return None if math.isnan(low) else f"{low:.1f} to {high:.1f}"
+
+
+def _tracks(found: Comparison) -> str:
+    groups = (*found.guides, *found.agents)
+    names = list(dict.fromkeys(track for group in groups for track in group.tracks))
+    if len(names) > IN_ONE_TABLE:
+        return f"The rewards on each of the {len(names)} tracks are in report_tracks.csv."
+    rows = [
+        {"driver": group.title} | {track: group.means(place)["reward"] for place, track in enumerate(group.tracks)}
+        for group in groups
+    ]
+    columns = {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names}
+    return markdown_table(rows, columns)

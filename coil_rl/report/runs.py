@@ -1,0 +1,162 @@
+"""Reads what finished runs left in their folders."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from coil_rl.errors import UserError
+
+Array = NDArray[np.float64]
+
+GUIDE = "guide"  # as `driver` calls it in evaluation.csv
+MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How one driver of a run did.
+
+    Attributes:
+        driver: "guide", or the label of the run for its agent.
+        advice: what was done to the advice, such as "zeroed"; empty if nothing was.
+        actions: "deterministic" or "sampled".
+        tracks: their names, in the order in which they were driven.
+        values: [tracks, MEASURES].
+    """
+
+    driver: str
+    advice: str
+    actions: str
+    tracks: tuple[str, ...]
+    values: Array
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training run.
+
+    Attributes:
+        folder: where it is.
+        label: the group that it belongs to: its seeds share one.
+        seed: of the run.
+        needs_guide: whether the agent needs the guide when it drives; None if there is no agent.
+        drives: its guide's and its agent's; none until the run is finished.
+        curve: the rows of its metrics.csv; none if nothing was learned.
+        guide_return: the guide's mean return on the training tracks, if it was measured.
+    """
+
+    folder: Path
+    label: str
+    seed: int
+    needs_guide: bool | None
+    drives: tuple[Drive, ...] = ()
+    curve: Sequence[dict[str, float]] = field(default=(), repr=False)
+    guide_return: float | None = None
+
+    @property
+    def finished(self) -> bool:
+        """Whether its drivers have been judged."""
+        return bool(self.drives)
+
+
+def read_runs(folders: Sequence[Path]) -> list[Run]:
+    """All runs in some folders, at any depth, in the order of their folders' names.
+
+    Raises:
+        UserError: if a folder is missing or holds no run, or if a file of a run is damaged.
+    """
+    found: dict[Path, Run] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise UserError(f"folder={folder} is not there; give a folder in which coil-train has left runs")
+        places = [path.parent for path in sorted(folder.rglob("config.yaml")) if not _is_hidden(path, folder)]
+        if not places:
+            raise UserError(f"folder={folder} holds no run of coil-train: nothing in it has a config.yaml")
+        # A folder that was given twice, or with the one around it, counts once.
+        found |= {place.resolve(): _read(place) for place in places if place.resolve() not in found}
+    return list(found.values())
+
+
+def _is_hidden(path: Path, folder: Path) -> bool:
+    """Whether this is Hydra's own copy of a configuration, in `.hydra`."""
+    return any(part.startswith(".") for part in path.relative_to(folder).parts)
+
+
+def _read(folder: Path) -> Run:
+    path = folder / "config.yaml"
+    try:
+        config = OmegaConf.load(path)
+        if not isinstance(config, DictConfig):
+            raise ValueError("a list")
+        label, seed = str(config["label"]), int(config["seed"])
+        needs_guide = config["method"]["needs_guide"]
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
+        problem = " ".join(str(error).split("\n    full_key")[0].split())
+        raise UserError(
+            f"{path} has no label, seed and method.needs_guide to read ({problem}); "
+            "put back the file that coil-train wrote, or take the run out of the folder"
+        ) from error
+    if not (folder / "evaluation.csv").exists():
+        return Run(folder, label, seed, needs_guide)
+    return Run(
+        folder, label, seed, needs_guide,
+        _drives(folder / "evaluation.csv"), _curve(folder / "metrics.csv"), _number(folder / "guide_return.json"),
+    )  # fmt: skip
+
+
+def _drives(path: Path) -> tuple[Drive, ...]:
+    tracks: dict[tuple[str, str, str], dict[str, list[float]]] = {}
+    for row in _rows(path):
+        try:
+            driver = (row["driver"], row["advice"], row["actions"])
+            values = [float(row[measure]) for measure in MEASURES]
+            if row["track"] != "mean":
+                tracks.setdefault(driver, {})[row["track"]] = values
+        except (KeyError, TypeError, ValueError) as error:
+            raise _damaged(path, error) from error
+    if not tracks:
+        raise _damaged(path, ValueError("no rows"))
+    return tuple(
+        Drive(*driver, tuple(of_driver), np.array(list(of_driver.values()))) for driver, of_driver in tracks.items()
+    )
+
+
+def _curve(path: Path) -> list[dict[str, float]]:
+    try:
+        return [{key: float(value) for key, value in row.items()} for row in _rows(path)] if path.exists() else []
+    except (TypeError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _number(path: Path) -> float | None:
+    try:
+        return float(json.loads(path.read_text())) if path.exists() else None
+    except (TypeError, ValueError) as error:
+        raise _damaged(path, error) from error
+
+
+def _rows(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file, strict=True))
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise _damaged(path, error) from error
+
+
+def _damaged(path: Path, error: Exception) -> UserError:
+    problem = f"no column {error}" if isinstance(error, KeyError) else str(error)
+    return UserError(
+        f"{path} is damaged ({problem}); remove the file and write it again by coil-train resume={path.parent}"
+        if path.name == "evaluation.csv"
+        else f"{path} is damaged ({problem}); put the whole file back, or take the run out of the folder"
+    )

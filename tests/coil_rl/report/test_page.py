@@ -1,0 +1,52 @@
+from run_folders import driven, make_run, make_sweep
+
+from coil_rl.report import page
+from coil_rl.report.comparison import compare
+from coil_rl.report.runs import read_runs
+
+
+def section(folder, against=None):
+    found = compare(read_runs([folder]))
+    return page.section("Results", found, found.table(against), against)
+
+
+def test_a_section_is_a_table_of_drivers_and_one_of_tracks(tmp_path):
+    heading, drivers, tracks = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
+    assert heading == "## Results"
+    titles, _, guide, ppo, coil, zeroed = [
+        [cell.strip() for cell in line.split("|")[1:-1]] for line in drivers.splitlines()
+    ]
+    assert titles[:6] == ["driver", "advice", "seeds", "reward (IQM)", "95 % interval", "mean"]
+    assert titles[-2:] == ["better than ppo", "guide at test time"]
+    assert guide[:6] == ["guide", "", "-", "550.0", "-", "550.0"]
+    assert coil[:4] == ["coil", "", "3", "571.0"]
+    assert coil[6:] == ["100%", "0%", "50.00", "0.200", "0.30", "0%", "yes"]
+    assert ppo[-2:] == ["-", "no"]
+    assert zeroed[:2] == ["coil", "zeroed"]
+    assert zeroed[-1] == "-"
+    low, high = map(float, coil[4].split(" to "))
+    assert 570 <= low < high <= 572
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tracks.splitlines()]
+    assert rows[0] == ["mean reward", "a", "b"]
+    assert rows[-1] == ["coil, zeroed", "-100.0", "-201.0"]
+
+
+def test_columns_that_say_nothing_are_left_out(tmp_path):
+    make_run(tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}) + driven("coil", {"a": 2.0}))
+    drivers = section(tmp_path)
+    assert "advice" not in drivers
+    assert "better than" not in drivers
+
+
+def test_many_tracks_are_left_to_the_file(tmp_path):
+    tracks = {f"track_{k}": 1.0 * k for k in range(9)}
+    make_run(tmp_path / "run", "coil", 0, driven("guide", tracks) + driven("coil", tracks))
+    assert section(tmp_path).endswith("The rewards on each of the 9 tracks are in report_tracks.csv.")
+
+
+def test_notes_say_what_was_done():
+    assert "1234 resamples of whole seeds" in page.notes(1234, None)
+    assert "Better than" not in page.notes(10, None)
+    assert "Better than its guide: the probability" in page.notes(10, "guide")
+    assert page.progress(3, 3) == "3 of 3 runs are finished."
+    assert page.progress(2, 3).endswith("goes on with the rest.")

@@ -1,0 +1,67 @@
+"""Folders such as coil-train leaves them, made in no time."""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from coil_rl.report import write_csv
+
+Row = dict[str, Any]
+OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0, "clearance": 0.3}
+
+
+def driven(
+    driver: str, rewards: Mapping[str, float], actions: str = "deterministic", advice: str = "", **others: float
+) -> list[Row]:
+    """The rows of one driver: a row per track, and their mean."""
+    row = {"driver": driver, "advice": advice, "actions": actions}
+    rows = [row | {"track": track, "reward": reward} | OTHERS | others for track, reward in rewards.items()]
+    return [*rows, rows[0] | {"track": "mean", "reward": sum(rewards.values()) / len(rewards)}]
+
+
+def make_run(
+    folder: Path,
+    label: str,
+    seed: int,
+    rows: Sequence[Row] | None,
+    needs_guide: bool | None = True,
+    guide: float = 300.0,
+) -> Path:
+    """A run; without rows it is not finished."""
+    folder.mkdir(parents=True)
+    config = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
+    (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
+    (folder / "guide_return.json").write_text(f"{guide}\n")
+    frames = range(1000, 20_001, 1000)
+    write_csv(
+        [{"frames": n, "train/return": 400 * (1 - math.exp(-n / 5000)) + seed} for n in frames], folder / "metrics.csv"
+    )
+    if rows is not None:
+        write_csv(rows, folder / "evaluation.csv")
+    return folder
+
+
+def make_sweep(folder: Path) -> Path:
+    """Three seeds of coil, which beats its guide, and of ppo, which beats coil; two further runs are not finished."""
+    guide = driven("guide", {"a": 500.0, "b": 600.0})
+    for seed in range(3):
+        coil = [
+            *driven("coil", {"a": 520.0 + seed, "b": 620.0 + seed}, smoothness=0.2),
+            *driven("coil", {"a": 510.0 + seed, "b": 610.0 + seed}, "sampled"),
+            *driven(
+                "coil",
+                {"a": -100.0, "b": -200.0 - seed},
+                advice="zeroed",
+                lap_time=math.nan,
+                completed=0.0,
+                crashed=1.0,
+            ),
+        ]
+        make_run(folder / f"{seed}_coil", "coil", seed, guide + coil)
+        ppo = driven("ppo", {"a": 540.0 + seed, "b": 640.0 + seed}) + driven("ppo", {"a": 505.0, "b": 615.0}, "sampled")
+        make_run(folder / f"{seed + 3}_ppo", "ppo", seed, guide + ppo, needs_guide=False)
+    make_run(folder / "6_coil", "coil", 3, None)
+    make_run(folder / "7_ppo", "ppo", 3, None)
+    return folder
