@@ -70,7 +70,7 @@ def _intervals(found: Comparison, rows: Sequence[Mapping[str, Any]]) -> list[Int
             hollow=bool(group.advice),
         )
         for group, row in zip((*found.guides, *found.agents), rows, strict=True)
-        if group.guide or not found.agents
+        if not group.is_guide or not found.agents
     ]
 
 

@@ -28,7 +28,8 @@ class Group:
         advice: what was done to the advice; empty if nothing was.
         tracks: their names.
         values: [seeds, tracks, MEASURES].
-        guide: the drives of the guide beside which it drove; None for a guide.
+        is_guide: whether this is a guide.
+        guide: the drives of the guide beside which an agent drove, if one did.
         needs_guide: whether it needs the guide when it drives; None where that is no question.
     """
 
@@ -36,6 +37,7 @@ class Group:
     advice: str
     tracks: tuple[str, ...]
     values: Array
+    is_guide: bool = False
     guide: Group | None = None
     needs_guide: bool | None = None
 
@@ -47,7 +49,7 @@ class Group:
     @property
     def seeds(self) -> int | None:
         """How many; None for a guide that drives alike with each."""
-        return None if self.guide is None and len(self.values) == 1 else len(self.values)
+        return None if self.is_guide and len(self.values) == 1 else len(self.values)
 
     @property
     def scores(self) -> Array:
@@ -138,7 +140,7 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         drives = [drive for run in alike for drive in run.drives if drive.driver != GUIDE and drive.actions == actions]
         variants = [
             Group(label, advice, *_stack(label, [drive for drive in drives if drive.advice == advice]),
-                  guides[label], None if advice else alike[0].needs_guide)
+                  guide=guides.get(label), needs_guide=None if advice else alike[0].needs_guide)
             for advice in dict.fromkeys(drive.advice for drive in drives)
         ]  # fmt: skip
         agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
@@ -184,6 +186,8 @@ def _guides(of_label: dict[str, list[Run]]) -> dict[str, Group]:
             for drive in run.drives
             if drive.driver == GUIDE
         }
+        if not drives:
+            continue
         family = next((f for f in families if f[1].keys() <= drives.keys() or drives.keys() <= f[1].keys()), None)
         if family is None:
             families.append(([label], drives))
@@ -193,7 +197,7 @@ def _guides(of_label: dict[str, list[Run]]) -> dict[str, Group]:
     groups: dict[str, Group] = {}
     for labels, drives in families:
         name = GUIDE if len(families) == 1 else f"{GUIDE} ({_listed(labels)})"
-        group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())))
+        group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())), is_guide=True)
         groups |= dict.fromkeys(labels, group)
     return groups
 

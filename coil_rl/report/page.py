@@ -60,10 +60,12 @@ def notes(resamples: int, against: str | None) -> str:
 
 
 def progress(finished: int, begun: int) -> str:
-    """How many runs the tables are about, and how to get the rest."""
+    """How many runs the tables are about, and how to get the rest; of a run that is yet to begin there is no trace."""
     if finished == begun:
-        return f"{finished} of {begun} runs are finished."
-    return f"{finished} of {begun} runs are finished; the command that began them goes on with the rest."
+        return f"All {begun} runs that have begun are finished."
+    return (
+        f"{finished} of {begun} runs that have begun are finished; the command that began them goes on with the rest."
+    )
 
 
 def whose(against: str | None) -> str:

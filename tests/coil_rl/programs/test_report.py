@@ -52,7 +52,7 @@ def test_report_prints_the_page_and_leaves_everything_in_the_folder_and_nothing_
     assert {Path(path) for path in everything() - before} == {sweep / name for name in FILES}
     assert out == (sweep / "report.md").read_text() + "report: see sweep\n"
     assert "better than ppo" in out
-    last = "6 of 8 runs are finished; the command that began them goes on with the rest."
+    last = "6 of 8 runs that have begun are finished; the command that began them goes on with the rest."
     assert out.splitlines()[-2:] == [last, "report: see sweep"]
     for name in ("report.png", "report_curves.png"):
         with Image.open(sweep / name) as image:
@@ -93,7 +93,7 @@ def test_several_folders_are_one_report_in_the_first(sweep):
     _, out, _ = outcome("folder=[other,sweep]", "against=coil")
     assert "| residual |" in out
     assert "better than coil" in out
-    assert "7 of 9 runs are finished" in out
+    assert "7 of 9 runs that have begun are finished" in out
     assert {file.name for file in other.iterdir()} == FILES | {"run"}
     assert not FILES & {file.name for file in sweep.iterdir()}
 

@@ -94,6 +94,15 @@ def test_guides_alone_can_be_compared(tmp_path):
     assert list(rows_of(tmp_path)) == [("guide (spline)", ""), ("guide (zero)", "")]
 
 
+def test_agents_may_drive_without_a_guide_beside_them(tmp_path):
+    make_run(tmp_path / "0", "alone", 0, driven("alone", TRACKS), needs_guide=False)
+    make_run(tmp_path / "1", "coil", 0, driven("guide", TRACKS) + driven("coil", {"a": 1.0, "b": 2.0}))
+    rows = rows_of(tmp_path, against="guide")
+    assert list(rows) == [("guide", ""), ("alone", ""), ("coil", "")]
+    assert (rows["alone", ""]["guide"], rows["alone", ""]["improvement"], rows["alone", ""]["seeds"]) == (None, None, 1)
+    assert rows["coil", ""]["improvement"] == 0
+
+
 def test_the_same_seed_twice_is_refused(tmp_path):
     for name in ("one", "two"):
         make_run(tmp_path / name, "coil", 7, driven("guide", TRACKS) + driven("coil", TRACKS))

@@ -48,5 +48,5 @@ def test_notes_say_what_was_done():
     assert "1234 resamples of whole seeds" in page.notes(1234, None)
     assert "Better than" not in page.notes(10, None)
     assert "Better than its guide: the probability" in page.notes(10, "guide")
-    assert page.progress(3, 3) == "3 of 3 runs are finished."
+    assert page.progress(3, 3) == "All 3 runs that have begun are finished."
     assert page.progress(2, 3).endswith("goes on with the rest.")
