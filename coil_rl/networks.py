@@ -15,21 +15,21 @@ from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 
 
-class Network(nn.Module):
-    """A tanh network over some of an env's entries, flattened beyond the batch and joined, with PPO's orthogonal start.
+class Joined(nn.Module):
+    """Some of an env's entries as one vector: each is flattened beyond the batch, then they are joined.
 
     Args:
         env: for its specs.
         in_keys: the entries.
-        hidden: widths of the hidden layers.
-        outputs: width of the last layer.
-        gain: size of the last layer's weights.
+
+    Attributes:
+        width: D, length of the vector.
 
     Raises:
         KeyError: if the env has no such entry, naming those it has.
     """
 
-    def __init__(self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], outputs: int, gain: float) -> None:
+    def __init__(self, env: EnvBase, in_keys: Sequence[str]) -> None:
         super().__init__()
         spec, batch = env.observation_spec, len(env.batch_size)
         known = [key for key in spec.keys(True, True) if isinstance(key, str)]
@@ -38,19 +38,55 @@ class Network(nn.Module):
             raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(known)}")
         shapes = [spec[key].shape[batch:] for key in in_keys]
         self.event_dims = [len(shape) for shape in shapes]
-        width = sum(shape.numel() for shape in shapes)
-        self.layers = MLP(width, outputs, num_cells=list(hidden), activation_class=nn.Tanh, device=env.device)
-        linear = [layer for layer in self.layers if isinstance(layer, nn.Linear)]
-        for layer in linear:
-            nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
-            nn.init.zeros_(layer.bias)
+        self.width = sum(shape.numel() for shape in shapes)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[*batch, ...] each to [*batch, outputs]."""
+        """[*batch, ...] each to [*batch, D]."""
         flat = [
             x.unsqueeze(-1) if dims == 0 else x.flatten(-dims) for x, dims in zip(inputs, self.event_dims, strict=True)
         ]
-        out: Tensor = self.layers(torch.cat(flat, -1) if len(flat) > 1 else flat[0])
+        return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
+
+
+def tanh_layers(
+    inputs: int, outputs: int, hidden: Sequence[int], gain: float, device: torch.device | None = None
+) -> MLP:
+    """A tanh network with PPO's orthogonal start.
+
+    Args:
+        inputs: width of what it reads.
+        outputs: width of the last layer.
+        hidden: widths of the hidden layers.
+        gain: size of the last layer's weights.
+        device: where it lives.
+    """
+    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=nn.Tanh, device=device)
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+    for layer in linear:
+        nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
+        nn.init.zeros_(layer.bias)
+    return layers
+
+
+class Network(nn.Module):
+    """`tanh_layers` over some of an env's entries, joined.
+
+    Args:
+        env: for its specs.
+        in_keys: the entries.
+        hidden: widths of the hidden layers.
+        outputs: width of the last layer.
+        gain: size of the last layer's weights.
+    """
+
+    def __init__(self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], outputs: int, gain: float) -> None:
+        super().__init__()
+        self.joined = Joined(env, in_keys)
+        self.layers = tanh_layers(self.joined.width, outputs, hidden, gain, env.device)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """[*batch, ...] each to [*batch, outputs]."""
+        out: Tensor = self.layers(self.joined(*inputs))
         return out
 
 

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from coil_rl.files import whole_file
+from coil_rl.files import remove_unfinished, whole_file, whole_folder
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
@@ -28,3 +28,40 @@ def test_an_error_leaves_the_older_file_and_nothing_else(tmp_path: Path) -> None
         write()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_folder_appears_when_it_is_whole(tmp_path: Path) -> None:
+    path = tmp_path / "new folder" / "data"
+    with whole_folder(path) as unfinished:
+        (unfinished / "inner").mkdir()
+        (unfinished / "inner" / "numbers").write_text("1 2")
+        assert not path.exists()
+    assert (path / "inner" / "numbers").read_text() == "1 2"
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_an_error_leaves_no_folder(tmp_path: Path) -> None:
+    def write() -> None:
+        with whole_folder(tmp_path / "data") as unfinished:
+            (unfinished / "half").write_text("1")
+            raise RuntimeError("the disk is full")
+
+    with pytest.raises(RuntimeError, match="the disk is full"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_with_something_in_it_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "mine").write_text("1")
+    with pytest.raises(OSError, match="data"), whole_folder(tmp_path / "data"):
+        pass
+    assert [path.name for path in (tmp_path / "data").iterdir()] == ["mine"]
+
+
+def test_what_a_killed_process_began_is_removed(tmp_path: Path) -> None:
+    (tmp_path / ".data.123" / "inner").mkdir(parents=True)
+    (tmp_path / ".table.123.csv").write_text("half")
+    (tmp_path / "table.csv").write_text("whole")
+    remove_unfinished(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
