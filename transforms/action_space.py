@@ -40,7 +40,7 @@ class ActionSpace:
         best = vectors.argmax(-1)
         if isinstance(self.spec, OneHot):
             return F.one_hot(best, self.size).to(self.spec.dtype)
-        return best.reshape(*best.shape, *self.event).to(self.spec.dtype)
+        return best.reshape((*best.shape, *self.event)).to(self.spec.dtype)
 
     def clamp(self, vectors: Tensor) -> Tensor:
         """[*batch, A] within the bounds of the action, if it has any."""

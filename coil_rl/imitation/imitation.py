@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torch.nn import functional as F
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError
@@ -25,6 +25,7 @@ from coil_rl.imitation import dataset as folders
 from coil_rl.imitation.regressor import Regressor
 from coil_rl.imitation.validation import cross_validated, scores
 from coil_rl.networks import Joined, Keyed
+from coil_rl.transforms.action_space import ActionSpace
 
 
 class Imitation:
@@ -94,11 +95,13 @@ class Imitation:
         if not 0 <= seed < 2**32:
             raise ValueError(f"seed={seed} must be at least 0 and at most {2**32 - 1}")
         self.regressor = regressor.fresh(self.joined.width, size).to(env.device)
-        self.policy = Keyed(_Action(self.joined, self.regressor, env.action_spec), in_keys, ["action"])
+        self.policy = Keyed(
+            _Action(self.joined, self.regressor, ActionSpace(env.action_spec, batch)), in_keys, ["action"]
+        )
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
         self.group_key = _known(group_key, spec)
         self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
-        self.validate, self.seed = validate, seed
+        self.validate, self.seed, self.device = validate, seed, env.device
         self.dataset: TensorDictBase | None = None
         if dataset is not None:
             self.dataset = self._fitting(folders.load(dataset), dataset, env)
@@ -128,6 +131,11 @@ class Imitation:
         self.regressor.fit(x, y)
         with torch.no_grad():
             return metrics | scores([self.regressor(x)], [y], "training")
+
+    def export(self, folder: Path) -> None:
+        """Leave the data set as `dataset` in the folder of a run, for others to begin with."""
+        if self.dataset is not None and not (folder / "dataset").exists():
+            folders.save(self.dataset, folder / "dataset")
 
     def _pairs(self, batch: TensorDictBase) -> TensorDictBase:
         data = batch.select(*self.keys).reshape(-1)
@@ -159,35 +167,20 @@ class Imitation:
         entries = state["dataset"]
         if entries is not None:
             entries = TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
-            entries = entries.to(self.policy.module.low.device)
+            entries = entries.to(self.device)
         self.dataset = entries
 
 
 class _Action(nn.Module):
     """What a regressor says of the observed entries, as an action that the env takes."""
 
-    low: Tensor
-    high: Tensor
-
-    def __init__(self, joined: Joined, regressor: Regressor, spec: TensorSpec) -> None:
+    def __init__(self, joined: Joined, regressor: Regressor, space: ActionSpace) -> None:
         super().__init__()
-        self.joined, self.regressor = joined, regressor
-        self.categorical, self.one_hot, self.dtype = isinstance(spec, Categorical), isinstance(spec, OneHot), spec.dtype
-        bounds = (-torch.inf, torch.inf)
-        if isinstance(spec, Bounded):
-            event = tuple(0 for _ in spec.shape[:-1])
-            bounds = (spec.space.low[event], spec.space.high[event])
-        for name, bound in zip(("low", "high"), bounds, strict=True):
-            self.register_buffer(name, torch.as_tensor(bound, device=spec.device), persistent=False)
+        self.joined, self.regressor, self.space = joined, regressor, space
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[*batch, ...] each to the action: [*batch, A], or [*batch] where it is a number of a finite set."""
-        said: Tensor = self.regressor(self.joined(*inputs))
-        if self.categorical:
-            return said.argmax(-1)
-        if self.one_hot:
-            return F.one_hot(said.argmax(-1), said.shape[-1]).to(self.dtype)
-        return said.clamp(self.low, self.high)
+        return self.space.actions(self.space.clamp(self.regressor(self.joined(*inputs))))
 
 
 def _known(key: str | Sequence[str] | None, spec: TensorSpec) -> NestedKey | None:

@@ -16,6 +16,9 @@ from coil_rl.files import remove_unfinished, whole_file
 from coil_rl.programs.versions import versions
 from coil_rl.trained import configuration
 
+# What two runs of one configuration may differ in; a configuration that was read holds the defaults of its type.
+UNLIKE = ("run_dir", "logger", "existing", "defaults")
+
 
 @contextmanager
 def claimed(folder: Path) -> Iterator[None]:
@@ -65,7 +68,7 @@ def holds(folder: Path, config: DictConfig) -> bool:
         _flat(OmegaConf.to_container(each, resolve=True)) for each in (configuration(folder, "run_dir"), config)
     )
     for key in dict.fromkeys([*kept, *wanted]):
-        if kept.get(key) != wanted.get(key) and key.split(".")[0] not in ("run_dir", "logger", "existing"):
+        if kept.get(key) != wanted.get(key) and key.split(".")[0] not in UNLIKE:
             raise UserError(
                 f"{folder} holds a run with {key}={kept.get(key)}, not {wanted.get(key)}; "
                 "choose another folder, or remove that one"

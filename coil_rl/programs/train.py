@@ -81,6 +81,8 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         experiment.resume()
     rows = experiment.run(guide_return)
     draw_learning_curves({config.label: [rows]}, folder / "learning_curve.png", guide=guide_return)
+    if hasattr(learner, "export"):  # not every learner has something to leave besides its policy
+        learner.export(folder)
     learner.policy.load_state_dict(checkpoint.load(folder / f"policy_{config.evaluation.policy}.pt", config.device))
     return learner.policy
 

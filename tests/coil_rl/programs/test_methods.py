@@ -19,7 +19,7 @@ METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "me
 TINY = ["track=generated", "track.train.count=1", "track.test.count=2", "env.laps=1", "env.time_limit=2",
         "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "checkpoint_every=1",
         "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
-IMITATION = {"oil": ["learner=linear", "+learner.validate=false"], "dagger": ["learner=linear"]}
+IMITATION = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
 
 
 def trained(folder, *overrides):
