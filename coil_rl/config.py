@@ -11,6 +11,8 @@ from omegaconf import MISSING, OmegaConf
 
 # Two runs started within a microsecond of each other still get folders of their own.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
+# What a table has entries for, as part of a label: ${names:${degrade},intact}
+OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, table)) or none, replace=True)
 
 
 @dataclass

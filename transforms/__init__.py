@@ -4,11 +4,11 @@ from coil_rl.transforms.combined_actions import MixedAction, ResidualAction
 from coil_rl.transforms.degraded_advice import (
     BiasedAdvice,
     DegradedAdvice,
-    NoisyAdvice,
     PartialAdvice,
     ScaledAdvice,
 )
 from coil_rl.transforms.displaced_advice import DelayedAdvice, RemovedAdvice, ShuffledAdvice
+from coil_rl.transforms.drawn_advice import NoisyAdvice, RandomAdvice
 from coil_rl.transforms.guide_actions import GuideActions
 from coil_rl.transforms.reward_coupling import RewardCoupling
 from coil_rl.transforms.takeover import JumpStart, Takeover
@@ -22,6 +22,7 @@ __all__ = [
     "MixedAction",
     "NoisyAdvice",
     "PartialAdvice",
+    "RandomAdvice",
     "RemovedAdvice",
     "ResidualAction",
     "RewardCoupling",

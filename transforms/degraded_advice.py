@@ -1,4 +1,4 @@
-"""Advice that is made worse on purpose: guides that are noisy, biased, undertuned or right half of the time.
+"""Advice that is made worse on purpose: guides that are biased, undertuned or right half of the time.
 
 Whoever claims that a guide helped compares it with these. Each stands behind `GuideActions` and changes what it wrote,
 under the same key and within the same bounds, so that nothing downstream knows; behind one another they add up.
@@ -7,9 +7,8 @@ under the same key and within the same bounds, so that nothing downstream knows;
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Literal
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
@@ -140,67 +139,6 @@ class PartialAdvice(DegradedAdvice):
     def degrade(self, advice: Tensor) -> Tensor:
         """The positive or the negative part of the advice."""
         return advice.clamp(min=0) if self.side == "left" else advice.clamp(max=0)
-
-
-class DrawnAdvice(DegradedAdvice):
-    """Changes advice at random, by draws from a generator of its own that `state_dict()` holds.
-
-    Args:
-        args: of `DegradedAdvice`, or of whatever comes between.
-    """
-
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
-        self.generator = torch.Generator()
-
-    def get_extra_state(self) -> Tensor:
-        """The generator's state."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator."""
-        self.generator.set_state(state.cpu())
-
-
-class NoisyAdvice(DrawnAdvice):
-    """Advice with Gaussian noise, new at every step.
-
-    A row's noise does not depend on when the episodes of other rows begin.
-
-    Args:
-        sigma: standard deviation, in action units.
-        seed: of the noise.
-        key: the advice, [*batch, n_guides, A].
-
-    Raises:
-        ValueError: for a sigma that is negative or not finite.
-    """
-
-    def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
-        super().__init__(key)
-        if not 0 <= sigma < math.inf:
-            raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
-        self.sigma = sigma
-        self.generator.manual_seed(seed)
-
-    def degrade(self, advice: Tensor) -> Tensor:
-        """Advice + noise."""
-        return self._noisy(advice, self._draw(advice)[0])
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        if tensordict.get("_reset", None) is None:
-            return self._call(tensordict_reset)
-        # The second half of what the next step is going to draw anyway: resets then change nothing that comes later.
-        state, advice = self.generator.get_state(), tensordict_reset[self.key]
-        noise = self._draw(advice)[1]
-        self.generator.set_state(state)
-        return self._write(tensordict_reset, self._noisy(advice, noise))
-
-    def _draw(self, advice: Tensor) -> Tensor:
-        return torch.randn(2, *advice.shape, generator=self.generator)
-
-    def _noisy(self, advice: Tensor, noise: Tensor) -> Tensor:
-        return torch.add(advice, noise.to(advice), alpha=self.sigma)
 
 
 def _finite(name: str, value: float) -> float:

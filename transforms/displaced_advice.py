@@ -12,7 +12,8 @@ from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Composite, TensorSpec
 
-from coil_rl.transforms.degraded_advice import DegradedAdvice, DrawnAdvice
+from coil_rl.transforms.degraded_advice import DegradedAdvice
+from coil_rl.transforms.drawn_advice import DrawnAdvice
 
 
 class _Remembering(DegradedAdvice):
