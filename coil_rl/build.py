@@ -34,7 +34,7 @@ def build(node: Any, name: str, kind: type | None = None, **given: Any) -> Any:
         built = hydra.utils.instantiate(node, **given, _convert_="all")
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
-        if isinstance(cause, (ValueError, KeyError, TypeError, OSError)):
+        if isinstance(cause, (UserError, ValueError, KeyError, TypeError, OSError)):
             said = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
             raise UserError(f"{name}: {' '.join(str(said).split())}") from error
         if cause is None:  # Hydra itself will not call this target
@@ -95,18 +95,27 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
         config: with `env`, `method` and `degrade`.
         overrides: what to change in `env`.
         advice: which of `evaluation.advice` comes last, and degrades the advice once more.
+
+    Raises:
+        UserError: as `build`, and if the transforms do not fit together.
     """
     env = build_bare_env(config, overrides)
     transforms = build_transforms(config)
     if advice:
         transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
     # The sum comes first, before a method changes what the agent is paid.
-    return TransformedEnv(env, Compose(RewardSum(), *transforms))
+    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    try:
+        env.observation_spec  # noqa: B018  transforms look at what stands before them once they are asked
+    except (KeyError, ValueError) as error:
+        raise UserError(f"method.transforms: {error.args[0]}") from error
+    return env
 
 
 def build_transforms(config: DictConfig) -> list[Transform]:
-    """The transforms of a method, and after them those that degrade what its guides say."""
-    return [*build_all(config.method.transforms, "method.transforms"), *build_all(config.degrade, "degrade")]
+    """The transforms of a method, and after them those that degrade what its guides say, if it asks any."""
+    transforms, degrade = build_all(config.method.transforms, "method.transforms"), build_all(config.degrade, "degrade")
+    return transforms + degrade if transforms else []
 
 
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:

@@ -58,6 +58,11 @@ def check(config: DictConfig) -> None:
         build_all(config.degrade, "degrade")
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
+        if not config.label or config.label == "guide" or "/" in config.label:
+            raise UserError(
+                f"label={config.label} cannot name an agent: it must not be empty, not guide, and have no /; "
+                "take another"
+            )
         _check_training(config)
     _make_folder(Path(config.run_dir))
 

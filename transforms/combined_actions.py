@@ -4,17 +4,26 @@ from __future__ import annotations
 
 from tensordict import TensorDictBase
 from torch import Tensor
+from torchrl.data import Composite
 
 from coil_rl.transforms.guided import Guided, Schedule
 
 
 class _CombinedAction(Guided):
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """See that there is advice, and that actions can be added up.
+
+        Raises:
+            ValueError: if they are choices.
+        """
         if not self.space.continuous:
             raise ValueError(
                 f"{type(self).__name__} adds actions up, but this env takes one of {self.space.size} choices; "
                 "use Takeover, by which the guide acts in some of the steps"
             )
+        return super().transform_observation_spec(observation_spec)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         combined = self._combine(tensordict[self.action_key], self.advice(tensordict))
         return tensordict.set(self.action_key, self.space.clamp(combined))
 

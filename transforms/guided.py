@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.data import Composite
 from torchrl.envs import Transform
 
 from coil_rl.transforms.action_space import ActionSpace
@@ -52,19 +53,24 @@ class Guided(Transform):
         return value(self.progress if self.training else 1.0)
 
     def advice(self, tensordict: TensorDictBase) -> Tensor:
-        """[*batch, A].
+        """[*batch, A]."""
+        advice: Tensor = tensordict[self.advice_key]
+        return advice[..., self.guide, :]
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """See that there is advice.
 
         Raises:
-            KeyError: if nobody wrote advice.
+            KeyError: if nobody writes it, or not so many rows of it.
         """
-        advice = tensordict.get(self.advice_key, None)
-        if advice is None or self.guide >= advice.shape[-2]:
-            what = "no advice" if advice is None else f"only {advice.shape[-2]} rows of advice"
+        spec = observation_spec.get(self.advice_key, None)
+        if spec is None or self.guide >= spec.shape[-2]:
+            what = "no advice" if spec is None else f"{spec.shape[-2]} of them"
             raise KeyError(
-                f"{type(self).__name__} reads row {self.guide} of {self.advice_key!r}, but finds {what}; "
+                f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {what}; "
                 "put GuideActions with that many guides before it"
             )
-        return advice[..., self.guide, :]
+        return observation_spec
 
     @property
     def space(self) -> ActionSpace:

@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Composite, Unbounded
 
 from coil_rl.transforms.guided import Guided, Schedule
 
@@ -64,8 +64,9 @@ class RewardCoupling(Guided):
         zero: Tensor = self.parent.full_reward_spec["reward"].zero()
         return zero
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the two parts of the reward."""
+        observation_spec = super().transform_observation_spec(observation_spec)
         reward = self.parent.full_reward_spec["reward"]
         for key in self.out_keys:
             observation_spec[key] = Unbounded(reward.shape, device=reward.device, dtype=reward.dtype)

@@ -11,7 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.data import Binary, TensorSpec, Unbounded
+from torchrl.data import Binary, Composite, Unbounded
 
 from coil_rl.transforms.guided import Guided, Schedule
 
@@ -43,8 +43,9 @@ class _Takeover(Guided):
         agent = tensordict["agent_acts"].reshape(tensordict.batch_size)
         return tensordict.set(self.action_key, torch.where(expand_as_right(agent, action), action, advice))
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add who acts."""
+        observation_spec = super().transform_observation_spec(observation_spec)
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         observation_spec["agent_acts"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
         return observation_spec
@@ -104,7 +105,7 @@ class JumpStart(_Takeover):
         tensordict.set("guide_steps", steps)
         return tensordict.set("agent_acts", steps == 0)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add who acts, and for how many steps the guide still does."""
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         observation_spec["guide_steps"] = Unbounded(shape, device=device, dtype=torch.int64)

@@ -48,7 +48,8 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         plan.append((config.label, "", "deterministic", 1))
         if hasattr(agent, "get_dist"):
             plan.append((config.label, "", "sampled", config.evaluation.repeats))
-        plan += [(config.label, advice, "deterministic", 1) for advice in config.evaluation.advice]
+        if config.method.transforms:
+            plan += [(config.label, advice, "deterministic", 1) for advice in config.evaluation.advice]
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     drives: dict[str, Drive] = {}

@@ -69,5 +69,5 @@ def test_specs_hold_around_every_world(env):
 def test_what_cannot_be_is_refused():
     with pytest.raises(ValueError, match="norm='l3' must be one of l1, l2, linf"):
         RewardCoupling(0.5, "l3")
-    with pytest.raises(KeyError, match="RewardCoupling reads row 1 of 'guide_action', but finds only 1 rows of advice"):
+    with pytest.raises(KeyError, match="RewardCoupling reads row 1 of guide_action, but there is 1 of them"):
         worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1)

@@ -67,7 +67,7 @@ def refusal(name, *arguments):
     ("arguments", "words"),
     [
         # keys
-        ("sed=1", "no key sed; the configuration has preset, track, env, guide, method"),
+        ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("sed=1", "resume; did you mean seed?"),
         ("budget.car=1", "no key budget.car; budget has frames, cars, steps; did you mean cars?"),
         ("learner.learning_rat=1", "+learner.learning_rat=VALUE adds it; did you mean learning_rate?"),
@@ -114,7 +114,7 @@ def refusal(name, *arguments):
         ("guide=zero guide._target_=subprocess.run", "guide: Target 'subprocess.run' is blocklisted"),
         ("~guide._target_", "names nothing to build; give it a _target_"),
         # groups
-        ("guide=splin", "no guide=splin; guide can be constant, random, spline, zero; did you mean spline?"),
+        ("guide=splin", "no guide=splin; guide can be centre_fast, constant, learned, random, spline, zero; did"),
         ("guide=null", "a group takes the name of one of its files, as in guide=spline"),
         ("+guide=random", "guide is chosen already; write guide=random without the +"),
         ("+experiment=nope", "no experiment=nope; experiment can be coil_vs_ppo"),
@@ -148,6 +148,27 @@ def test_mistake_of_training_is_one_sentence(started, arguments, words):
         ("track=folder track.dir=5", "path=5 must be text or a path"),
         ("-m seed=-1,0", "seed=-1 must be at least 0"),
         ("-m guide=zero,zeroo", "no guide=zeroo"),
+        ("degrade=[noisy,loud]", "no degrade=loud"),
+        ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
+        ("guide=learned", "guide.run must be given"),
+        ("guide=learned guide.run=nowhere", "guide: guide.run=nowhere is not the folder of a run"),
+        (
+            "method=rfc method.transforms.coupling.norm=l3",
+            "method.transforms.coupling: norm='l3' must be one of l1, l2",
+        ),
+        (
+            "method=rfc +method.transforms.coupling.guide=1",
+            "method.transforms: RewardCoupling reads row 1 of",
+        ),
+        (
+            "method=rfc ~method.transforms.advice",
+            "but there is no advice; put GuideActions with",
+        ),
+        ("method=kickstart learner=linear", "learner: Imitation takes no auxiliary; it takes env, in_keys, regressor"),
+        ("method=ppo learner=linear", "learner: the env has no entry guide_action to imitate; it has observation"),
+        ("label=guide", "label=guide cannot name an agent"),
+        ("existing=maybe", "existing=maybe must be one of refuse, resume"),
+        ("+evaluation.advice.odd=3", "evaluation.advice.odd=3 names nothing to build"),
     ],
 )
 def test_mistake_in_tracks_and_sweeps_is_one_sentence(started, arguments, words):

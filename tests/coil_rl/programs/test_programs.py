@@ -3,23 +3,10 @@ import os
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 from PIL import Image
-
-ROOT = Path(__file__).parents[3]
-
-TINY = ["budget.frames=512", "budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1",
-        "track.test.count=1", "env.laps=1", "evaluation.repeats=1", "logger=none"]  # fmt: skip
-
-
-def program(name, *arguments, cwd, code=0):
-    command = [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd)])}
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == code, done.stderr
-    return done
+from programs import ROOT, TINY, program
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from programs import TINY, program
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.programs import report
@@ -172,3 +173,20 @@ def test_a_damaged_file_is_named(sweep):
     code, _, error = outcome("folder=sweep")
     assert code == 2
     assert error.startswith("report: sweep/2_coil/evaluation.csv is damaged (")
+
+
+@pytest.mark.slow
+def test_report_reads_what_coil_train_wrote(tmp_path):
+    sweep = ["method=coil,ppo", "evaluation.gif=false", "hydra.sweep.dir=sweep"]
+    program("train", "-m", *TINY, *sweep, cwd=tmp_path)
+    done = program("report", "folder=sweep", "actions=both", cwd=tmp_path)
+    assert "All 2 runs that have begun are finished." in done.stdout
+    assert done.stderr == ""
+    assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
+    assert {path.name for path in tmp_path.iterdir()} == {"sweep"}
+    reward = {row["driver"]: float(row["mean"]) for row in rows_of(tmp_path / "sweep" / "report.csv")[:3]}
+    for run in (tmp_path / "sweep").glob("*_seed0"):
+        means = [row for row in rows_of(run / "evaluation.csv") if row["track"] == "mean" and not row["advice"]]
+        guide, agent = means[0], means[1]
+        assert reward["guide"] == pytest.approx(float(guide["reward"]))
+        assert reward[agent["driver"]] == pytest.approx(float(agent["reward"]))
