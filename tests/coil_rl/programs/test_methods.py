@@ -12,6 +12,7 @@ from coil_rl import config as _schema  # noqa: F401
 from coil_rl.check import check
 from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
+from coil_rl.imitation import dataset
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 
@@ -121,3 +122,12 @@ def test_driving_leaves_what_is_only_for_learning_out(residual):
 def compose_evaluate(run):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose("evaluate", [*TINY[:3], f"run={run}", "run_dir=unused"])
+
+
+def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
+    given = ["learner=linear", "learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
+    oil = trained(tmp_path / "oil", "method=oil", *given)
+    dagger = trained(tmp_path / "dagger", "method=dagger", *given)
+    gathered, other = (dataset.load(run / "dataset") for run in (oil, dagger))
+    assert len(gathered) == 64
+    assert (gathered == other).all()
