@@ -104,6 +104,7 @@ class ScaledAdvice(DegradedAdvice):
         ValueError: for a gain that is not finite.
 
     Example:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> stored = TensorDict({"guide_action": torch.tensor([[[0.5]], [[-1.0]]])}, [2])
         >>> ScaledAdvice(gain=-1)(stored)["guide_action"].flatten().tolist()
