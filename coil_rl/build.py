@@ -124,13 +124,22 @@ def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
 
 
 def build_guided_env(
-    config: DictConfig, overrides: Mapping[str, Any] | None = None
+    config: DictConfig, overrides: Mapping[str, Any], guides: Mapping[str, TensorDictModuleBase] | None = None
 ) -> tuple[EnvBase, TensorDictModuleBase]:
-    """The env of a configuration, and a policy by which its guide drives there, degraded as the configuration says."""
-    env = build_bare_env(config, overrides)
-    transforms = [GuideActions({"guide": build_guide(config)}), *build_all(config.degrade, "degrade")]
+    """The env of a configuration, and a policy by which its guides drive there, degraded as the configuration says.
+
+    Args:
+        config: with `env`, `guide` and `degrade`.
+        overrides: what to change in `env`, with `num_cars`. There are so many cars for each guide, the first guide's
+            first.
+        guides: others than those of the configuration.
+    """
+    guides = guides or build_guides(config)
+    cars = overrides["num_cars"]
+    env = build_bare_env(config, {**overrides, "num_cars": cars * len(guides)})
+    transforms = [GuideActions(guides), *build_all(config.degrade, "degrade")]
     env = TransformedEnv(env, Compose(RewardSum(), *transforms))
-    return env, FollowAdvice(env)
+    return env, FollowAdvice(env, [guide for guide in range(len(guides)) for _ in range(cars)])
 
 
 def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
@@ -146,7 +155,17 @@ def build_learner(config: DictConfig, env: EnvBase) -> Any:
     return build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
 
 
-def build_guide(config: DictConfig) -> TensorDictModuleBase:
-    """The guide of a configuration."""
-    guide: TensorDictModuleBase = build(config.guide, "guide", TensorDictModuleBase)
-    return guide
+def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """The guides of a configuration by name, in its order.
+
+    Raises:
+        UserError: as `build`, and if there is none, or one without a name.
+    """
+    if "_target_" in config.guide:
+        raise UserError(
+            "guide: a guide needs a name, so that others can stand beside it: let its file begin with "
+            "# @package guide.NAME, or give +guide.NAME._target_"
+        )
+    if not config.guide:
+        raise UserError("guide: there is none; give at least one, as in guide=spline")
+    return {name: build(node, f"guide.{name}", TensorDictModuleBase) for name, node in config.guide.items()}

@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.build import build, build_all, build_bare_env, build_env, build_guide, build_learner, check_node
+from coil_rl.build import build, build_all, build_bare_env, build_env, build_guides, build_learner, check_node
 from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.signature import near
@@ -54,11 +54,12 @@ def check(config: DictConfig) -> None:
     if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
         env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
-        _check_guide(build_guide(config), env)
+        for name, guide in build_guides(config).items():
+            _check_guide(guide, env, f"guide.{name}")
         build_all(config.degrade, "degrade")
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
-        if not config.label or config.label == "guide" or "/" in config.label:
+        if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
             raise UserError(
                 f"label={config.label} cannot name an agent: it must not be empty, not guide, and have no /; "
                 "take another"
@@ -99,15 +100,15 @@ def _check_device(key: str, name: str) -> None:
         raise UserError(f"{key}={name} cannot be used ({str(error).splitlines()[0]}); take {key}=cpu") from error
 
 
-def _check_guide(guide: TensorDictModuleBase, env: EnvBase) -> None:
+def _check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
     data = env.reset()
     for key in guide.in_keys:
         if key not in data.keys(True):
-            raise UserError(f"guide: it reads {key}, but the env has only {', '.join(map(_name, data.keys()))}")
+            raise UserError(f"{name}: it reads {key}, but the env has only {', '.join(map(_name, data.keys()))}")
     action = guide(data)["action"]
     shape, wanted = action.shape, env.action_spec.shape
     if shape != wanted:
-        raise UserError(f"guide: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
+        raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
 
 
 def _check_training(config: DictConfig) -> None:

@@ -32,6 +32,17 @@ class Drive:
     episodes: list[dict[str, Any]]
     lines: list[NDArray[np.float64]]
 
+    @property
+    def mean_reward(self) -> float:
+        """Of an episode."""
+        return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
+
+    def split(self, parts: int) -> list[Drive]:
+        """As many drives, of equally many cars each, in their order."""
+        size = len(self.episodes) // parts
+        ends = range(size, len(self.episodes) + 1, size)
+        return [Drive(self.episodes[end - size : end], self.lines[end - size : end]) for end in ends]
+
 
 @torch.no_grad()
 def drive(

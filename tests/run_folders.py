@@ -33,7 +33,7 @@ def make_run(
     folder.mkdir(parents=True)
     config = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
-    (folder / "guide_return.json").write_text(f"{guide}\n")
+    (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
     frames = range(1000, 20_001, 1000)
     write_csv(
         [{"frames": n, "train/return": 400 * (1 - math.exp(-n / 5000)) + seed} for n in frames], folder / "metrics.csv"

@@ -76,6 +76,19 @@ class GuideActions(Transform):
         self.guides.eval()
         return self
 
+    def get_extra_state(self) -> dict[str, list[str]]:
+        """The guides' names: a policy that learned to read their rows must not get others'."""
+        return {"names": self.names}
+
+    def set_extra_state(self, state: dict[str, list[str]]) -> None:
+        """Refuse a state of other guides, or of another order.
+
+        Raises:
+            ValueError: naming both.
+        """
+        if state["names"] != self.names:
+            raise ValueError(f"the state is of the guides {', '.join(state['names'])}, not {', '.join(self.names)}")
+
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice on data that an env of this kind wrote before."""
         return self._call(tensordict)

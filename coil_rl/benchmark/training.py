@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.benchmark.plain_ppo import PlainPPO
 from coil_rl.benchmark.turns import Sections, Turns, median_ratio
-from coil_rl.build import build, build_bare_env, build_env, build_guide, build_learner
+from coil_rl.build import build, build_bare_env, build_env, build_guides, build_learner
 from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -61,7 +61,7 @@ class Training:
 def plain(config: DictConfig, method: str, cars: int, steps: int) -> Callable[[], int]:
     """The hand-written loop on the same env, with the same hyper-parameters."""
     env = build_bare_env(config, {"num_cars": cars})
-    guide = build_guide(config) if method == "coil" else None
+    guide = next(iter(build_guides(config).values())) if method == "coil" else None
     learned: Any = OmegaConf.to_container(config.learner, resolve=True)
     node = {key: value for key, value in learned.items() if key not in ("compile", "action_gain")}
     node |= {"_target_": f"{PlainPPO.__module__}.{PlainPPO.__qualname__}"}

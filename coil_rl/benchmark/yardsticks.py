@@ -45,7 +45,8 @@ def measure_oracle(config: DictConfig, turns: Turns) -> dict[str, Any]:
 def one_car(oracle: ModuleType, config: DictConfig) -> Callable[[], int]:
     """Drives `tests/oracle.py` on the training tracks in turn, each to the end."""
     options = {key: config.env[key] for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")}
-    guide = {key: config.guide[key] for key in ("spline", "smoothing", "gain") if key in config.guide}
+    spline = config.guide.get("spline", {})
+    guide = {key: spline[key] for key in ("spline", "smoothing", "gain") if key in spline}
     cars = [oracle.OneCar(t.left, t.right, t.start, **options) for t in build(config.track.train, "track.train")]
     driven = 0
 

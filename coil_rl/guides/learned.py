@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
@@ -32,23 +31,28 @@ class LearnedGuide(TensorDictModuleBase):
     def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
         super().__init__()
         folder = Path(run).expanduser()
-        config = configuration(folder, "guide.run", {"device": device})
+        config = configuration(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
         # One car is enough: what the transforms need of an env are its specs.
         env = TransformedEnv(build_bare_env(config, {"num_cars": 1}), Compose(*build_transforms(config)))
-        shown = [key for key in env.base_env.observation_spec if key != "info"]
-        self.in_keys, self.out_keys = shown, ["action"]
-        self.transforms, self.policy = env.transform, policy(folder, config, env, which)
+        self.policy, self.transforms = policy(folder, config, env, which), None
+        self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
+        if config.method.needs_guide:
+            self.transforms = env.transform
+            self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
         # Transforms know their env by a weak reference; in a tuple it is no module of this one.
         self._kept = (env,)
         self.requires_grad_(False)
         self.eval()
 
-    @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action`, as the env gets it in the end."""
-        seen = self.transforms(tensordict.select(*self.in_keys))
+        seen = tensordict.select(*self.in_keys)
+        if self.transforms is not None:
+            seen = self.transforms(seen)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             chosen = self.policy(seen)
-        return tensordict.set("action", self.transforms.inv(chosen)["action"])
+        if self.transforms is not None:
+            chosen = self.transforms.inv(chosen)
+        return tensordict.set("action", chosen["action"])

@@ -105,21 +105,30 @@ class FollowAdvice(TensorDictModuleBase):
 
     Args:
         env: for its actions.
-        guide: which row of the advice.
+        guide: which row of the advice, or which for each row of the env.
         in_key: of the advice, [*batch, n_guides, A].
         out_key: where to write the action.
     """
 
+    guide: Tensor
+
     def __init__(
-        self, env: EnvBase, guide: int = 0, in_key: NestedKey = "guide_action", out_key: NestedKey = "action"
+        self,
+        env: EnvBase,
+        guide: int | Sequence[int] = 0,
+        in_key: NestedKey = "guide_action",
+        out_key: NestedKey = "action",
     ) -> None:
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
-        self.space, self.guide = ActionSpace(env.full_action_spec[out_key], env.batch_dims), guide
+        self.space = ActionSpace(env.full_action_spec[out_key], env.batch_dims)
+        self.register_buffer("guide", torch.as_tensor(guide, device=env.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        advice = tensordict[self.in_keys[0]][..., self.guide, :]
+        advice = tensordict[self.in_keys[0]]
+        guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
+        advice = advice.gather(-2, guide).squeeze(-2)
         return tensordict.set(self.out_keys[0], self.space.actions(advice))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ COLUMNS = {
 def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) -> None:
     """Evaluate and write `episodes.csv`, `lines.png`, `lines.gif`, `evaluation.md` (means) and, last, `evaluation.csv`.
 
-    The guide drives each track once; an agent once by its deterministic action, `evaluation.repeats` times by sampled
+    Each guide drives each track once; an agent once by its deterministic action, `evaluation.repeats` times by sampled
     ones if it samples, and once with each advice of `evaluation.advice` in place of what it was trained with.
 
     Args:
@@ -43,30 +43,26 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
     """
     tracks = build(config.track.test, "track.test")
     names = [track.name for track in tracks]
-    plan = [("guide", "", "deterministic", 1)]
-    if agent is not None:
-        plan.append((config.label, "", "deterministic", 1))
-        if hasattr(agent, "get_dist"):
-            plan.append((config.label, "", "sampled", config.evaluation.repeats))
-        if config.method.transforms:
-            plan += [(config.label, advice, "deterministic", 1) for advice in config.evaluation.advice]
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     drives: dict[str, Drive] = {}
+
+    def note(driven: Drive, driver: str, advice: str = "", actions: str = "deterministic") -> None:
+        label = {"driver": driver, "advice": advice, "actions": actions}
+        table.extend(label | row for row in summarise(driven.episodes))
+        episodes.extend(label | row for row in driven.episodes)
+        if actions == "deterministic":
+            drives[f"{driver}, {advice}" if advice else driver] = driven
+
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
-        for index, (driver, advice, actions, repeats) in enumerate(plan):
-            bar.set_postfix_str(", ".join(filter(None, (driver, advice, actions))))
-            overrides: Mapping[str, Any] = {**config.evaluation.env, "num_cars": repeats * len(tracks)}
-            if agent is None or index == 0:
-                env, policy = build_guided_env(config, overrides)
-            else:
-                env, policy = build_env(config, overrides, advice=advice), agent
-            driven = drive(env, policy, sampled=actions == "sampled", names=names, tick=bar.update)
-            label = {"driver": driver, "advice": advice, "actions": actions}
-            table += [label | row for row in summarise(driven.episodes)]
-            episodes += [label | row for row in driven.episodes]
-            if actions == "deterministic":
-                drives[f"{driver}, {advice}" if advice else driver] = driven
+        bar.set_postfix_str("guide")
+        for driver, driven in drive_guides(config, config.evaluation.env, names, bar.update).items():
+            note(driven, driver)
+        for advice, actions, repeats in [] if agent is None else _plan(config, agent):
+            bar.set_postfix_str(", ".join(filter(None, (config.label, advice, actions))))
+            env = build_env(config, {**config.evaluation.env, "num_cars": repeats * len(tracks)}, advice=advice)
+            driven = drive(env, agent, sampled=actions == "sampled", names=names, tick=bar.update)
+            note(driven, config.label, advice, actions)
     write_csv(episodes, folder / "episodes.csv")
     lines = {driver: driven.lines for driver, driven in drives.items()}
     crashed = {driver: [row["crashed"] for row in driven.episodes] for driver, driven in drives.items()}
@@ -77,6 +73,38 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
         unfinished.write_text(markdown_table(table, columns) + "\n")
     write_csv(table, folder / "evaluation.csv")
+
+
+def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, str, int]]:
+    """What advice the agent gets, how it acts, and how often it drives each track."""
+    plan = [("", "deterministic", 1)]
+    if hasattr(agent, "get_dist"):
+        plan.append(("", "sampled", config.evaluation.repeats))
+    if config.method.transforms:
+        plan += [(advice, "deterministic", 1) for advice in config.evaluation.advice]
+    return plan
+
+
+def drive_guides(
+    config: DictConfig,
+    overrides: Mapping[str, Any],
+    names: Sequence[str],
+    tick: Callable[[], Any],
+    guides: Mapping[str, TensorDictModuleBase] | None = None,
+) -> dict[str, Drive]:
+    """Each guide of a run alone, on each track once, by what it goes as in tables: `guide`, or `guide NAME` of several.
+
+    Args:
+        config: of the run.
+        overrides: what to change in `env`; its tracks, one car each.
+        names: of the tracks.
+        tick: called every step.
+        guides: others than those of the configuration.
+    """
+    env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
+    called = list(guides or config.guide)
+    drivers = ["guide"] if len(called) == 1 else [f"guide {name}" for name in called]
+    return dict(zip(drivers, drive(env, policy, names=names, tick=tick).split(len(called)), strict=True))
 
 
 def is_judged(folder: Path) -> bool:

@@ -80,14 +80,14 @@ def _draw_curves(runs: Sequence[Run], found: Comparison, path: Path) -> None:
     guides: dict[str, float] = {}
     for label in dict.fromkeys(group.name for group in found.agents):
         learned = [run for run in runs if run.label == label and run.curve]
-        returns = [run.guide_return for run in learned if run.guide_return is not None]
+        returns = [max(run.guide_returns.values()) for run in learned if run.guide_returns]
         curves |= {label: [run.curve for run in learned]} if learned else {}
         guides |= {label: float(np.mean(returns))} if returns else {}
     several = len({round(value, 3) for value in guides.values()}) > 1
     if several or len(curves) > IN_ONE_PICTURE:
         draw_curve_grid(curves, path, guides=guides)
     elif curves:
-        draw_learning_curves(curves, path, guide=next(iter(guides.values()), None))
+        draw_learning_curves(curves, path, guides={GUIDE: next(iter(guides.values()))} if guides else {})
 
 
 def _against(asked: str | None, found: Mapping[str, Comparison]) -> str | None:

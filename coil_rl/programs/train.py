@@ -11,13 +11,12 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from coil_rl import checkpoint
-from coil_rl.build import build, build_env, build_guided_env, build_learner
+from coil_rl.build import build, build_env, build_learner
 from coil_rl.errors import UserError
-from coil_rl.evaluation import drive
 from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.files import whole_file
 from coil_rl.programs import app, run_folder
-from coil_rl.programs.judge import is_judged, judge, outcome
+from coil_rl.programs.judge import drive_guides, is_judged, judge, outcome
 from coil_rl.report import draw_learning_curves
 from coil_rl.rollout import Rollout
 from coil_rl.trained import configuration
@@ -62,8 +61,8 @@ def finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float:
 
 def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     """Train, draw the learning curve and return the policy to judge."""
-    guide_return = guide_on_training_tracks(config, folder / "guide_return.json")
-    # After the guide, which another process may have driven already.
+    guides = guides_on_training_tracks(config, folder / "guide_return.json")
+    # After the guides, which another process may have driven already.
     torch.manual_seed(config.seed)
     env = build_env(config)
     learner = build_learner(config, env)
@@ -79,26 +78,25 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     )
     if resumed:
         experiment.resume()
-    rows = experiment.run(guide_return)
-    draw_learning_curves({config.label: [rows]}, folder / "learning_curve.png", guide=guide_return)
+    rows = experiment.run(max(guides.values()))
+    draw_learning_curves({config.label: [rows]}, folder / "learning_curve.png", guides=guides)
     if hasattr(learner, "export"):  # not every learner has something to leave besides its policy
         learner.export(folder)
     learner.policy.load_state_dict(checkpoint.load(folder / f"policy_{config.evaluation.policy}.pt", config.device))
     return learner.policy
 
 
-def guide_on_training_tracks(config: DictConfig, file: Path) -> float:
-    """The guide's own mean return where the agent trains: the line to beat. A file remembers it."""
+def guides_on_training_tracks(config: DictConfig, file: Path) -> dict[str, float]:
+    """Each guide's own mean return where the agent trains: the lines to beat. A file remembers them."""
     if file.exists():
-        return float(json.loads(file.read_text()))
-    tracks = build(config.track.train, "track.train")
-    env, guide = build_guided_env(config, {"assignment": "cyclic", "num_cars": len(tracks)})
+        return {name: float(value) for name, value in json.loads(file.read_text()).items()}
+    names = [track.name for track in build(config.track.train, "track.train")]
     with tqdm(unit="step", desc="guide on the training tracks", leave=False, mininterval=0.5) as bar:
-        episodes = drive(env, guide, tick=bar.update).episodes
-    mean = float(sum(episode["reward"] for episode in episodes) / len(episodes))
+        drives = drive_guides(config, {"assignment": "cyclic"}, names, bar.update)
+    means = {driver: drive.mean_reward for driver, drive in drives.items()}
     with whole_file(file) as unfinished:
-        unfinished.write_text(f"{mean}\n")
-    return mean
+        unfinished.write_text(json.dumps(means, indent=2) + "\n")
+    return means
 
 
 def main() -> None:

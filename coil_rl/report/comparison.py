@@ -24,12 +24,12 @@ class Group:
     """All drives of one driver.
 
     Attributes:
-        name: the label, or "guide" and, where there are several, whose.
+        name: the label, or what the guide is called and, where several are called so, whose.
         advice: what was done to the advice; empty if nothing was.
         tracks: their names.
         values: [seeds, tracks, MEASURES].
         is_guide: whether this is a guide.
-        guide: the drives of the guide beside which an agent drove, if one did.
+        guide: the drives of the best guide beside which an agent drove, if one did.
         needs_guide: whether it needs the guide when it drives; None where that is no question.
     """
 
@@ -137,16 +137,16 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     guides = _guides(of_label)
     agents: list[Group] = []
     for label, alike in of_label.items():
-        drives = [drive for run in alike for drive in run.drives if drive.driver != GUIDE and drive.actions == actions]
+        drives = [drive for run in alike for drive in run.drives if not drive.is_guide and drive.actions == actions]
         variants = [
             Group(label, advice, *_stack(label, [drive for drive in drives if drive.advice == advice]),
-                  guide=guides.get(label), needs_guide=None if advice else alike[0].needs_guide)
+                  guide=next(iter(guides.get(label, ())), None), needs_guide=None if advice else alike[0].needs_guide)
             for advice in dict.fromkeys(drive.advice for drive in drives)
         ]  # fmt: skip
         agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
     own = {group.name: group.iqm for group in reversed(agents)}  # the first of each label: its advice is not altered
     agents.sort(key=lambda group: (-own[group.name], group.name))
-    different = {id(group): group for group in guides.values()}
+    different = {id(group): group for of_label in guides.values() for group in of_label}
     return Comparison(tuple(sorted(different.values(), key=lambda group: -group.iqm)), tuple(agents))
 
 
@@ -172,34 +172,34 @@ def _stack(name: str, drives: Sequence[Drive]) -> tuple[tuple[str, ...], Array]:
     return tracks, np.stack([drive.values for drive in drives])
 
 
-def _guides(of_label: dict[str, list[Run]]) -> dict[str, Group]:
-    """From label to its guide: labels whose guides drove alike share one, each different drive of which counts once.
+def _guides(of_label: dict[str, list[Run]]) -> dict[str, list[Group]]:
+    """From label to its guides, the best first.
 
-    A guide that draws at random drives otherwise with every seed. Then labels share it whose seeds all drove alike, as
-    far as both have them.
+    Labels whose guides drove alike share one, and each different drive of it counts once. A guide that draws at random
+    drives otherwise with every seed. Then labels share it whose seeds all drove alike, as far as both have them.
     """
-    families: list[tuple[list[str], dict[Any, Drive]]] = []
+    families: dict[str, list[tuple[list[str], dict[Any, Drive]]]] = {}
     for label, runs in of_label.items():
-        drives = {
-            (drive.tracks, *np.round(drive.values[:, 0], 3)): drive
-            for run in runs
-            for drive in run.drives
-            if drive.driver == GUIDE
-        }
-        if not drives:
-            continue
-        family = next((f for f in families if f[1].keys() <= drives.keys() or drives.keys() <= f[1].keys()), None)
-        if family is None:
-            families.append(([label], drives))
-        else:
-            family[0].append(label)
-            family[1].update(drives)
-    groups: dict[str, Group] = {}
-    for labels, drives in families:
-        name = GUIDE if len(families) == 1 else f"{GUIDE} ({_listed(labels)})"
-        group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())), is_guide=True)
-        groups |= dict.fromkeys(labels, group)
-    return groups
+        driven = [drive for run in runs for drive in run.drives if drive.is_guide]
+        for driver in dict.fromkeys(drive.driver for drive in driven):
+            drives = {
+                (drive.tracks, *np.round(drive.values[:, 0], 3)): drive for drive in driven if drive.driver == driver
+            }
+            alike = families.setdefault(driver, [])
+            family = next((f for f in alike if f[1].keys() <= drives.keys() or drives.keys() <= f[1].keys()), None)
+            if family is None:
+                alike.append(([label], drives))
+            else:
+                family[0].append(label)
+                family[1].update(drives)
+    groups: dict[str, list[Group]] = {}
+    for driver, alike in families.items():
+        for labels, drives in alike:
+            name = driver if len(alike) == 1 else f"{driver} ({_listed(labels)})"
+            group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())), is_guide=True)
+            for label in labels:
+                groups.setdefault(label, []).append(group)
+    return {label: sorted(of_label, key=lambda group: -group.iqm) for label, of_label in groups.items()}
 
 
 def _listed(labels: Sequence[str]) -> str:

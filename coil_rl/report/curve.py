@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import SupportsFloat, cast
 
@@ -33,7 +34,7 @@ def draw_learning_curves(
     runs: Mapping[str, Sequence[Run]],
     path: str | os.PathLike[str],
     *,
-    guide: float | None = None,
+    guides: Mapping[str, float] | None = None,
     title: str | None = None,
 ) -> None:
     """Draw how the return grows with training: thin while training, with dots where the agent was evaluated.
@@ -45,7 +46,7 @@ def draw_learning_curves(
         runs: from label to its runs (seeds), each a sequence of rows with "frames" (frames of the env so far) and
             "train/return" or "evaluation/return" or both; a row may lack either, or have None or NaN for it.
         path: the picture, in the format of its ending, 8 inches wide.
-        guide: the guide's own mean return, drawn as a dashed line.
+        guides: from the name of each guide to its own mean return, drawn as a dashed line.
         title: above the picture.
 
     Raises:
@@ -53,7 +54,7 @@ def draw_learning_curves(
 
     Example:
         >>> rows = [{"frames": 1e5 * n, "train/return": 3.0 * n} for n in range(10)]
-        >>> draw_learning_curves({"COIL": [rows]}, "curve.png", guide=20.0)  # doctest: +SKIP
+        >>> draw_learning_curves({"COIL": [rows]}, "curve.png", guides={"guide": 20.0})  # doctest: +SKIP
     """
     if not any(len(of_label) for of_label in runs.values()):
         raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
@@ -85,11 +86,11 @@ def draw_learning_curves(
                     axes.fill_between(frames / size, low, high, color=stroke.colour, alpha=0.16, lw=0)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
-        if guide is not None:
-            axes.axhline(guide, color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.3, zorder=1.5)
+        for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
+            axes.axhline(value, color=colour, ls=(0, style.DASHES), lw=1.3, zorder=1.5)
             axes.annotate(
-                f"guide\n{guide:.1f}", (1, guide), (4, 0), xycoords=("axes fraction", "data"),
-                textcoords="offset points", va="center", color=style.GUIDES[0],
+                f"{name}\n{value:.1f}", (1, value), (4, 0), xycoords=("axes fraction", "data"),
+                textcoords="offset points", va="center", color=colour,
             )  # fmt: skip
         with whole_file(path) as unfinished:
             figure.savefig(unfinished, format=Path(path).suffix[1:] or "png")

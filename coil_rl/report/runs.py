@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,7 +27,7 @@ class Drive:
     """How one driver of a run did.
 
     Attributes:
-        driver: "guide", or the label of the run for its agent.
+        driver: "guide", or "guide NAME" where there are several; or the label of the run for its agent.
         advice: what was done to the advice, such as "zeroed"; empty if nothing was.
         actions: "deterministic" or "sampled".
         tracks: their names, in the order in which they were driven.
@@ -39,6 +39,11 @@ class Drive:
     actions: str
     tracks: tuple[str, ...]
     values: Array
+
+    @property
+    def is_guide(self) -> bool:
+        """Whether a guide drove."""
+        return self.driver.split()[:1] == [GUIDE]
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,7 @@ class Run:
         needs_guide: whether the agent needs the guide when it drives; None if there is no agent.
         drives: its guide's and its agent's; none until the run is finished.
         curve: the rows of its metrics.csv; none if nothing was learned.
-        guide_return: the guide's mean return on the training tracks, if it was measured.
+        guide_returns: each guide's mean return on the training tracks by its driver's name, if it was measured.
     """
 
     folder: Path
@@ -61,7 +66,7 @@ class Run:
     needs_guide: bool | None
     drives: tuple[Drive, ...] = ()
     curve: Sequence[dict[str, float]] = field(default=(), repr=False)
-    guide_return: float | None = None
+    guide_returns: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def finished(self) -> bool:
@@ -110,7 +115,7 @@ def _read(folder: Path) -> Run:
         return Run(folder, label, seed, needs_guide)
     return Run(
         folder, label, seed, needs_guide,
-        _drives(folder / "evaluation.csv"), _curve(folder / "metrics.csv"), _number(folder / "guide_return.json"),
+        _drives(folder / "evaluation.csv"), _curve(folder / "metrics.csv"), _numbers(folder / "guide_return.json"),
     )  # fmt: skip
 
 
@@ -138,10 +143,10 @@ def _curve(path: Path) -> list[dict[str, float]]:
         raise _damaged(path, error) from error
 
 
-def _number(path: Path) -> float | None:
+def _numbers(path: Path) -> dict[str, float]:
     try:
-        return float(json.loads(path.read_text())) if path.exists() else None
-    except (TypeError, ValueError) as error:
+        return {key: float(value) for key, value in json.loads(path.read_text()).items()} if path.exists() else {}
+    except (AttributeError, TypeError, ValueError) as error:
         raise _damaged(path, error) from error
 
 

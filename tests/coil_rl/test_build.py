@@ -6,7 +6,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build, build_bare_env, build_env, build_guide, build_guided_env
+from coil_rl.build import build, build_bare_env, build_env, build_guided_env, build_guides
 from coil_rl.errors import UserError
 from coil_rl.testing import check_env, check_guide
 
@@ -34,21 +34,21 @@ def test_every_method_builds_an_env_that_keeps_the_contract(preset, method):
 @pytest.mark.parametrize("guide", sorted(set(choices("guide")) - {"learned"}))
 def test_every_guide_advises_on_what_the_env_shows(guide):
     config = composed(f"guide={guide}")
-    guide_module, data = build_guide(config), build_bare_env(config).reset()
+    (guide_module,), data = build_guides(config).values(), build_bare_env(config).reset()
     assert guide_module(data.copy())["action"].shape == (4, 1)
     if guide != "random":
         check_guide(guide_module, data)
 
 
 def test_a_guide_drives_as_its_advice_is_degraded():
-    config = composed("guide=constant", "guide.value=0.4", "degrade=[undertuned,biased]")
-    env, policy = build_guided_env(config)
+    config = composed("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
+    env, policy = build_guided_env(config, {"num_cars": 4})
     step = env.step(policy(env.reset()))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.4 * 0.5 + 0.2))
 
 
 def test_what_degrades_advice_comes_after_every_method():
-    config = composed("method=residual", "guide=constant", "guide.value=0.4", "degrade=[zeroed]")
+    config = composed("method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]")
     step = (env := build_env(config)).step(env.reset().set("action", torch.full((4, 1), 0.5)))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 

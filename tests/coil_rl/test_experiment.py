@@ -20,7 +20,7 @@ WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", 
 def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
     torch.manual_seed(seed)
     env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
-    env = TransformedEnv(env, Compose(*extra, GuideActions({"guide": guide or SplineGuide()}), RewardSum()))
+    env = TransformedEnv(env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum()))
     learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
     rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)

@@ -22,6 +22,14 @@ def test_advice_is_what_the_guide_says_about_the_same_moment():
     assert rollout["next", "done"].any(), "random driving should have crashed, so that resets are covered"
 
 
+def test_a_state_knows_whose_advice_it_goes_with():
+    guides = {"straight": ZeroGuide(), "left": ConstantGuide(0.5)}
+    state = cone_env(guides).state_dict()
+    cone_env(guides).load_state_dict(state)
+    with pytest.raises(ValueError, match="the state is of the guides straight, left, not left, straight"):
+        cone_env(dict(reversed(guides.items()))).load_state_dict(state)
+
+
 def test_several_guides_keep_their_order():
     guides = {"right": ConstantGuide(-0.25), "straight": ZeroGuide(), "left": ConstantGuide(0.5)}
     env = cone_env(guides)

@@ -2,7 +2,7 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build_env, build_guide
+from coil_rl.build import build_env, build_guides
 from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
 from coil_rl.guides.learned import LearnedGuide
@@ -32,8 +32,8 @@ def test_it_drives_as_the_policy_does_in_the_env_it_was_trained_in(run):
     config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
     overrides = {"num_cars": 3, "assignment": "cyclic"}
     alone = drive(build_env(config, overrides), agent)
-    guided = composed(*TINY, "method=guide", "guide=learned", f"guide.run={run}", "run_dir=unused")
-    learned = drive(build_env(guided, overrides), build_guide(guided))
+    guided = composed(*TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
+    learned = drive(build_env(guided, overrides), build_guides(guided)["learned"])
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in alone.episodes]
 
 
@@ -47,13 +47,13 @@ def test_it_is_a_guide_even_while_others_explore(run):
 
 def test_it_may_guide_another_agent(run, tmp_path):
     (tmp_path / "next").mkdir()
-    config = composed(*TINY, "method=coil", "guide=learned", f"guide.run={run}", f"run_dir={tmp_path / 'next'}")
+    config = composed(*TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", f"run_dir={tmp_path / 'next'}")
     train(config)
     assert (tmp_path / "next" / "evaluation.csv").exists()
 
 
 def test_a_folder_without_an_agent_is_refused(tmp_path):
-    with pytest.raises(UserError, match=r"guide.run=.* is not the folder of a run: it has no config.yaml"):
+    with pytest.raises(UserError, match=r"run=.* is not the folder of a run: it has no config.yaml"):
         LearnedGuide(str(tmp_path))
     train(composed(*TINY, "method=guide", f"run_dir={tmp_path}"))
     with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):

@@ -1,6 +1,7 @@
 """Every method is trained, judged, stopped, resumed and judged again by the same programs."""
 
 import csv
+import json
 import shutil
 from pathlib import Path
 
@@ -131,3 +132,11 @@ def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
     gathered, other = (dataset.load(run / "dataset") for run in (oil, dagger))
     assert len(gathered) == 64
     assert (gathered == other).all()
+
+
+def test_every_guide_of_several_is_driven_and_remembered(tmp_path):
+    run = trained(tmp_path / "run", "method=coil_multi", "guide=[zero,spline]")
+    assert [row["driver"] for row in rows(run)][::3] == ["guide zero", "guide spline", "coil_multi", "coil_multi"]
+    assert list(json.loads((run / "guide_return.json").read_text())) == ["guide zero", "guide spline"]
+    alone = trained(tmp_path / "alone", "method=guide")
+    assert rows(run, driver="guide spline")[0]["reward"] == rows(alone)[0]["reward"]

@@ -122,3 +122,12 @@ def test_labels_on_different_tracks_are_not_said_to_improve(tmp_path):
         make_run(tmp_path / label, label, 0, driven("guide", {label: 1.0}) + driven(label, {label: 1.0}))
     assert rows_of(tmp_path, against="b")["a", ""]["improvement"] is None
     assert len(compare(read_runs([tmp_path])).guides) == 2
+
+
+def test_several_guides_are_rows_of_their_own_and_the_best_is_the_line_to_beat(tmp_path):
+    good, bad = driven("guide spline", TRACKS), driven("guide random", {track: -100.0 for track in TRACKS})
+    make_run(tmp_path / "multi", "multi", 0, bad + good + driven("multi", TRACKS))
+    make_run(tmp_path / "other", "other", 0, good + driven("other", TRACKS))
+    rows = rows_of(tmp_path)
+    assert list(rows) == [("guide spline", ""), ("guide random", ""), ("multi", ""), ("other", "")]
+    assert rows["multi", ""]["guide"] == rows["other", ""]["guide"] == "guide spline"

@@ -32,7 +32,7 @@ def run(seed: int, rows: int = 40, every: int = 8) -> list[Row]:
     ],
 )
 def test_a_curve_is_a_picture(runs: dict[str, list[list[Row]]], tmp_path: Path) -> None:
-    draw_learning_curves(runs, tmp_path / "curve.png", guide=243.2, title="Learning")
+    draw_learning_curves(runs, tmp_path / "curve.png", guides={"guide": 243.2}, title="Learning")
     with Image.open(tmp_path / "curve.png") as image:
         assert image.size == (1600, 840)
         assert len(image.convert("RGB").getcolors(1 << 20) or []) > 50

@@ -23,7 +23,7 @@ def test_every_run_of_a_folder_is_read(sweep):
     assert (agent.driver, sampled.actions, zeroed.advice) == ("coil", "sampled", "zeroed")
     assert agent.values[:, MEASURES.index("reward")].tolist() == [521, 621], "without the row of the mean"
     assert agent.values[:, MEASURES.index("smoothness")].tolist() == [0.2, 0.2]
-    assert (runs[1].guide_return, runs[1].curve[0]["frames"], len(runs[1].curve)) == (300, 1000, 20)
+    assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == ({"guide": 300}, 1000, 20)
 
 
 def test_runs_are_found_at_any_depth_and_once(sweep):
@@ -39,7 +39,7 @@ def test_a_guide_alone_learns_nothing(tmp_path):
     (run / "guide_return.json").unlink()
     (found,) = read_runs([tmp_path])
     assert found.finished
-    assert (list(found.curve), found.guide_return, found.needs_guide) == ([], None, None)
+    assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
 @pytest.mark.parametrize(
