@@ -12,7 +12,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.signature import check_call, shown
+from coil_rl.signature import check_call, shown, takes
 from coil_rl.transforms import GuideActions
 
 
@@ -150,9 +150,21 @@ def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = Non
     return env
 
 
-def build_learner(config: DictConfig, env: EnvBase) -> Any:
-    """The learner of a configuration, observing what its method says of this env."""
-    return build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
+    """The learner of a configuration, observing what its method says of this env.
+
+    Args:
+        config: with `learner` and `method`.
+        env: as its agent sees it.
+        guides: those that it trains, if it does.
+    """
+    given: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
+    return build(config.learner, "learner", env=env, in_keys=list(config.method.observes), **given)
+
+
+def trains_guides(config: DictConfig) -> bool:
+    """Whether the learner of a configuration asks for guides, to improve them."""
+    return "guides" in takes(_target(config.learner.get("_target_"), "learner"))
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:

@@ -17,9 +17,19 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.build import build, build_all, build_bare_env, build_env, build_guides, build_learner, check_node
+from coil_rl.build import (
+    build,
+    build_all,
+    build_bare_env,
+    build_env,
+    build_guides,
+    build_learner,
+    check_node,
+    trains_guides,
+)
 from coil_rl.config import Train
 from coil_rl.errors import UserError
+from coil_rl.proxies import untrained
 from coil_rl.signature import near
 
 LARGEST = 2**63 - 1
@@ -115,7 +125,9 @@ def _check_training(config: DictConfig) -> None:
     if not config.method.observes:
         raise UserError("method.observes=[] lets the agent see nothing; name entries of the env, or null for no agent")
     env = build_env(config)
-    learner = build_learner(config, env)
+    if trains_guides(config) and config.degrade:
+        raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
+    learner = build_learner(config, env, untrained(config) if trains_guides(config) else None)
     frames = config.budget.cars * config.budget.steps
     minibatches = getattr(learner, "minibatches", 1)  # not every learner has them
     if minibatches > frames:

@@ -71,6 +71,7 @@ class Train(Common):
     label: str = MISSING
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
+    proxy: dict[str, Any] = field(default_factory=dict)
     watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: int = 10
     existing: str = "refuse"

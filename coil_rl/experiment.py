@@ -39,6 +39,17 @@ class Learner(Protocol):
         """Take over a state of `state_dict`."""
 
 
+class Probe(Protocol):
+    """What is measured now and then, because it takes long."""
+
+    @property
+    def unknown(self) -> dict[str, float]:
+        """NaN under each name that a call gives."""
+
+    def __call__(self) -> dict[str, float]:
+        """Measure."""
+
+
 class Experiment:
     """One training run in one folder.
 
@@ -55,6 +66,8 @@ class Experiment:
         logger: any TorchRL logger, besides the CSV.
         watch: name to key of entries logged as means over finished episodes ("episode") or over all steps ("step").
         checkpoint_every: updates between two checkpoints.
+        probe: looks at what learns besides the agent before the first update, when the learner says
+            `guides_changed`, and at the end.
     """
 
     EPISODES = 100  # the return is a mean over so many finished episodes
@@ -69,9 +82,11 @@ class Experiment:
         logger: Any | None = None,
         watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
         checkpoint_every: int = 10,
+        probe: Probe | None = None,
     ) -> None:
         self.learner, self.rollout, self.frames, self.folder = learner, rollout, frames, folder
         self.metrics, self.checkpoint_every = Metrics(folder / "metrics.csv", logger), checkpoint_every
+        self.probe = probe
         watch = watch or {}
         self.watch_episode = {name: ("next", *key) for name, key in watch.get("episode", {}).items()}
         self.watch_step = {name: ("next", *key) for name, key in watch.get("step", {}).items()}
@@ -107,7 +122,10 @@ class Experiment:
             total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
         ) as bar:
             while self.updates < updates:
+                before = self._probed(self.updates == 0)
                 row = self.update(self.updates / updates)
+                after = self._probed(self.updates == updates or bool(row.get("learner/guides_changed")))
+                row |= {name: before[name] if math.isnan(value) else value for name, value in after.items()}
                 self.rows.append(row)
                 self.metrics.append(row)
                 bar.update(frames)
@@ -137,6 +155,11 @@ class Experiment:
         with self._saying_how_to_go_on():
             check_losses(learned, self.updates)
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
+
+    def _probed(self, due: bool) -> dict[str, float]:
+        if self.probe is None:
+            return {}
+        return self.probe() if due else self.probe.unknown
 
     @contextmanager
     def _saying_how_to_go_on(self) -> Iterator[None]:

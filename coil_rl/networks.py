@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -21,6 +21,7 @@ class Joined(nn.Module):
     Args:
         env: for its specs.
         in_keys: the entries.
+        shapes: of those that the env does not write, without the batch.
 
     Attributes:
         width: D, length of the vector.
@@ -29,16 +30,16 @@ class Joined(nn.Module):
         KeyError: if the env has no such entry, naming those it has.
     """
 
-    def __init__(self, env: EnvBase, in_keys: Sequence[str]) -> None:
+    def __init__(self, env: EnvBase, in_keys: Sequence[str], shapes: Mapping[str, torch.Size] | None = None) -> None:
         super().__init__()
-        spec, batch = env.observation_spec, len(env.batch_size)
-        known = [key for key in spec.keys(True, True) if isinstance(key, str)]
+        spec, batch, others = env.observation_spec, len(env.batch_size), shapes or {}
+        known = [*(key for key in spec.keys(True, True) if isinstance(key, str)), *others]
         missing = [key for key in in_keys if key not in known]
         if missing:
             raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(known)}")
-        shapes = [spec[key].shape[batch:] for key in in_keys]
-        self.event_dims = [len(shape) for shape in shapes]
-        self.width = sum(shape.numel() for shape in shapes)
+        each = [others[key] if key in others else spec[key].shape[batch:] for key in in_keys]
+        self.event_dims = [len(shape) for shape in each]
+        self.width = sum(shape.numel() for shape in each)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[*batch, ...] each to [*batch, D]."""
@@ -77,11 +78,20 @@ class Network(nn.Module):
         hidden: widths of the hidden layers.
         outputs: width of the last layer.
         gain: size of the last layer's weights.
+        shapes: as for `Joined`.
     """
 
-    def __init__(self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], outputs: int, gain: float) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[str],
+        hidden: Sequence[int],
+        outputs: int,
+        gain: float,
+        shapes: Mapping[str, torch.Size] | None = None,
+    ) -> None:
         super().__init__()
-        self.joined = Joined(env, in_keys)
+        self.joined = Joined(env, in_keys, shapes)
         self.layers = tanh_layers(self.joined.width, outputs, hidden, gain, env.device)
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -130,7 +140,12 @@ class Keyed(TensorDictModuleBase):
 
 
 def actor(
-    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5, gain: float = 0.01
+    env: EnvBase,
+    in_keys: Sequence[str],
+    hidden: Sequence[int] = (64, 64),
+    scale: float = 0.5,
+    gain: float = 0.01,
+    shapes: Mapping[str, torch.Size] | None = None,
 ) -> ProbabilisticActor:
     """A stochastic policy for the env's action: a squashed normal where actions are bounded, else a normal or a choice.
 
@@ -142,6 +157,7 @@ def actor(
         hidden: widths of the hidden layers.
         scale: standard deviation at the start, before squashing.
         gain: size of the last layer's weights at the start.
+        shapes: as for `Joined`.
 
     Returns:
         A module that writes `action` and `action_log_prob`.
@@ -149,7 +165,7 @@ def actor(
     spec = env.action_spec
     discrete = isinstance(spec, (Categorical, OneHot))
     size = spec.space.n if discrete else spec.shape[-1]
-    network = Network(env, in_keys, hidden, size, gain)
+    network = Network(env, in_keys, hidden, size, gain, shapes)
     common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
     if discrete:
         module = Keyed(network, in_keys, ["logits"])

@@ -45,14 +45,14 @@ def check_call(called: Callable[..., Any], node: Mapping[str, Any], name: str, g
     parameters = _parameters(called)
     if parameters is None:
         return
-    takes = [p.name for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    known = takes(called)
     anything = any(p.kind is p.VAR_KEYWORD for p in parameters)
-    for key in sorted(keys.difference(takes)):
+    for key in sorted(keys.difference(known)):
         if not anything or key.startswith("_"):
             raise UserError(
-                f"{name}: {title} takes no {key}; it takes {', '.join(takes) or 'nothing'}{near(key, takes)}"
+                f"{name}: {title} takes no {key}; it takes {', '.join(known) or 'nothing'}{near(key, known)}"
             )
-    lacks = [p.name for p in parameters if p.default is p.empty and p.name in takes and p.name not in {*keys, *given}]
+    lacks = [p.name for p in parameters if p.default is p.empty and p.name in known and p.name not in {*keys, *given}]
     if lacks and "_partial_" not in node:
         raise UserError(f"{name}: {title} needs {', '.join(lacks)}; give {name}.{lacks[0]}=VALUE")
     hints = _hints(called)
@@ -60,6 +60,11 @@ def check_call(called: Callable[..., Any], node: Mapping[str, Any], name: str, g
         if not fits(node[key], hints[key]):
             path, value, hint = _narrowed(key, node[key], hints[key])
             raise UserError(f"{name}: {path}={shown(value)} must be {describe(hint)}")
+
+
+def takes(called: Callable[..., Any]) -> list[str]:
+    """The names of the arguments of what is called, as far as it tells."""
+    return [p.name for p in _parameters(called) or () if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
 
 
 def near(given: str, known: Iterable[str]) -> str:
@@ -130,18 +135,30 @@ def _narrowed(path: str, value: Any, hint: Any) -> tuple[str, Any, Any]:
 
 
 def _parameters(called: Callable[..., Any]) -> list[inspect.Parameter] | None:
-    """What is called takes, as far as it tells."""
+    """What is called takes, as far as it tells; what a class of ours hands on, its base takes."""
     try:
         # Of a class with a metaclass that can be called, as TorchRL's envs, `signature` sees the metaclass only.
         if inspect.isclass(called) and called.__init__ is not object.__init__:
-            return list(inspect.signature(called.__init__).parameters.values())[1:]
+            own = list(inspect.signature(called.__init__).parameters.values())[1:]
+            if _hands_on(called) and (rest := _parameters(called.__bases__[0])) is not None:
+                names = {parameter.name for parameter in own}
+                own = [p for p in own if p.kind is not p.VAR_KEYWORD] + [p for p in rest if p.name not in names]
+            return own
         return list(inspect.signature(called).parameters.values())
     except ValueError:
         return None
 
 
+def _hands_on(called: type) -> bool:
+    parameters = inspect.signature(vars(called).get("__init__", called)).parameters.values()
+    return called.__module__.startswith("coil_rl.") and any(p.kind is p.VAR_KEYWORD for p in parameters)
+
+
 def _hints(called: Any) -> dict[str, Any]:
     try:
-        return get_type_hints(called.__init__ if inspect.isclass(called) else called)
+        own = get_type_hints(called.__init__ if inspect.isclass(called) else called)
+        if inspect.isclass(called) and _hands_on(called):
+            return _hints(called.__bases__[0]) | own
+        return own
     except (AttributeError, NameError, TypeError):  # annotations that only a type checker can resolve
         return {}

@@ -13,10 +13,12 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl import checkpoint
-from coil_rl.build import build_learner
+from coil_rl.build import build_env, build_guides, build_learner, trains_guides
 from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.sentence import sentence
+
+PROXIES = "proxies"  # where a run keeps networks that stand for its guides
 
 
 def configuration(folder: Path, key: str, instead: Mapping[str, Any] | None = None) -> DictConfig:
@@ -58,7 +60,7 @@ def policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") 
     Raises:
         UserError: if it has no such policy, or one that does not fit.
     """
-    learner = build_learner(config, env)
+    learner = build_learner(config, env, guides(folder, config) if trains_guides(config) else None)
     weights = folder / f"policy_{which}.pt"
     try:
         learner.policy.load_state_dict(checkpoint.load(weights, config.device))
@@ -68,3 +70,22 @@ def policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") 
         ) from error
     restored: TensorDictModuleBase = learner.policy
     return restored
+
+
+def guides(folder: Path, config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """The guides of a run that trains them, as they were before: where it has a proxy of one, that.
+
+    Args:
+        folder: of the run.
+        config: its configuration.
+
+    Raises:
+        UserError: if a proxy cannot be used.
+    """
+    found = build_guides(config)
+    for name in found:
+        proxy = folder / PROXIES / name
+        if proxy.exists():
+            of_proxy = configuration(proxy, f"the proxy of guide.{name}", {"device": config.device})
+            found[name] = policy(proxy, of_proxy, build_env(of_proxy))
+    return found

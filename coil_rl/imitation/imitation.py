@@ -115,7 +115,9 @@ class Imitation:
 
         Returns:
             `samples` of the data set; `target_variance`, the mean squared error of always predicting the mean;
-            `mse_training` and `r2_training`, of the samples learned from; with `validate`, what `cross_validated` says.
+            `mse_ahead` and `r2_ahead`, of this batch before it is learned from: where the policy itself drove, that is
+            how well it does what the guide would; `mse_training` and `r2_training`, of the samples learned from; with
+            `validate`, what `cross_validated` says.
 
         Raises:
             UserError: if the data cannot be validated.
@@ -125,6 +127,9 @@ class Imitation:
         self.dataset = dataset
         x, y = self.joined(*(dataset[key] for key in self.in_keys)), dataset["action"]
         metrics = {"samples": float(len(y)), "target_variance": float(y.var(0, correction=0).mean())}
+        with torch.no_grad():
+            ahead = self.regressor(self.joined(*(pairs[key] for key in self.in_keys)))
+            metrics |= scores([ahead], [pairs["action"]], "ahead")
         if self.validate:
             groups = None if self.group_key is None else dataset[self.group_key].reshape(-1)
             metrics |= cross_validated(self.regressor, x, y, groups, self.seed)

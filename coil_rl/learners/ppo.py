@@ -12,6 +12,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
 
@@ -85,7 +87,7 @@ class PPO:
         for name, number in {"action_scale": action_scale, "clip": clip, "max_grad_norm": max_grad_norm}.items():
             if not 0 < number < math.inf:
                 raise ValueError(f"{name}={number} must be a finite number of more than 0")
-        self.policy = networks.actor(env, in_keys, hidden, action_scale, action_gain)
+        self.policy = self.build_policy(env, in_keys, hidden, action_scale, action_gain)
         self.critic = networks.critic(env, in_keys, hidden)
         self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
         for name, number in {"learning_rate": self.learning_rate(0), "entropy": self.entropy(0)}.items():
@@ -105,17 +107,35 @@ class PPO:
             functional=False,
         )
         self.losses = torch.compile(self.loss.__call__) if compile else self.loss
-        self.parameters = [p for p in self.loss.parameters() if p.requires_grad]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
+        groups = self.groups()
+        self.parameters = [parameter for group in groups for parameter in group]
+        of_group = [{"params": group, "lr": rate} for group, rate in zip(groups, self.rates(0), strict=True)]
+        self.optimiser = torch.optim.Adam(of_group, eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
         self.auxiliary = list(auxiliary)
         # Where a guide acts in some of the steps, the env says in which.
         self.shares_control = "agent_acts" in env.observation_spec
         beside = [key for auxiliary in self.auxiliary for key in auxiliary.keys]
-        before = [*in_keys, "action", "action_log_prob", *beside, *(["agent_acts"] if self.shares_control else [])]
+        seen = dict.fromkeys([*in_keys, *self.policy.in_keys])
+        acts = ["agent_acts"] if self.shares_control else []
+        before = [*seen, "action", "action_log_prob", *beside, *acts]
         after = [*in_keys, "reward", "done", "terminated"]
         self.keys = [*before, *(("next", key) for key in after)]
         self.learned_from = [*before, "advantage", "value_target"]
+
+    def build_policy(
+        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
+    ) -> ProbabilisticTensorDictSequential:
+        """The network that acts."""
+        return networks.actor(env, in_keys, hidden, scale, gain)
+
+    def groups(self) -> list[list[nn.Parameter]]:
+        """The parameters that learn, those together that learn at one rate."""
+        return [[p for p in self.loss.parameters() if p.requires_grad]]
+
+    def rates(self, progress: float) -> list[float]:
+        """The learning rate of each group."""
+        return [self.learning_rate(progress)]
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts.
@@ -128,8 +148,8 @@ class PPO:
         Returns:
             Means over the update of each loss, the approximate KL divergence and the share of clipped ratios.
         """
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
+        for group, rate in zip(self.optimiser.param_groups, self.rates(progress), strict=True):
+            group["lr"] = rate
         if self.loss.entropy_bonus:
             self.loss.entropy_coeff.fill_(self.entropy(progress))
         self.advantage(batch)

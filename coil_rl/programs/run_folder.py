@@ -21,15 +21,19 @@ UNLIKE = ("run_dir", "logger", "existing", "defaults")
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Keep every other process from writing a run there until the block ends, or this process does.
+
+    Args:
+        folder: of the run; it is made.
+        wait: for a process that has claimed it, instead of refusing.
 
     Raises:
         UserError: if another process has claimed the folder.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
-        with FileLock(folder / ".lock", timeout=0):
+        with FileLock(folder / ".lock", timeout=-1 if wait else 0):
             remove_unfinished(folder)
             yield
     except Timeout:

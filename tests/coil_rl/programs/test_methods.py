@@ -21,7 +21,10 @@ METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "me
 TINY = ["track=generated", "track.train.count=1", "track.test.count=2", "env.laps=1", "env.time_limit=2",
         "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "checkpoint_every=1",
         "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
-IMITATION = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
+SMALL_PROXY = ["guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16",
+               "proxy.learner.regressor.epochs=1"]  # fmt: skip
+QUICK = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
+QUICK |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
 
 
 def trained(folder, *overrides):
@@ -32,9 +35,14 @@ def trained(folder, *overrides):
     return folder
 
 
+@pytest.fixture(scope="module")
+def proxies(tmp_path_factory):
+    return f"proxy.folder={tmp_path_factory.mktemp('proxies')}"
+
+
 @pytest.mark.parametrize("method", METHODS)
-def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, tmp_path, capsys):
-    run = trained(tmp_path / "run", f"method={method}", *IMITATION.get(method, []))
+def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies, tmp_path, capsys):
+    run = trained(tmp_path / "run", f"method={method}", proxies, *QUICK.get(method, []))
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
     for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
