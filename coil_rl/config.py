@@ -125,9 +125,21 @@ class Report:
     seed: int = 0
 
 
+@dataclass
+class Listen(Common):
+    """Configuration of `coil-listen`."""
+
+    run: str = MISSING
+    donors: int = 16
+    turn_radius: float = 10.0
+    approach: float = 4.0
+    bin: float = 1.0
+
+
 REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
 ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
 ConfigStore.instance().store(name="schema", node=Train)
 ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
 ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
 ConfigStore.instance().store(name="report_schema", node=Report)
+ConfigStore.instance().store(name="listen_schema", node=Listen)

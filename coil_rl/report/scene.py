@@ -45,10 +45,17 @@ class Scene:
         legend: the handles that explain what will be drawn on the tracks; those of the tracks themselves are added.
         title: above everything.
         dpi: pixels per inch of the 8 inches.
+        groups: of equally many tracks; each begins a row.
     """
 
     def __init__(
-        self, tracks: Sequence[Track], *, legend: Sequence[Line2D] = (), title: str | None = None, dpi: int
+        self,
+        tracks: Sequence[Track],
+        *,
+        legend: Sequence[Line2D] = (),
+        title: str | None = None,
+        dpi: int,
+        groups: int = 1,
     ) -> None:
         if not tracks:
             raise ValueError("A picture of driven lines needs at least one track, none was given.")
@@ -58,7 +65,8 @@ class Scene:
             edges = [np.vstack([track.boundary("left", 0.25), track.boundary("right", 0.25)]) for track in tracks]
             lows = np.array([edge.min(axis=0) for edge in edges]) - 2 * CONE_RADIUS
             sizes = np.array([edge.max(axis=0) for edge in edges]) + 2 * CONE_RADIUS - lows
-            rows = np.array_split(np.arange(len(tracks)), -(-len(tracks) // MOST_IN_A_ROW))
+            grouped = np.arange(len(tracks)).reshape(groups, -1)
+            rows = [row for group in grouped for row in np.array_split(group, -(-len(group) // MOST_IN_A_ROW))]
             room = [style.WIDTH - 2 * style.MARGIN - (len(row) - 1) * GAP for row in rows]
             fits = [width / sizes[row, 0].sum() for width, row in zip(room, rows, strict=True)]
             self.scale = float(min(*fits, TALLEST / sizes[:, 1].max()))

@@ -1,0 +1,122 @@
+import contextlib
+import csv
+import io
+import logging
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from PIL import Image
+
+from coil_rl import checkpoint
+from coil_rl.build import build_env, build_learner
+from coil_rl.programs import listen
+
+TRACKS = ["track=generated", "track.test.count=1", "track.train.count=1"]
+FEW = [*TRACKS, "evaluation.repeats=1", "donors=2"]
+FILES = {
+    "listening.csv", "listening.md", "listening.png", "listening_agreement.png", "listening_gradient.png",
+    "listening_places.csv",
+}  # fmt: skip
+
+
+def make_run(folder, *overrides):
+    """What coil-train leaves, as far as coil-listen reads it; the agent has learned nothing."""
+    folder.mkdir()
+    torch.manual_seed(0)
+    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*TRACKS, "env.time_limit=2", *overrides, f"run_dir={folder}"])
+    if config.method.observes is not None:
+        policy = build_learner(config, build_env(config)).policy
+        checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
+    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    kept.logger = None
+    OmegaConf.save(kept, folder / "config.yaml")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    make_run(folder / "coil", "method=coil", "guide=[spline,random]", "learner.action_gain=1.0")
+    make_run(folder / "ppo", "method=ppo")
+    make_run(folder / "guide", "method=guide")
+    return folder
+
+
+@pytest.fixture
+def here(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    yield tmp_path
+    logging.getLogger().handlers.clear()
+
+
+def outcome(*arguments):
+    """Exit code, and what stands on standard output and error."""
+    out, error, code, given = io.StringIO(), io.StringIO(), 0, sys.argv
+    sys.argv = ["listen", *arguments]
+    try:
+        with contextlib.redirect_stderr(error), contextlib.redirect_stdout(out):
+            listen.main()
+    except SystemExit as end:
+        code = end.code
+    finally:
+        sys.argv = given
+    return code, out.getvalue(), error.getvalue()
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_listen_prints_the_table_and_leaves_maps_and_numbers(runs, here):
+    code, out, _ = outcome(f"run={runs / 'coil'}", *FEW, "hydra.run.dir=found")
+    assert code == 0
+    assert {path.name for path in Path("found").iterdir() if path.is_file()} == FILES
+    assert out.startswith((Path("found") / "listening.md").read_text())
+    last = out.splitlines()[-1]
+    assert last.startswith("coil listens most to ")
+    assert last.endswith(f"; see {here / 'found'}")
+    table = rows_of(Path("found") / "listening_places.csv")
+    assert {row["guide"] for row in table} == {"spline", "random"}
+    assert next(row["place"] for row in table if row["guide"] == "spline") == "everywhere"
+    assert {row["guide"] for row in rows_of(Path("found") / "listening.csv")} == {"spline", "random"}
+    for name in FILES:
+        if name.endswith(".png"):
+            with Image.open(Path("found") / name) as image:
+                assert image.width == 1600
+
+
+@pytest.mark.slow
+def test_all_numbers_come_out_again(runs, here):
+    for folder in ("one", "other"):
+        assert outcome(f"run={runs / 'coil'}", *FEW, f"hydra.run.dir={folder}")[0] == 0
+    for name in ("listening.csv", "listening_places.csv", "listening.md"):
+        assert (Path("one") / name).read_bytes() == (Path("other") / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "run must be given: write run=VALUE"),
+        ("run=null", "run=null must be text"),
+        ("run=nowhere", "run=nowhere is not the folder of a run: it has no config.yaml"),
+        ("run={runs}/ppo", "has nobody to listen to: the policy does not read guide_action; it reads observation"),
+        ("run={runs}/guide", "has no agent: its guide drives alone; give a run that sees advice"),
+        ("run={runs}/coil donors=0", "donors=0 must be between 1 and 10000"),
+        ("run={runs}/coil bin=0", "bin=0.0 must be between 0.1 and 100.0"),
+        ("run={runs}/coil turn_radius=-1", "turn_radius=-1.0 must be between 0.5 and 1000.0"),
+        ("run={runs}/coil donor=1", "no key donor; the configuration has"),
+    ],
+)
+def test_mistakes_are_one_sentence_exit_code_2_and_leave_nothing(arguments, words, runs, here):
+    code, _, error = outcome(*arguments.format(runs=runs).split(), *TRACKS)
+    (sentence,) = error.splitlines()
+    assert code == 2
+    assert sentence.startswith("listen: ")
+    assert words in sentence
+    assert not list(here.iterdir())
