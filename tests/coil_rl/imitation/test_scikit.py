@@ -6,7 +6,12 @@ import pytest
 import skops.io
 import torch
 from sklearn.cluster import KMeans
-from sklearn.ensemble import GradientBoostingRegressor, HistGradientBoostingRegressor, RandomForestRegressor
+from sklearn.ensemble import (
+    ExtraTreesRegressor,
+    GradientBoostingRegressor,
+    HistGradientBoostingRegressor,
+    RandomForestRegressor,
+)
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.multioutput import MultiOutputRegressor
@@ -78,6 +83,25 @@ def test_a_forest_is_fitted_by_its_threads_and_asked_by_one():
     regressor, alone = fitted(RandomForestRegressor(4, n_jobs=2)), fitted(RandomForestRegressor(4))
     assert (regressor.estimator.n_jobs, regressor.model.n_jobs) == (2, 1)
     assert torch.equal(regressor(data()[0]), alone(data()[0]))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("forest", [RandomForestRegressor, ExtraTreesRegressor])
+def test_the_trees_of_a_forest_say_what_the_forest_says(forest, outputs, monkeypatch):
+    regressor = Sklearn(forest(8)).fresh(4, outputs)
+    regressor.load_state_dict(fitted(forest(8), outputs).state_dict())
+    x = torch.randn(300, 4, generator=torch.Generator().manual_seed(1))
+    expected = torch.from_numpy(regressor.model.predict(x.numpy())).float().reshape(300, outputs)
+    monkeypatch.setattr(forest, "predict", None)
+    assert torch.equal(regressor(x), expected)
+
+
+def test_a_forest_refuses_what_scikit_learn_refuses():
+    regressor = fitted(RandomForestRegressor(4))
+    with pytest.raises(ValueError, match="contains infinity"):
+        regressor(torch.full((3, 4), torch.inf))
+    with pytest.raises(ValueError, match="has 3 features, but RandomForestRegressor is expecting 4"):
+        regressor(torch.zeros(2, 3))
 
 
 def test_an_unknown_type_is_neither_kept_nor_read():
