@@ -33,10 +33,10 @@ bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='device=cuda'
 	$(BIN)/coil-benchmark $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m '' $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m '' $(ARGS)
 
 kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
 	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)

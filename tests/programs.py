@@ -1,5 +1,9 @@
-"""The console programs in processes of their own, and the smallest run that goes through all of coil-train."""
+"""The console programs, in this process or in one of their own, and the smallest run of all of coil-train."""
 
+import contextlib
+import importlib
+import io
+import logging
 import os
 import subprocess
 import sys
@@ -7,13 +11,47 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-TINY = ["budget.frames=512", "budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1",
-        "track.test.count=1", "env.laps=1", "evaluation.repeats=1", "logger=none"]  # fmt: skip
+RINGS = ROOT / "tests" / "rings"
+TRACK = ["track=folder", f"track.dir={RINGS / 'narrow.csv'}"]
+LAP = [*TRACK, "env.laps=1", "env.rate=6"]
+TINY = [*LAP, "budget.frames=512", "budget.cars=8", "budget.steps=32", "evaluation.repeats=1", "logger=none"]
+
+
+def command(name, *arguments):
+    return [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
+
+
+def environment(cwd):
+    # One after the other, as PYTHONPATH may hold packages that the tests were given.
+    return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")])}
 
 
 def program(name, *arguments, cwd, code=0):
-    command = [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd)])}
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=300, check=False)
+    """What a program does as a person starts it, in a process of its own; importing PyTorch takes it seconds."""
+    done = subprocess.run(
+        command(name, *arguments),
+        cwd=cwd,
+        env=environment(cwd),
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
     assert done.returncode == code, done.stderr
     return done
+
+
+def called(name, *arguments, cwd=".", code=0):
+    """The same in this process; None is any exit code."""
+    out, error, ended, given = io.StringIO(), io.StringIO(), 0, sys.argv
+    sys.argv = [name, *arguments]
+    try:
+        with contextlib.chdir(cwd), contextlib.redirect_stderr(error), contextlib.redirect_stdout(out):
+            importlib.import_module(f"coil_rl.programs.{name}").main()
+    except SystemExit as end:
+        ended = end.code
+    finally:
+        sys.argv = given
+        logging.getLogger().handlers.clear()
+    assert code is None or ended == code, error.getvalue()
+    return subprocess.CompletedProcess(sys.argv, ended, out.getvalue(), error.getvalue())

@@ -78,27 +78,27 @@ def test_wheel_takes_one_import_name_only(wheel: Path) -> None:
     assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
 
 
-def test_installed_wheel_imports_from_another_folder(installed: Path, tmp_path: Path) -> None:
+def test_installed_wheel_imports_and_its_programs_run_from_another_folder(installed: Path, tmp_path: Path) -> None:
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    for target in scripts.values():
+        module = target.removesuffix(":main")
+        assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
+    # One process for both, because importing PyTorch takes it seconds.
     program = """
 import importlib.resources
 import coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms
 for module in (coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms):
     print(module.__file__)
 print(importlib.resources.files("coil_rl.conf").joinpath("a", "b", "planted.yaml"))
+from coil_rl.programs.train import main
+main()
 """
-    lines = run(sys.executable, "-c", program, cwd=tmp_path, pythonpath=installed).splitlines()
+    tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "hydra.run.dir=run"]
+    out = run(sys.executable, "-c", program, *tiny, cwd=tmp_path, pythonpath=installed)
+    lines = out.splitlines()[:5]
     outside = [line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())]
     assert (len(lines), outside) == (5, [])
     assert all(Path(line).is_file() for line in lines)
-
-
-def test_programs_of_the_wheel_run_from_another_folder(installed: Path, tmp_path: Path) -> None:
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    for target in scripts.values():
-        module = target.removesuffix(":main")
-        assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
-    tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "hydra.run.dir=run"]
-    out = run(sys.executable, "-m", "coil_rl.programs.train", *tiny, cwd=tmp_path, pythonpath=installed)
     assert "test_3" in out, "the shipped tracks should have come from the wheel"
 
 

@@ -8,23 +8,23 @@ from coil_rl.transforms import GuideActions
 
 
 def rollout(seed=0, steps=6, keys=None):
-    env = ConeTrackEnv(shipped_tracks("train"), 5, seed=seed)
+    env = ConeTrackEnv(shipped_tracks("train"), 5, seed=seed, rate=8)
     env = TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), RewardSum()))
     return Rollout(env, RandomGuide(-1, 0.2, seed=seed), steps, keys)
 
 
 def test_batches_follow_one_another():
-    long, short = rollout(steps=120), rollout(steps=40)
+    long, short = rollout(steps=60), rollout(steps=20)
     parts = torch.cat([short.collect() for _ in range(3)], 1)
     whole = long.collect()
     assert whole["next", "done"].any()
     assert (whole == parts).all()
-    assert whole.batch_size == (5, 120)
-    assert long.frames == 600
+    assert whole.batch_size == (5, 60)
+    assert long.frames == 300
 
 
 def test_next_of_a_step_is_the_step_after_it_unless_the_episode_ended():
-    batch = rollout(steps=150).collect()
+    batch = rollout(steps=60).collect()
     after, now = batch["next", "observation"][:, :-1], batch["observation"][:, 1:]
     going_on = ~batch["next", "done"][:, :-1].squeeze(-1)
     assert torch.equal(after[going_on], now[going_on])
@@ -44,5 +44,6 @@ def test_state_dict_goes_on_in_another_rollout():
     first.collect()
     second.load_state_dict(first.state_dict())
     second.policy.load_state_dict(first.policy.state_dict())
-    for _ in range(30):
-        assert (first.collect() == second.collect()).all()
+    batches = [(first.collect(), second.collect()) for _ in range(10)]
+    assert all((one == other).all() for one, other in batches)
+    assert any(one["next", "done"].any() for one, _ in batches)

@@ -22,8 +22,8 @@ def linears(module):
     return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
-@pytest.fixture(params=["ppo", "coil"])
-def pair(request, ring):
+@pytest.fixture(scope="module", params=["ppo", "coil"])
+def made(request, ring):
     """Both learners with the same weights, and a batch that the plain one collected, in the language of each."""
     torch.manual_seed(0)
     guide = SplineGuide() if request.param == "coil" else None
@@ -39,6 +39,11 @@ def pair(request, ring):
     plain.log_scale.data.copy_(ours.policy.module[0].module.log_scale)
     batch = plain.collect()
     return plain, ours, batch
+
+
+@pytest.fixture
+def pair(made):
+    return copy.deepcopy(made)
 
 
 def in_torchrl(batch: Batch, ours: PPO) -> TensorDict:

@@ -22,7 +22,7 @@ def test_one_car_drives_a_lap_and_starts_anew(monkeypatch):
         return outcomes[-1]
 
     monkeypatch.setattr(oracle.OneCar, "step", remember)
-    drive = yardsticks.one_car(oracle, benchmark_config("env.laps=1"))
+    drive = yardsticks.one_car(oracle, benchmark_config("env.laps=1", "env.rate=8"))
     while not any(outcome.terminated for outcome in outcomes):
         assert drive() == yardsticks.ORACLE_STEPS
     assert not any(outcome.crashed for outcome in outcomes)

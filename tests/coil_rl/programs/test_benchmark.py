@@ -1,30 +1,17 @@
 import importlib.util
 import json
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 from PIL import Image
+from programs import called, program
 
-ROOT = Path(__file__).parents[3]
 PARTS = ["start", "memory", "env", "training", "shares", "oracle", "sb3", "profile"]
-
-
-def program(*arguments, cwd, code=0):
-    command = [sys.executable, "-m", "coil_rl.programs.benchmark", *arguments]
-    # One after the other, as PYTHONPATH may hold packages that the tests were given.
-    paths = [str(ROOT), os.environ.get("PYTHONPATH", "")]
-    env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
-    done = subprocess.run(command, cwd=cwd, env=env, capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == code, done.stderr
-    return done
 
 
 @pytest.mark.slow
 def test_quick_benchmark_measures_everything(tmp_path):
-    done = program("quick=true", "track=generated", "track.train.count=1", "hydra.run.dir=run", cwd=tmp_path)
+    arguments = ["quick=true", "track=generated", "track.train.count=1", "hydra.run.dir=run"]
+    done = program("benchmark", *arguments, cwd=tmp_path)
     found = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     assert set(found) == {"versions", "settings", "goals", *PARTS}
     assert found["settings"]["repeats"] == 2
@@ -56,7 +43,7 @@ def test_quick_benchmark_measures_everything(tmp_path):
     assert "Traceback" not in done.stderr
     with Image.open(tmp_path / "run" / "benchmark.png") as image:
         assert image.width >= 600
-    again = program("parts=[start]", "hydra.run.dir=run", cwd=tmp_path, code=2)
+    again = program("benchmark", "parts=[start]", "hydra.run.dir=run", cwd=tmp_path, code=2)
     assert "already holds a benchmark" in again.stderr
 
 
@@ -69,6 +56,6 @@ def test_quick_benchmark_measures_everything(tmp_path):
     ],
 )
 def test_mistakes_are_one_sentence_and_exit_code_2(arguments, words, tmp_path):
-    done = program(*arguments, cwd=tmp_path, code=2)
+    done = called("benchmark", *arguments, cwd=tmp_path, code=2)
     (sentence,) = done.stderr.strip().splitlines()
     assert words in sentence

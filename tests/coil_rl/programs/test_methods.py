@@ -18,16 +18,18 @@ from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
-TINY = ["track=generated", "track.train.count=1", "track.test.count=2", "env.laps=1", "env.time_limit=2",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "checkpoint_every=1",
-        "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
-SMALL_PROXY = ["guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16",
+TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
+TINY = [*TRACKS, "env.laps=1", "env.time_limit=1", "env.rate=12", "evaluation.repeats=1", "evaluation.gif=false",
+        "logger=none", "checkpoint_every=1", "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
+PPO = ["learner.epochs=2", "learner.minibatches=2"]
+SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16",
                "proxy.learner.regressor.epochs=1"]  # fmt: skip
-QUICK = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
-QUICK |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
+SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
+SMALL |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
 
 
-def trained(folder, *overrides):
+def trained(folder, method, *overrides):
+    overrides = [f"method={method}", *SMALL.get(method, PPO), *overrides]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("train", [*TINY, *overrides, f"run_dir={folder}"])
     check(config)
@@ -42,7 +44,7 @@ def proxies(tmp_path_factory):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies, tmp_path, capsys):
-    run = trained(tmp_path / "run", f"method={method}", proxies, *QUICK.get(method, []))
+    run = trained(tmp_path / "run", method, proxies)
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
     for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
@@ -57,7 +59,12 @@ def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies,
 
 @pytest.fixture(scope="module")
 def residual(tmp_path_factory):
-    return trained(tmp_path_factory.mktemp("runs") / "residual", "method=residual", "label=mine")
+    return trained(tmp_path_factory.mktemp("runs") / "residual", "residual", "label=mine")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("runs") / "ppo", "ppo")
 
 
 def rows(folder, **where):
@@ -71,16 +78,16 @@ def test_a_run_goes_by_its_label(residual):
 
 def test_a_run_that_is_there_is_not_trained_again_where_that_is_asked_for(residual, capsys):
     before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
-    trained(residual, "method=residual", "label=mine", "existing=resume")
+    trained(residual, "residual", "label=mine", "existing=resume")
     assert {file: file.stat().st_mtime_ns for file in before} == before
     assert "mine: mean test reward" in capsys.readouterr().out
     with pytest.raises(UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9; choose another"):
-        trained(residual, "method=residual", "label=mine", "existing=resume", "learner.gamma=0.9")
+        trained(residual, "residual", "label=mine", "existing=resume", "learner.gamma=0.9")
 
 
 def test_a_trained_agent_is_judged_with_other_advice_too(residual, tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("evaluate", [*TINY[:3], f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
+        config = compose("evaluate", [*TRACKS, f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
                                       "degrade=[zeroed,adversarial]"])  # fmt: skip
     evaluate.evaluate(config)
     normal, zeroed, adversarial = (
@@ -92,15 +99,14 @@ def test_a_trained_agent_is_judged_with_other_advice_too(residual, tmp_path):
 
 
 def test_a_degraded_guide_is_judged_as_it_advises(tmp_path):
-    run = trained(tmp_path / "run", "method=guide", "degrade=[adversarial]")
-    alone = trained(tmp_path / "alone", "method=guide")
+    run = trained(tmp_path / "run", "guide", "degrade=[adversarial]")
+    alone = trained(tmp_path / "alone", "guide")
     assert rows(run)[0]["reward"] != rows(alone)[0]["reward"]
 
 
-def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path):
+def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path, plain):
     """Its numbers before the first update are plain PPO's, whatever the coupling costs."""
-    coupled = trained(tmp_path / "rfc", "method=rfc", "method.transforms.coupling.beta=1000")
-    plain = trained(tmp_path / "ppo", "method=ppo")
+    coupled = trained(tmp_path / "rfc", "rfc", "method.transforms.coupling.beta=1000")
     first, other = (next(csv.DictReader((run / "metrics.csv").open(newline=""))) for run in (coupled, plain))
     same = [key for key in other if key.startswith("train/")]
     assert {key: first[key] for key in same} == {key: other[key] for key in same}
@@ -108,15 +114,14 @@ def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path):
     assert first["learner/loss_critic"] != other["learner/loss_critic"]
 
 
-def test_jump_start_of_no_steps_is_ppo_to_the_bit(tmp_path):
-    jumped = trained(tmp_path / "jump", "method=jump_start", "method.transforms.jump_start.horizon=0")
-    plain = trained(tmp_path / "ppo", "method=ppo")
+def test_jump_start_of_no_steps_is_ppo_to_the_bit(tmp_path, plain):
+    jumped = trained(tmp_path / "jump", "jump_start", "method.transforms.jump_start.horizon=0")
     first, other = (torch.load(run / "policy_last.pt", weights_only=True) for run in (jumped, plain))
     assert all(torch.equal(first[key], other[key]) for key in other)
 
 
 def test_residual_of_scale_zero_is_the_guide_exactly(tmp_path):
-    run = trained(tmp_path / "run", "method=residual", "method.transforms.residual.scale=0")
+    run = trained(tmp_path / "run", "residual", "method.transforms.residual.scale=0")
     guide, agent = rows(run, driver="guide"), rows(run, driver="residual", actions="deterministic")
     assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
 
@@ -130,21 +135,21 @@ def test_driving_leaves_what_is_only_for_learning_out(residual):
 
 def compose_evaluate(run):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("evaluate", [*TINY[:3], f"run={run}", "run_dir=unused"])
+        return compose("evaluate", [*TRACKS, f"run={run}", "run_dir=unused"])
 
 
 def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
-    given = ["learner=linear", "learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
-    oil = trained(tmp_path / "oil", "method=oil", *given)
-    dagger = trained(tmp_path / "dagger", "method=dagger", *given)
+    given = ["learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
+    oil = trained(tmp_path / "oil", "oil", *given)
+    dagger = trained(tmp_path / "dagger", "dagger", *given)
     gathered, other = (dataset.load(run / "dataset") for run in (oil, dagger))
     assert len(gathered) == 64
     assert (gathered == other).all()
 
 
 def test_every_guide_of_several_is_driven_and_remembered(tmp_path):
-    run = trained(tmp_path / "run", "method=coil_multi", "guide=[zero,spline]")
+    run = trained(tmp_path / "run", "coil_multi", "guide=[zero,spline]")
     assert [row["driver"] for row in rows(run)][::3] == ["guide zero", "guide spline", "coil_multi", "coil_multi"]
     assert list(json.loads((run / "guide_return.json").read_text())) == ["guide zero", "guide spline"]
-    alone = trained(tmp_path / "alone", "method=guide")
+    alone = trained(tmp_path / "alone", "guide")
     assert rows(run, driver="guide spline")[0]["reward"] == rows(alone)[0]["reward"]

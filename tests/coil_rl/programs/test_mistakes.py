@@ -1,9 +1,5 @@
 """Whatever is wrong with what a program is given: one sentence, exit code 2, no traceback, nothing left behind."""
 
-import contextlib
-import io
-import logging
-import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +7,7 @@ from hydra import compose, initialize_config_module
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
+from programs import called
 
 from coil_rl import checkpoint
 from coil_rl.build import build, build_env
@@ -18,7 +15,6 @@ from coil_rl.config import Train  # noqa: F401  registers the schema
 from coil_rl.programs import evaluate, train
 
 TINY = ["budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1", "track.test.count=1"]
-PROGRAMS = {"train": train, "evaluate": evaluate}
 # All examples of a test share its folder; each looks at what it adds.
 SHARED = [HealthCheck.function_scoped_fixture]
 
@@ -31,22 +27,13 @@ def started(monkeypatch, tmp_path):
     monkeypatch.setattr(train, "train", lambda config: names.append("train"))
     monkeypatch.setattr(evaluate, "judge", lambda *_: None)
     monkeypatch.setattr(evaluate, "outcome", lambda folder: 0.0)
-    yield names
-    logging.getLogger().handlers.clear()
+    return names
 
 
 def outcome(name, *arguments):
     """Exit code and what stands on standard error."""
-    error, code, given = io.StringIO(), 0, sys.argv
-    sys.argv = [name, *arguments]
-    try:
-        with contextlib.redirect_stderr(error), contextlib.redirect_stdout(io.StringIO()):
-            PROGRAMS[name].main()
-    except SystemExit as end:
-        code = end.code
-    finally:
-        sys.argv = given
-    return code, error.getvalue()
+    done = called(name, *arguments, code=None)
+    return done.returncode, done.stderr
 
 
 def everything():

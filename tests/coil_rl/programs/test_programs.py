@@ -1,12 +1,10 @@
 import json
-import os
 import subprocess
-import sys
 import time
 
 import pytest
 from PIL import Image
-from programs import ROOT, TINY, program
+from programs import LAP, TINY, TRACK, called, command, environment, program
 
 
 @pytest.fixture(scope="module")
@@ -37,21 +35,21 @@ def test_train_shows_progress_and_nothing_alarming(run):
 
 def test_evaluate_gives_the_same_numbers_again(run):
     folder, trained = run
-    again = program("evaluate", "run=run", *TINY[3:6], "evaluation.repeats=1", cwd=folder)
+    again = program("evaluate", "run=run", *TRACK, "evaluation.repeats=1", cwd=folder)
     assert again.stdout.splitlines()[:-1] == trained.stdout.splitlines()[:-1], "also what is sampled"
 
 
 def test_guide_alone_is_a_method_and_an_evaluation(tmp_path):
-    done = program("train", *TINY, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path)
+    done = called("train", *TINY, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path)
     assert "guide: mean test reward" in done.stdout
     assert not (tmp_path / "run" / "metrics.csv").exists()
-    alone = program("evaluate", "guide=zero", *TINY[3:7], "hydra.run.dir=alone", cwd=tmp_path)
+    alone = called("evaluate", "guide=zero", *LAP, "hydra.run.dir=alone", cwd=tmp_path)
     assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
 
 
 def test_a_folder_that_holds_a_run_is_refused(run):
     folder, _ = run
-    done = program("train", *TINY, "hydra.run.dir=run", cwd=folder, code=2)
+    done = called("train", *TINY, "hydra.run.dir=run", cwd=folder, code=2)
     (sentence,) = done.stderr.splitlines()
     assert sentence.startswith(f"train: {folder / 'run'} already holds a run; go on with it by coil-train resume=")
 
@@ -59,19 +57,19 @@ def test_a_folder_that_holds_a_run_is_refused(run):
 def test_a_finished_run_prints_its_outcome_again(run):
     folder, done = run
     before = {file: file.stat().st_mtime_ns for file in (folder / "run").iterdir() if file.name != ".lock"}
-    again = program("train", "resume=run", cwd=folder)
+    again = called("train", "resume=run", cwd=folder)
     assert again.stdout == done.stdout
     assert {file: file.stat().st_mtime_ns for file in before} == before
 
 
 def test_a_run_ended_while_it_is_judged_goes_on_to_the_same_numbers(run, tmp_path):
     folder, _ = run
-    command = [sys.executable, "-m", "coil_rl.programs.train", *TINY, "logger=tensorboard", "hydra.run.dir=run"]
-    env = os.environ | {"PYTHONPATH": str(ROOT)}
-    first = subprocess.Popen(command, cwd=tmp_path, env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    train = command("train", *TINY, "logger=tensorboard", "hydra.run.dir=run")
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    first = subprocess.Popen(train, cwd=tmp_path, env=environment(tmp_path), **pipes)
     while first.poll() is None and not (tmp_path / "run" / "policy_best.pt").exists():
         time.sleep(0.01)
-    second = program("train", "resume=run", cwd=tmp_path, code=2)
+    second = called("train", "resume=run", cwd=tmp_path, code=2)
     (sentence,) = second.stderr.splitlines()
     assert sentence == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
     first.terminate()
@@ -81,38 +79,44 @@ def test_a_run_ended_while_it_is_judged_goes_on_to_the_same_numbers(run, tmp_pat
     assert not (tmp_path / "run" / "evaluation.csv").exists()
 
     (tmp_path / "run").rename(tmp_path / "moved")
-    program("train", "resume=moved", cwd=tmp_path)
+    called("train", "resume=moved", cwd=tmp_path)
     for name in ("metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt", "policy_best.pt"):
         assert (tmp_path / "moved" / name).read_bytes() == (folder / "run" / name).read_bytes(), name
     assert not (tmp_path / "run").exists(), "the logger should have followed the folder"
 
 
 # Many more of them, in one process, are in test_mistakes.py.
+def test_a_mistake_is_one_sentence_exit_code_2_and_no_folder(tmp_path):
+    done = program("train", "learner.gamma=abc", *TRACK, cwd=tmp_path, code=2)
+    assert done.stderr == "train: learner: gamma='abc' must be a finite number\n"
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
-    ("name", "arguments", "sentence"),
+    ("name", "arguments", "words"),
     [
-        ("train", ["learner.gamma=abc"], "train: learner: gamma='abc' must be a finite number"),
-        ("evaluate", ["run=/nowhere"], "evaluate: run=/nowhere is not the folder of a run: it has no config.yaml"),
+        ("evaluate", ["run=/nowhere"], "run=/nowhere is not the folder of a run: it has no config.yaml"),
         (
             "train",
             ["-m", "resume=run,other"],
-            "train: resume=run,other goes alone: that run's own config.yaml says the rest; leave out -m",
+            "resume=run,other goes alone: that run's own config.yaml says the rest; leave out -m",
         ),
     ],
 )
-def test_mistakes_are_one_sentence_exit_code_2_and_no_folder(name, arguments, sentence, tmp_path):
-    done = program(name, *arguments, *([] if "-m" in arguments else TINY[3:5]), cwd=tmp_path, code=2)
-    assert done.stderr == sentence + "\n"
+def test_what_is_no_run_is_refused_and_leaves_no_folder(name, arguments, words, tmp_path):
+    done = called(name, *arguments, cwd=tmp_path, code=2)
+    assert done.stderr == f"{name}: {words}\n"
     assert not list(tmp_path.iterdir())
 
 
 def test_info_names_the_versions_that_matter(tmp_path):
-    out = program("info", cwd=tmp_path).stdout
+    out = called("info", cwd=tmp_path).stdout
     for name in ("python", "coil-rl", "torch ", "torchrl", "hydra-core", "commit"):
         assert name in out
 
 
-def test_part_of_another_package_needs_no_change_here(tmp_path):
+def test_part_of_another_package_needs_no_change_here(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "their_package.py").write_text(
         "from coil_rl.guides import ConstantGuide\n\n\nclass TheirGuide(ConstantGuide):\n"
         "    def __init__(self, angle):\n        super().__init__(angle / 80)\n"
@@ -124,11 +128,13 @@ def test_part_of_another_package_needs_no_change_here(tmp_path):
     (experiments / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
     )
-    done = program("train", "--config-dir", "conf", *TINY, "+experiment=mine", "hydra.run.dir=run", cwd=tmp_path)
+    mine = ["--config-dir", "conf", *TINY, "+experiment=mine", "hydra.run.dir=run"]
+    done = called("train", *mine, cwd=tmp_path)
     assert "100%" in done.stdout, "a constant steering of 8 degrees should have crashed every car"
 
 
 def test_a_sweep_gives_every_run_a_folder(tmp_path):
-    program("train", "-m", *TINY, "method=guide", "guide=zero", "seed=0,1", "evaluation.gif=false", cwd=tmp_path)
+    sweep = ["method=guide", "guide=zero", "seed=0,1", "evaluation.gif=false"]
+    called("train", "-m", *TINY, *sweep, cwd=tmp_path)
     runs = sorted(path.parent.name for path in (tmp_path / "outputs" / "sweep").glob("*/*/evaluation.csv"))
     assert runs == ["0_guide_seed0", "1_guide_seed1"]

@@ -1,17 +1,11 @@
-import contextlib
 import csv
-import io
-import logging
 import math
-import sys
 from pathlib import Path
 
 import pytest
 from PIL import Image
-from programs import TINY, program
+from programs import TINY, called, program
 from run_folders import driven, make_run, make_sweep
-
-from coil_rl.programs import report
 
 FILES = {"report.md", "report.csv", "report_tracks.csv", "report.png", "report_curves.png"}
 
@@ -19,22 +13,13 @@ FILES = {"report.md", "report.csv", "report_tracks.csv", "report.png", "report_c
 @pytest.fixture
 def sweep(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
-    yield make_sweep(Path("sweep"))
-    logging.getLogger().handlers.clear()
+    return make_sweep(Path("sweep"))
 
 
 def outcome(*arguments):
     """Exit code, and what stands on standard output and error."""
-    out, error, code, given = io.StringIO(), io.StringIO(), 0, sys.argv
-    sys.argv = ["report", *arguments]
-    try:
-        with contextlib.redirect_stderr(error), contextlib.redirect_stdout(out):
-            report.main()
-    except SystemExit as end:
-        code = end.code
-    finally:
-        sys.argv = given
-    return code, out.getvalue(), error.getvalue()
+    done = called("report", *arguments, code=None)
+    return done.returncode, done.stdout, done.stderr
 
 
 def everything():
