@@ -11,8 +11,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-RINGS = ROOT / "tests" / "rings"
-TRACK = ["track=folder", f"track.dir={RINGS / 'narrow.csv'}"]
+TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 TINY = [*LAP, "budget.frames=512", "budget.cars=8", "budget.steps=32", "evaluation.repeats=1", "logger=none"]
 
