@@ -7,9 +7,9 @@ It sees the cones ahead, is paid for laps, new cones and staying alive, and pays
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial, reduce
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -45,6 +45,30 @@ class Reward(NamedTuple):
     cone: float = 2.5
     smooth: float = -0.1
     alive: float = 0.001
+
+
+class Outcome(NamedTuple):
+    """What a step brought each car, [B] unless said otherwise.
+
+    Attributes:
+        action: that was taken.
+        roughness: |a - mean of the last 20 actions|.
+        lap_time: s, of the lap just completed, else 0.
+        finished: whether one was.
+        discovered: on how many sides a cone came into sight.
+        to_boundaries: [2, B] m, to the left and to the right one.
+        crashed: whether it did.
+        alive: 1 unless it did.
+    """
+
+    action: Tensor
+    roughness: Tensor
+    lap_time: Tensor
+    finished: Tensor
+    discovered: Tensor
+    to_boundaries: Tensor
+    crashed: Tensor
+    alive: Tensor
 
 
 class ConeTrackEnv(EnvBase):
@@ -88,6 +112,9 @@ class ConeTrackEnv(EnvBase):
         torch.Size([8, 3, 20])
     """
 
+    reward_terms: ClassVar[tuple[str, ...]] = REWARD_TERMS
+
+    weights: Tensor
     track: Tensor
     pose: Tensor
     history: Tensor
@@ -145,24 +172,20 @@ class ConeTrackEnv(EnvBase):
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
         if max_steering > 90:
             raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
-        unknown = set(reward or {}) - set(Reward._fields)
-        if unknown:
-            raise ValueError(f"reward has no weight {sorted(unknown)}; it has {', '.join(Reward._fields)}")
-        for name, value in (reward or {}).items():
-            if not abs(value) <= 1e6:
-                raise ValueError(f"reward.{name}={value} must be between -1e6 and 1e6")
+        check_weights("reward", reward or {}, Reward._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
         self.dtype_ = dtype
         self.rate, self.laps, self.held_steps, self.assignment = rate, laps, held_steps, assignment
         self.info = info
         self.max_steps = round(time_limit * rate)
-        self.weights = Reward(**(reward or {}))
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
         self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
         self.map = TrackMap(tracks, dtype=dtype).to(self.device)
         self.generator = torch.Generator()
+        weights = torch.tensor(Reward(**(reward or {})), dtype=dtype, device=self.device)
+        self.register_buffer("weights", weights, persistent=False)
         self._declare_specs()
         self._allocate(num_cars)
         self.set_seed(seed)
@@ -227,7 +250,7 @@ class ConeTrackEnv(EnvBase):
 
         info = Composite(
             track=whole(1), lap=whole(1), lap_time=real(1), crashed=flag(), clearance=real(1), smoothness=real(1),
-            pose=real(3), reward=Composite({term: real(1) for term in REWARD_TERMS}, shape=self.batch_size),
+            pose=real(3), reward=Composite({term: real(1) for term in self.reward_terms}, shape=self.batch_size),
             shape=self.batch_size,
         )  # fmt: skip
         self.observation_spec = Composite(
@@ -272,7 +295,7 @@ class ConeTrackEnv(EnvBase):
         start = (self.start_observation, self.start_cones, self.start_count)
         empty = (x.new_zeros(*x.shape[:-1], len(everyone)) for x in start)
         observation, cones, count = (put(x, y[..., track]) for x, y in zip(empty, start, strict=True))
-        terms = dict.fromkeys(REWARD_TERMS, zero)
+        terms = dict.fromkeys(self.reward_terms, zero)
         return self._tensordict(observation.t(), cones, count, self._info(zero, zero.bool(), zero, zero, terms))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -289,17 +312,12 @@ class ConeTrackEnv(EnvBase):
         seen, slot = self._look(self.track, cell, self.pose)
         discovered = self._discover(seen, slot, finished)
         observation, self.samples, self.sampled = self._observe(self.pose, seen, self.samples, self.sampled)
-        clearance = self.map.clearance(self.track, cell, self.pose[:2])
+        to_boundaries = self.map.to_boundaries(self.track, self.pose[:2])
+        clearance = self.map.clearance(self.track, cell, self.pose[:2], to_boundaries)
 
         crashed = clearance <= 0
         alive = (~crashed).to(action.dtype)
-        terms = {
-            "finish": torch.add(finished * self.weights.finish, lap_time, alpha=self.weights.second) * alive,
-            "crash": crashed * self.weights.crash,
-            "cone": discovered * self.weights.cone * alive,
-            "smooth": roughness * self.weights.smooth * alive,
-            "alive": self.weights.alive * alive,
-        }
+        terms = self._pay(Outcome(action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive))
         terminated = crashed | (self.lap >= self.laps)
         truncated = (self.steps >= self.max_steps) & ~terminated
         out = self._tensordict(
@@ -308,10 +326,14 @@ class ConeTrackEnv(EnvBase):
             seen.count.long(),
             self._info(lap_time, crashed, clearance, roughness, terms),
         )
-        out["reward"] = sum(terms.values()).to(action.dtype).unsqueeze(-1)
+        out["reward"] = reduce(torch.add, terms.values()).to(action.dtype).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
         return out
+
+    def _pay(self, outcome: Outcome) -> dict[str, Tensor]:
+        """The terms of the reward, [B] each."""
+        return pay(outcome, dict(zip(Reward._fields, self.weights.unbind(0), strict=True)))
 
     def _move(self, action: Tensor) -> Tensor:
         """The bicycle model (equations 99-100): first along the heading, then the heading turns."""
@@ -399,6 +421,37 @@ class ConeTrackEnv(EnvBase):
             self.batch_size,
             device=self.device,
         )
+
+
+def pay(outcome: Outcome, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The terms of the paper's reward (4.1.1), [B] each.
+
+    Args:
+        outcome: of the step.
+        weights: see `Reward`; each a number, or [B].
+    """
+    alive = outcome.alive
+    return {
+        "finish": torch.addcmul(outcome.finished * weights["finish"], outcome.lap_time, weights["second"]) * alive,
+        "crash": outcome.crashed * weights["crash"],
+        "cone": outcome.discovered * weights["cone"] * alive,
+        "smooth": outcome.roughness * weights["smooth"] * alive,
+        "alive": weights["alive"] * alive,
+    }
+
+
+def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str]) -> None:
+    """Refuse weights of a reward that do not exist or are no numbers to learn from.
+
+    Raises:
+        ValueError: naming the weight.
+    """
+    unknown = set(weights) - set(known)
+    if unknown:
+        raise ValueError(f"{name} has no weight {sorted(unknown)}; it has {', '.join(known)}")
+    for key, value in weights.items():
+        if not abs(value) <= 1e6:
+            raise ValueError(f"{name}.{key}={value} must be between -1e6 and 1e6")
 
 
 def _recent_mean(history: Tensor) -> Tensor:

@@ -201,27 +201,38 @@ class TrackMap(nn.Module):
         slot = slot.permute(2, 1, 0).contiguous().int()
         return slot, self._positions(track, slot)
 
-    def clearance(self, track: Tensor, cell: Tensor, position: Tensor) -> Tensor:
-        """How far a car is from a crash: the nearer of cones and boundaries, less the distance that counts as one.
-
-        Args:
-            track: [B], the car's track.
-            cell: [B], where it is.
-            position: [2, B] in m.
+    def to_boundaries(self, track: Tensor, position: Tensor) -> Tensor:
+        """How far a car on one of these tracks [B] at this position [2, B] m is from the left and the right boundary.
 
         Returns:
-            [B] in m; zero or less is a crash. Exact up to 1 m, beyond that a cone may have been overlooked.
+            [2, B] in m, at most FAR.
         """
-        cones = self._positions(track, self.near.index_select(0, cell).t().contiguous())
-        to_cone = (cones - position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
         node, columns, (right, up) = self.fine.locate(track, position)
         right, up = right.unsqueeze(-1), up.unsqueeze(-1)
         corners = (self.field.index_select(0, place) for place in (node, node + 1, node + columns, node + columns + 1))
         low_left, low_right, high_left, high_right = corners
         low, high = torch.lerp(low_left, low_right, right), torch.lerp(high_left, high_right, right)
         # Each side by itself: half-way between the two the nearer one changes, and no interpolation can follow that.
-        to_boundary = torch.minimum(*torch.lerp(low, high, up).unbind(-1))
-        return torch.minimum(to_cone - self.cone_radius, to_boundary - self.boundary_margin)
+        return torch.lerp(low, high, up).t()
+
+    def clearance(self, track: Tensor, cell: Tensor, position: Tensor, to_boundaries: Tensor | None = None) -> Tensor:
+        """How far a car is from a crash: the nearer of cones and boundaries, less the distance that counts as one.
+
+        Args:
+            track: [B], the car's track.
+            cell: [B], where it is.
+            position: [2, B] in m.
+            to_boundaries: [2, B] in m, where they are known already.
+
+        Returns:
+            [B] in m; zero or less is a crash. Exact up to 1 m, beyond that a cone may have been overlooked.
+        """
+        if to_boundaries is None:
+            to_boundaries = self.to_boundaries(track, position)
+        cones = self._positions(track, self.near.index_select(0, cell).t().contiguous())
+        to_cone = (cones - position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
+        nearer = torch.minimum(*to_boundaries.unbind(0))
+        return torch.minimum(to_cone - self.cone_radius, nearer - self.boundary_margin)
 
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
         index = (slot + track.int() * (2 * self.slots)).flatten()
