@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
+PER_STEP = "per_step_"  # and the name of a task
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,8 @@ class Drive:
     Attributes:
         episodes: one row per car: `track`, `reward` (sum), `steps`, `lap_time` s (mean of the completed laps, NaN
             without one), `laps`, `completed`, `crashed`, `smoothness` (mean |a - a_avg|) and `clearance` m (smallest).
-            An env without `info` gives `reward` and `steps` only.
+            An env without `info` gives `reward` and `steps` only, one that says under `info` in which `task` a step was
+            paid also `steps_TASK` and `reward_TASK`, the parts that fell to each.
         lines: the positions of each car, [steps, 2] m.
     """
 
@@ -87,6 +89,8 @@ def _notes(after: TensorDictBase) -> dict[str, Tensor]:
         info = after["info"]
         notes |= {key: info[key] for key in ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")}
         notes["finished"] = after["terminated"] & ~info["crashed"]
+        if "task" in info:
+            notes |= {f"steps_{name}": paid for name, paid in info["task"].items()}
     return notes
 
 
@@ -109,6 +113,10 @@ def _measure(notes: dict[str, NDArray[np.float64]], names: Sequence[str]) -> Dri
                 "clearance": float(notes["clearance"][on, car].min()),
             }
             lines.append(notes["pose"][on, car, :2])
+            for key in notes:
+                if key.startswith("steps_"):
+                    paid = notes[key][on, car]
+                    row |= {key: int(paid.sum()), f"reward_{key[6:]}": (paid * notes["reward"][on, car]).sum()}
         episodes.append(row)
     return Drive(episodes, lines)
 
@@ -117,16 +125,28 @@ def summarise(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Means per track in the order they come, then the mean over tracks as the row `mean`.
 
     `completed` and `crashed` become shares, `lap_time` is over the episodes that have one, and `clearance` is the
-    smallest of all.
+    smallest of all. Where there are tasks, `per_step_TASK` is the reward of a step in it, over all steps of a track.
     """
-    tracks = list(dict.fromkeys(episode["track"] for episode in episodes))
-    rows = [_mean(track, [e for e in episodes if e["track"] == track]) for track in tracks]
-    return [*rows, _mean("mean", rows)]
+    tracks = {episode["track"]: [e for e in episodes if e["track"] == episode["track"]] for episode in episodes}
+    rows = [_mean(track, alike) | _per_step(alike) for track, alike in tracks.items()]
+    tasks = {key: _mean_of_known([row[key] for row in rows]) for key in rows[0] if key.startswith(PER_STEP)}
+    return [*rows, _mean("mean", rows) | tasks]
+
+
+def _per_step(episodes: Sequence[dict[str, Any]]) -> dict[str, float]:
+    tasks = [key.removeprefix("steps_") for key in episodes[0] if key.startswith("steps_")]
+    steps = {task: sum(row[f"steps_{task}"] for row in episodes) for task in tasks}
+    paid = {task: sum(row[f"reward_{task}"] for row in episodes) for task in tasks}
+    return {f"{PER_STEP}{task}": paid[task] / steps[task] if steps[task] else float("nan") for task in tasks}
+
+
+def _mean_of_known(values: Sequence[float]) -> float:
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else float("nan")
 
 
 def _mean(track: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     columns = {key: np.array([row[key] for row in rows], dtype=float) for key in MEASURES}
-    measured = columns["lap_time"][~np.isnan(columns["lap_time"])]
     means = {key: float(values.mean()) for key, values in columns.items()}
-    means |= {"lap_time": float(measured.mean()) if len(measured) else float("nan")}
+    means |= {"lap_time": _mean_of_known([row["lap_time"] for row in rows])}
     return {"track": track, **means, "clearance": float(columns["clearance"].min())}

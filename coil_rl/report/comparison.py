@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
-from coil_rl.report.runs import GUIDE, MEASURES, Drive, Run
+from coil_rl.report.runs import GUIDE, MEASURES, PER_STEP, Drive, Run
 from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap
 
 Array = NDArray[np.float64]
@@ -27,7 +27,8 @@ class Group:
         name: the label, or what the guide is called and, where several are called so, whose.
         advice: what was done to the advice; empty if nothing was.
         tracks: their names.
-        values: [seeds, tracks, MEASURES].
+        values: [seeds, tracks, MEASURES and tasks].
+        tasks: their names; none where the env has none.
         is_guide: whether this is a guide.
         guide: the drives of the best guide beside which an agent drove, if one did.
         needs_guide: whether it needs the guide when it drives; None where that is no question.
@@ -37,6 +38,7 @@ class Group:
     advice: str
     tracks: tuple[str, ...]
     values: Array
+    tasks: tuple[str, ...] = ()
     is_guide: bool = False
     guide: Group | None = None
     needs_guide: bool | None = None
@@ -72,6 +74,13 @@ class Group:
             "clearance": float(columns["clearance"].min()),
         }
 
+    @property
+    def per_step(self) -> dict[str, float]:
+        """The mean reward of a step in each task, over the seeds and tracks on which the task came up."""
+        columns = {task: self.values[..., len(MEASURES) + place] for place, task in enumerate(self.tasks)}
+        known = {task: column[np.isfinite(column)] for task, column in columns.items()}
+        return {task: float(column.mean()) if column.size else float("nan") for task, column in known.items()}
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -101,6 +110,7 @@ class Comparison:
                 "driver": group.name, "advice": group.advice, "guide": group.guide.name if group.guide else None,
                 "seeds": group.seeds, "iqm": group.iqm, "low": low, "high": high, "mean": means.pop("reward"),
                 **means, "improvement": self._improvement(group, against), "needs_guide": group.needs_guide,
+                **{PER_STEP + task: reward for task, reward in group.per_step.items()},
             })  # fmt: skip
         return rows
 
@@ -161,15 +171,20 @@ def _check_seeds(label: str, runs: Sequence[Run]) -> None:
         first[run.seed] = run
 
 
-def _stack(name: str, drives: Sequence[Drive]) -> tuple[tuple[str, ...], Array]:
-    tracks = drives[0].tracks
+def _stack(name: str, drives: Sequence[Drive]) -> tuple[tuple[str, ...], Array, tuple[str, ...]]:
+    tracks, tasks = drives[0].tracks, drives[0].tasks
     for drive in drives:
         if drive.tracks != tracks:
             raise UserError(
                 f"runs of {name} drove different tracks ({', '.join(tracks)}, and {', '.join(drive.tracks)}); "
                 "judge them on the same ones, or give them labels of their own (coil-train label=TEXT)"
             )
-    return tracks, np.stack([drive.values for drive in drives])
+        if drive.tasks != tasks:
+            raise UserError(
+                f"runs of {name} had different tasks ({', '.join(tasks) or 'none'}, and "
+                f"{', '.join(drive.tasks) or 'none'}); give them labels of their own (coil-train label=TEXT)"
+            )
+    return tracks, np.stack([drive.values for drive in drives]), tasks
 
 
 def _guides(of_label: dict[str, list[Run]]) -> dict[str, list[Group]]:

@@ -44,7 +44,7 @@ def section(heading: str, found: Comparison, rows: Sequence[Mapping[str, Any]], 
     if against is None:
         del columns["improvement"]
     table = markdown_table([{**row, "interval": _interval(row["low"], row["high"])} for row in rows], columns)
-    return "\n\n".join([f"## {heading}", table, _tracks(found)])
+    return "\n\n".join([f"## {heading}", table, *_tasks(found), _tracks(found)])
 
 
 def notes(resamples: int, against: str | None) -> str:
@@ -75,6 +75,15 @@ def whose(against: str | None) -> str:
 
 def _interval(low: float, high: float) -> str | None:
     return None if math.isnan(low) else f"{low:.1f} to {high:.1f}"
+
+
+def _tasks(found: Comparison) -> list[str]:
+    """The table of tasks and drivers, if there are tasks."""
+    groups = (*found.guides, *found.agents)
+    names = list(dict.fromkeys(task for group in groups for task in group.tasks))
+    rows = [{"driver": group.title} | group.per_step for group in groups if group.tasks]
+    columns = {"driver": ("reward of a step", "")} | {name: (name, ".3f") for name in names}
+    return [markdown_table(rows, columns)] if names else []
 
 
 def _tracks(found: Comparison) -> str:

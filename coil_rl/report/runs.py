@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 GUIDE = "guide"  # as `driver` calls it in evaluation.csv
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
+PER_STEP = "per_step_"  # and the name of a task
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Drive:
         advice: what was done to the advice, such as "zeroed"; empty if nothing was.
         actions: "deterministic" or "sampled".
         tracks: their names, in the order in which they were driven.
-        values: [tracks, MEASURES].
+        values: [tracks, MEASURES, and the reward of a step in each task].
+        tasks: their names; none where the env has none.
     """
 
     driver: str
@@ -39,6 +41,7 @@ class Drive:
     actions: str
     tracks: tuple[str, ...]
     values: Array
+    tasks: tuple[str, ...] = ()
 
     @property
     def is_guide(self) -> bool:
@@ -121,10 +124,12 @@ def _read(folder: Path) -> Run:
 
 def _drives(path: Path) -> tuple[Drive, ...]:
     tracks: dict[tuple[str, str, str], dict[str, list[float]]] = {}
-    for row in _rows(path):
+    rows = _rows(path)
+    tasks = [key for key in rows[0] if key and key.startswith(PER_STEP)] if rows else []
+    for row in rows:
         try:
             driver = (row["driver"], row["advice"], row["actions"])
-            values = [float(row[measure]) for measure in MEASURES]
+            values = [float(row[measure]) for measure in (*MEASURES, *tasks)]
             if row["track"] != "mean":
                 tracks.setdefault(driver, {})[row["track"]] = values
         except (KeyError, TypeError, ValueError) as error:
@@ -132,7 +137,8 @@ def _drives(path: Path) -> tuple[Drive, ...]:
     if not tracks:
         raise _damaged(path, ValueError("no rows"))
     return tuple(
-        Drive(*driver, tuple(of_driver), np.array(list(of_driver.values()))) for driver, of_driver in tracks.items()
+        Drive(*driver, tuple(on), np.array(list(on.values())), tuple(task.removeprefix(PER_STEP) for task in tasks))
+        for driver, on in tracks.items()
     )
 
 

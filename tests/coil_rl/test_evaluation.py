@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from coil_rl.envs import ConeTrackEnv, random_tracks
+from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, random_tracks
 from coil_rl.evaluation import drive, summarise
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.networks import actor
@@ -58,3 +58,28 @@ def test_summary_is_the_mean_over_tracks_of_means_over_episodes():
     assert math.isnan(rows[1]["lap_time"])
     assert [row["crashed"] for row in rows] == [0.5, 1, 0.75]
     assert rows[2]["clearance"] == 0.1
+
+
+def test_reward_is_told_apart_by_the_task_that_paid_it():
+    tasks = {"left": {"alive": 1.0, "crash": 0.0, "cone": 0.0}, "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0}}
+    env = DrivingTasksEnv(TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0})
+    driven = drive(env, ConstantGuide(1.0))
+    for row in driven.episodes:
+        assert row["steps_left"] + row["steps_right"] == row["steps"]
+        assert row["reward_left"] + row["reward_right"] == pytest.approx(row["reward"])
+    assert sum(row["steps_left"] for row in driven.episodes) > 6
+    *rows, mean = summarise(driven.episodes)
+    for row in rows:
+        alike = [episode for episode in driven.episodes if episode["track"] == row["track"]]
+        steps, paid = (sum(episode[f"{what}_left"] for episode in alike) for what in ("steps", "reward"))
+        assert row["per_step_left"] == pytest.approx(paid / steps)
+        # Every step but that of the crash.
+        assert 0.8 < row["per_step_left"] <= 1
+    assert mean["per_step_left"] == pytest.approx(sum(row["per_step_left"] for row in rows) / 2)
+
+
+def test_task_that_never_came_up_has_no_reward():
+    env = DrivingTasksEnv(TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left")
+    rows = summarise(drive(env, ConstantGuide(1.0)).episodes)
+    assert all(math.isnan(row["per_step_right"]) for row in rows)
+    assert not any(math.isnan(row["per_step_left"]) for row in rows)

@@ -50,3 +50,14 @@ def test_notes_say_what_was_done():
     assert "Better than its guide: the probability" in page.notes(10, "guide")
     assert page.progress(3, 3) == "All 3 runs that have begun are finished."
     assert page.progress(2, 3).endswith("goes on with the rest.")
+
+
+def test_tasks_have_a_table_of_their_own(tmp_path):
+    for seed, left in enumerate((0.5, 1.0)):
+        rows = driven("guide", {"a": 1.0}, per_step_left=0.25, per_step_right=float("nan"))
+        rows += driven("coil", {"a": 2.0}, per_step_left=left, per_step_right=-0.125)
+        make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
+    tasks = section(tmp_path).split("\n\n")[2]
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tasks.splitlines()]
+    assert rows[0] == ["reward of a step", "left", "right"]
+    assert rows[2:] == [["guide", "0.250", "-"], ["coil", "0.750", "-0.125"]]
