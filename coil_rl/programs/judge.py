@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
 from coil_rl.build import build, build_env, build_guided_env
-from coil_rl.evaluation import Drive, drive, summarise
+from coil_rl.evaluation import PER_STEP, Drive, drive, summarise
 from coil_rl.files import whole_file
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 
@@ -71,6 +71,8 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         animate_lines(tracks, lines, folder / "lines.gif", rate=config.env.rate, crashed=crashed)
     with whole_file(folder / "evaluation.md") as unfinished:
         columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
+        tasks = {key: key.removeprefix(PER_STEP) for key in table[0] if key.startswith(PER_STEP)}
+        columns |= {key: (f"{task} (a step)", ".3f") for key, task in tasks.items()}
         unfinished.write_text(markdown_table(table, columns) + "\n")
     write_csv(table, folder / "evaluation.csv")
 
