@@ -6,8 +6,9 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build, build_bare_env, build_env, build_guided_env, build_guides
+from coil_rl.build import build, build_bare_env, build_env, build_guided_env, build_guides, build_learner, trains_guides
 from coil_rl.errors import UserError
+from coil_rl.proxies import untrained
 from coil_rl.testing import check_env, check_guide
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -57,7 +58,7 @@ def test_what_degrades_advice_comes_after_every_method():
 def test_every_learner_builds_from_the_env(learner):
     config = composed(f"learner={learner}")
     env = build_env(config)
-    built = build(config.learner, "learner", env=env, in_keys=list(config.method.observes))
+    built = build_learner(config, env, untrained(config) if trains_guides(config) else None)
     assert built.policy(env.reset())["action"].shape == (4, 1)
 
 
