@@ -151,15 +151,15 @@ def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = Non
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
-    """The learner of a configuration, observing what its method says of this env.
+    """The learner of a configuration, observing what its method and `also_observes` say of this env.
 
     Args:
-        config: with `learner` and `method`.
+        config: with `learner`, `method` and `also_observes`.
         env: as its agent sees it.
         guides: those that it trains, if it does.
     """
     given: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
-    return build(config.learner, "learner", env=env, in_keys=list(config.method.observes), **given)
+    return build(config.learner, "learner", env=env, in_keys=[*config.method.observes, *config.also_observes], **given)
 
 
 def trains_guides(config: DictConfig) -> bool:

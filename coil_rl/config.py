@@ -56,6 +56,7 @@ class Common:
     guide: dict[str, Any] = MISSING
     degrade: dict[str, Any] = field(default_factory=dict)
     method: Method = field(default_factory=Method)
+    also_observes: list[str] = field(default_factory=list)
     budget: Budget = field(default_factory=Budget)
     evaluation: Evaluation = field(default_factory=Evaluation)
     seed: int = 0
