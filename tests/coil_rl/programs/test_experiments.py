@@ -1,0 +1,49 @@
+"""Every experiment file is a sweep that can be run, and one that goes on where it was stopped."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.check import check
+from coil_rl.programs.train import train
+
+CONF = Path(__file__).parents[3] / "conf"
+EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
+NEEDS_RUNS = ["driving_tasks"]
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1", "env.rate=12",
+        "evaluation.repeats=1", "logger=none", "budget.cars=4", "budget.steps=16", "budget.frames=128",
+        "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16"]  # fmt: skip
+
+
+def first(experiment, run_dir):
+    """The configuration of the first run of the sweep, as small as can be."""
+    params = OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml").hydra.sweeper.params
+    values = {key: str(value).split(",") for key, value in params.items()}
+    chosen = [f"{key}={value[0].strip()}" for key, value in values.items() if not key.startswith("budget.")]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", [f"+experiment={experiment}", *chosen, *TINY, f"run_dir={run_dir}"])
+
+
+@pytest.mark.parametrize("experiment", sorted({*EXPERIMENTS} - {*NEEDS_RUNS}))
+def test_an_experiment_can_be_run_and_goes_on_where_it_was_stopped(experiment, tmp_path):
+    config = first(experiment, tmp_path / "run")
+    check(config)
+    assert config.existing == "resume"
+
+
+@pytest.mark.slow
+def test_every_experiment_trains_and_judges(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for experiment in [*(name for name in EXPERIMENTS if name not in NEEDS_RUNS), *NEEDS_RUNS]:
+        for task in ("centred", "left", "right") if experiment == "driving_guides" else ("",):
+            run = tmp_path / "outputs" / "experiments" / experiment / (task or "run")
+            config = first(experiment, run)
+            if task:
+                config.env.only = task
+            run.mkdir(parents=True)
+            check(config)
+            train(config)
+            assert (run / "evaluation.csv").exists()
