@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from statistics import mean
 from typing import Any
 
 from coil_rl.report.comparison import Comparison
-from coil_rl.report.runs import GUIDE
+from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.table import markdown_table
 
 IN_ONE_TABLE = 8  # tracks
+OWN_RETURN = "guide/"  # as the columns of metrics.csv begin
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -45,6 +47,26 @@ def section(heading: str, found: Comparison, rows: Sequence[Mapping[str, Any]], 
         del columns["improvement"]
     table = markdown_table([{**row, "interval": _interval(row["low"], row["high"])} for row in rows], columns)
     return "\n\n".join([f"## {heading}", table, *_tasks(found), _tracks(found)])
+
+
+def guides_that_learned(runs: Sequence[Run]) -> list[str]:
+    """What the guides earned alone on the training tracks, before their run and after it, if any of them learned."""
+    rows: list[dict[str, Any]] = []
+    for label in dict.fromkeys(run.label for run in runs):
+        curves = [run.curve for run in runs if run.label == label and run.curve]
+        names = dict.fromkeys(key for curve in curves for key in curve[0] if key.startswith(OWN_RETURN))
+        own = {name: [[row[name] for row in curve if not math.isnan(row[name])] for curve in curves] for name in names}
+        ends = {
+            name: (mean(seed[0] for seed in seeds), mean(seed[-1] for seed in seeds)) for name, seeds in own.items()
+        }
+        cells = {name: f"{before:.1f} to {after:.1f}" for name, (before, after) in ends.items()}
+        rows += [{"label": label, "seeds": len(curves)} | cells] if cells else []
+    if not rows:
+        return []
+    columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
+    names = dict.fromkeys(key for row in rows for key in row if key.startswith(OWN_RETURN))
+    columns |= {name: (name.removeprefix(OWN_RETURN), "") for name in names}
+    return [markdown_table(rows, columns)]
 
 
 def notes(resamples: int, against: str | None) -> str:

@@ -1,6 +1,8 @@
+import math
+
 from run_folders import driven, make_run, make_sweep
 
-from coil_rl.report import page
+from coil_rl.report import page, write_csv
 from coil_rl.report.comparison import compare
 from coil_rl.report.runs import read_runs
 
@@ -61,3 +63,14 @@ def test_tasks_have_a_table_of_their_own(tmp_path):
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tasks.splitlines()]
     assert rows[0] == ["reward of a step", "left", "right"]
     assert rows[2:] == [["guide", "0.250", "-"], ["coil", "0.750", "-0.125"]]
+
+
+def test_guides_that_learned_have_what_they_earned_before_and_after(tmp_path):
+    for seed, label in enumerate(["dynamic", "dynamic", "coil"]):
+        run = make_run(tmp_path / str(seed), label, seed, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
+        if label == "dynamic":
+            own = [10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed]
+            write_csv([{"frames": n, "guide/spline": value} for n, value in enumerate(own)], run / "metrics.csv")
+    (table,) = page.guides_that_learned(read_runs([tmp_path]))
+    assert [cell.strip() for cell in table.splitlines()[-1].split("|")[1:-1]] == ["dynamic", "2", "10.5 to 40.5"]
+    assert page.guides_that_learned(read_runs([tmp_path / "2"])) == []
