@@ -44,7 +44,11 @@ LIMITS = {
     "checkpoint_every": (1, LARGEST),
 }
 LARGEST_BATCH = 2**28
-CHOICES = {"evaluation.policy": ("last", "best"), "existing": ("refuse", "resume")}
+CHOICES = {
+    "evaluation.policy": ("last", "best"),
+    "evaluation.guides": ("phases", "ends"),
+    "existing": ("refuse", "resume"),
+}
 
 
 def check(config: DictConfig) -> None:

@@ -32,6 +32,7 @@ class Evaluation:
     advice: dict[str, Any] = field(default_factory=dict)
     repeats: int = 5
     policy: str = "last"
+    guides: str = "phases"
     gif: bool = True
 
 

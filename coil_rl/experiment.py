@@ -40,7 +40,13 @@ class Learner(Protocol):
 
 
 class Probe(Protocol):
-    """What is measured now and then, because it takes long."""
+    """What is measured now and then, because it takes long.
+
+    Attributes:
+        each_phase: whether it is measured each time that the learner says `guides_changed`.
+    """
+
+    each_phase: bool
 
     @property
     def unknown(self) -> dict[str, float]:
@@ -66,8 +72,8 @@ class Experiment:
         logger: any TorchRL logger, besides the CSV.
         watch: name to key of entries logged as means over finished episodes ("episode") or over all steps ("step").
         checkpoint_every: updates between two checkpoints.
-        probe: looks at what learns besides the agent before the first update, when the learner says
-            `guides_changed`, and at the end.
+        probe: looks at what learns besides the agent before the first update, at the end and, if it asks for it, when
+            the learner says `guides_changed`.
     """
 
     EPISODES = 100  # the return is a mean over so many finished episodes
@@ -124,7 +130,8 @@ class Experiment:
             while self.updates < updates:
                 before = self._probed(self.updates == 0)
                 row = self.update(self.updates / updates)
-                after = self._probed(self.updates == updates or bool(row.get("learner/guides_changed")))
+                changed = self.probe is not None and self.probe.each_phase and row["learner/guides_changed"]
+                after = self._probed(self.updates == updates or bool(changed))
                 row |= {name: before[name] if math.isnan(value) else value for name, value in after.items()}
                 self.rows.append(row)
                 self.metrics.append(row)

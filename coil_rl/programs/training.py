@@ -119,6 +119,7 @@ class GuideReturns:
 
     def __init__(self, config: DictConfig, guides: Mapping[str, TensorDictModuleBase]) -> None:
         self.config, self.guides = config, guides
+        self.each_phase = config.evaluation.guides == "phases"
 
     @property
     def unknown(self) -> dict[str, float]:
