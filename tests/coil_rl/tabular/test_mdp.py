@@ -1,0 +1,67 @@
+import numpy as np
+import pytest
+
+from coil_rl.tabular import MDP, toymaker
+
+P = np.array([[[0.5, 0.5], [1.0, 0.0]], [[0.0, 1.0], [0.3, 0.7]]])
+R = np.array([[[1.0, 2.0], [3.0, 4.0]], [[0.0, 0.0], [5.0, 6.0]]])
+
+
+def changed(array, where, value):
+    copy = array.copy()
+    copy[where] = value
+    return copy
+
+
+def test_mean_reward_weighs_each_reward_by_its_probability():
+    np.testing.assert_allclose(MDP(P, R, 0.9).r, [[1.5, 3.0], [0.0, 5.7]])
+    np.testing.assert_allclose(toymaker().r, [[6, 4], [-3, -5]])
+
+
+def test_q_adds_what_is_to_come():
+    np.testing.assert_allclose(MDP(P, R, 0.5).q(np.array([10.0, 20.0])), [[1.5 + 7.5, 3 + 5], [10, 5.7 + 8.5]])
+
+
+def test_a_state_that_no_action_leaves_and_that_pays_nothing_is_terminal():
+    still, paid = np.array([[[0.0, 1.0]], [[0.0, 1.0]]]), np.zeros((2, 1, 2))
+    assert MDP(still, paid, 0.9).terminal.tolist() == [False, True]
+    assert not MDP(still, changed(paid, (1, 0, 1), 1.0), 0.9).terminal.any()
+    assert not MDP(P, R, 0.9).terminal.any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"P": changed(P, (1, 0), [0.1, 0.8])}, r"P\[1, 0\]=.* \(state low, action go\); they add up to 0.9"),
+        ({"P": changed(P, (0, 1), [1.5, -0.5])}, r"P\[0, 1\]=.* \(state high, action stay\)"),
+        ({"P": changed(P, (0, 1, 0), np.nan)}, "they add up to nan"),
+        ({"P": P[0]}, r"P must have the shape \[S, A, S\]"),
+        ({"P": P[:, :, :1]}, r"P must have the shape \[S, A, S\]"),
+        ({"R": R[0]}, r"R must have the shape of P, \(2, 2, 2\); it has \(2, 2\)"),
+        ({"R": changed(R, (1, 1, 0), np.inf)}, r"R\[1, 1\]=.* must be finite \(state low, action stay\)"),
+        ({"gamma": 1.0}, "gamma=1.0 must be at least 0 and less than 1"),
+        ({"gamma": -0.1}, "gamma=-0.1"),
+        ({"gamma": np.nan}, "gamma=nan"),
+        ({"start": [0.5, 0.6]}, "start must be 2 probabilities"),
+        ({"states": ("high",)}, "states has 1 names, but P has 2 states"),
+    ],
+)
+def test_what_is_no_markov_decision_process_is_refused(arguments, words):
+    named = {"states": ("high", "low"), "actions": ("go", "stay")}
+    with pytest.raises(ValueError, match=words):
+        MDP(**({"P": P, "R": R, "gamma": 0.9} | named | arguments))
+
+
+def test_policies_are_actions_or_their_probabilities():
+    mdp = MDP(P, R, 0.9, states=("high", "low"))
+    np.testing.assert_array_equal(mdp.probabilities([1, 0]), [[0, 1], [1, 0]])
+    np.testing.assert_array_equal(mdp.probabilities([[0.5, 0.5], [1, 0]]), [[0.5, 0.5], [1, 0]])
+    for policy, words in {
+        (1, 2): r"policy\[1\]=2 is no action in state low; actions are 0 to 1",
+        (-1, 0): r"policy\[0\]=-1 is no action in state high",
+        (0.5, 0.5): "A policy is",
+        (0, 0, 0): "A policy is",
+        ((0.5, 0.5), (0.5, 0.6)): r"policy\[1\]=.* state low",
+    }.items():
+        with pytest.raises(ValueError, match=words):
+            mdp.probabilities(policy)
