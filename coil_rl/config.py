@@ -138,6 +138,18 @@ class Listen(Common):
     bin: float = 1.0
 
 
+@dataclass
+class Reproduce:
+    """Configuration of `coil-reproduce`."""
+
+    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
+    table: int | None = None
+    figure: int | None = None
+    claim: str | None = None
+    results: dict[str, Any] = MISSING
+    run_dir: str = MISSING
+
+
 REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
 ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
 ConfigStore.instance().store(name="schema", node=Train)
@@ -145,3 +157,4 @@ ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
 ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
 ConfigStore.instance().store(name="report_schema", node=Report)
 ConfigStore.instance().store(name="listen_schema", node=Listen)
+ConfigStore.instance().store(name="reproduce_schema", node=Reproduce)

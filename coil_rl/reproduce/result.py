@@ -1,0 +1,59 @@
+"""What a result of the paper is to the program that makes it again."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from coil_rl.files import whole_file
+from coil_rl.report import style
+
+
+class Result(ABC):
+    """A table, a figure or a claim of the paper; its constructor takes the choices and refuses wrong ones."""
+
+    @abstractmethod
+    def make(self, stem: Path) -> str:
+        """Make it, with the paper's values beside ours.
+
+        Args:
+            stem: where to, without ending: all numbers go to `stem.csv`, the picture to `stem.png`.
+
+        Returns:
+            The page, Markdown: the table, and what there is to say about it.
+        """
+
+
+@contextmanager
+def picture(path: Path, title: str, handles: Sequence[Artist], height: float) -> Iterator[Figure]:
+    """An empty picture in the house's style; it is written when the block ends.
+
+    Args:
+        path: the picture, 8 inches wide.
+        title: above it.
+        handles: of the legend below the title.
+        height: in inches.
+    """
+    with mpl.rc_context(style.LETTERS):
+        figure = Figure(figsize=(style.WIDTH, height), dpi=style.RESOLUTION)
+        FigureCanvasAgg(figure)
+        header = style.draw_header(figure, handles, title)
+        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / height), w_pad=style.MARGIN / 2, h_pad=0.1)
+        yield figure
+        with whole_file(path) as unfinished:
+            figure.savefig(unfinished, format=path.suffix[1:])
+
+
+def lighten(axes: Axes, grid: str = "y") -> None:
+    """Leave out what frames a plot, and draw faint lines across it."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y" if grid == "y" else "x", color=style.ASPHALT, lw=0.7)
+    axes.set_axisbelow(True)
