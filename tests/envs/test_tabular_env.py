@@ -8,6 +8,8 @@ from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import TabularEnv
 from coil_rl.guides.simple import FollowAdvice
+from coil_rl.learners.ppo import PPO
+from coil_rl.rollout import Rollout
 from coil_rl.tabular import Gridworld, garnet, solve, toymaker, value_iteration
 from coil_rl.testing import check_env, check_transform
 from coil_rl.transforms import GuideActions
@@ -114,3 +116,20 @@ def changed(array, where, value):
 def test_what_is_no_world_is_refused(arguments, words):
     with pytest.raises(ValueError, match=words):
         TabularEnv(**({"P": P, "R": R} | arguments))
+
+
+def test_ppo_with_advice_learns_to_advertise():
+    torch.manual_seed(0)
+    mdp = toymaker()
+    bare = env_of(mdp, num_envs=64, max_steps=1_000)
+    env = TransformedEnv(bare, GuideActions({"plan": follows(value_iteration(mdp).policy)}))
+    keys = ["observation", "guide_action"]
+    ppo = PPO(env, keys, hidden=[16], learning_rate=1e-2, gamma=mdp.gamma, epochs=4, minibatches=4)
+    rollout = Rollout(env, ppo.policy, steps=16)
+    shares = []
+    for _ in range(20):
+        batch = rollout.collect()
+        ppo.update(batch)
+        shares.append(float(batch["action"].double().mean()))
+    assert shares[0] == pytest.approx(0.5, abs=0.1)
+    assert shares[-1] > 0.75
