@@ -6,7 +6,6 @@ from dataclasses import fields
 from pathlib import Path
 
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from coil_rl.build import build
 from coil_rl.config import Reproduce
@@ -28,13 +27,11 @@ def reproduce(config: DictConfig) -> None:
     for name in names:
         if (folder / f"{name}.md").exists():
             raise UserError(f"{folder} already holds {name}; choose another folder with hydra.run.dir=FOLDER")
-    with tqdm(results.items(), unit="result", desc="reproduce", leave=False, mininterval=0.5) as bar:
-        for name, result in bar:
-            bar.set_postfix_str(name)
-            text = result.make(folder / name)
-            with whole_file(folder / f"{name}.md") as unfinished:
-                unfinished.write_text(text + "\n", encoding="utf-8")
-            tqdm.write(text + "\n")
+    for name, result in results.items():
+        text = result.make(folder / name)
+        with whole_file(folder / f"{name}.md") as unfinished:
+            unfinished.write_text(text + "\n", encoding="utf-8")
+        print(f"{text}\n")
     print(f"reproduce: {', '.join(names)} made; see {folder}")
 
 

@@ -4,6 +4,7 @@ In the order of the paper: `mdp`, the world; `planning`, what to do where it is 
 `estimates`, getting to know it; `q_learning`, what to do without knowing it; `coil`, the same with a guide's advice.
 """
 
+from coil_rl.tabular.coil import sees_advice, with_advice
 from coil_rl.tabular.estimates import ModelEstimate
 from coil_rl.tabular.garnet import garnet
 from coil_rl.tabular.gridworld import Gridworld
@@ -26,7 +27,9 @@ __all__ = [
     "policy_evaluation",
     "policy_iteration",
     "q_learning",
+    "sees_advice",
     "solve",
     "toymaker",
     "value_iteration",
+    "with_advice",
 ]
