@@ -302,7 +302,7 @@ class ConeTrackEnv(EnvBase):
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
-        roughness = (action - _recent_mean(self.history)).abs()
+        roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.pose = self._move(action)
         self.steps = self.steps + 1
@@ -454,7 +454,7 @@ def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str])
             raise ValueError(f"{name}.{key}={value} must be between -1e6 and 1e6")
 
 
-def _recent_mean(history: Tensor) -> Tensor:
+def recent_mean(history: Tensor) -> Tensor:
     """Mean of the last actions [20, B], newest first, weighted exp(-0.1 k), in a fixed order of summation."""
     decay = math.exp(-0.1) ** torch.arange(HISTORY, dtype=history.dtype, device=history.device)
     fours = (history * (decay / decay.sum()).unsqueeze(-1)).view(4, HISTORY // 4, -1)
