@@ -3,6 +3,9 @@
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv
 from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_tracks
+from coil_rl.envs.mcap_replay import McapReplayEnv
+from coil_rl.envs.recording_writer import RecordingWriter
+from coil_rl.envs.recordings import Recording, RecordingError, read_recording
 from coil_rl.envs.tabular_env import TabularEnv
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.envs.track_generator import random_track, random_tracks
@@ -10,6 +13,10 @@ from coil_rl.envs.track_generator import random_track, random_tracks
 __all__ = [
     "ConeTrackEnv",
     "DrivingTasksEnv",
+    "McapReplayEnv",
+    "Recording",
+    "RecordingError",
+    "RecordingWriter",
     "TabularEnv",
     "Track",
     "TrackError",
@@ -17,6 +24,7 @@ __all__ = [
     "load_tracks",
     "random_track",
     "random_tracks",
+    "read_recording",
     "save_track",
     "shipped_tracks",
 ]
