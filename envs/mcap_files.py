@@ -17,7 +17,7 @@ MAGIC = b"\x89MCAP0\r\n"
 # What else is found under the name of a recording: its first bytes, what it is, and what to do.
 _OTHERS = {
     b"version https://git-lfs": ("is a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
-    b"#ROSBAG V": ("is a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst FOLDER --dst-storage mcap"),
+    b"#ROSBAG V": ("is a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
     b"SQLite format 3\0": (
         "is the SQLite storage of a ROS 2 bag",
         "convert its folder: rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap",
@@ -177,19 +177,17 @@ def _files(path: Path) -> Iterator[Path]:
     except (OSError, UnicodeDecodeError):
         raise RecordingError(
             f"{path} is a folder without a readable metadata.yaml; give one MCAP file, or let ROS write that file: "
-            "ros2 bag reindex FOLDER mcap."
+            "ros2 bag reindex FOLDER."
         ) from None
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
     listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
     if storage and storage[1] != "mcap":
         raise RecordingError(
             f"{path} is a recording in {storage[1]}, not in MCAP; convert it: "
-            f"rosbags-convert --src {path.name} --dst OTHER --dst-storage mcap."
+            "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap."
         )
     if not listed:
-        raise RecordingError(
-            f"{path / 'metadata.yaml'} lists no files; let ROS write it: ros2 bag reindex FOLDER mcap."
-        )
+        raise RecordingError(f"{path / 'metadata.yaml'} lists no files; let ROS write it: ros2 bag reindex FOLDER.")
     for line in listed[1].splitlines():
         # Older versions of ROS write the folder's own name before the file's.
         file = path / Path(line.strip().removeprefix("-").strip(" \"'")).name

@@ -1,12 +1,15 @@
 """Recordings: what was recorded comes back as arrays, and what cannot be used is refused in one sentence."""
 
 import json
+import re
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 from drives import ODOMETRY, SCAN, START, TURN, TWIST, drive, flipped, scan, store, uncompressed
+from rosbags import rosbag1, rosbag2
+from rosbags.convert.cli import main as convert
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
@@ -135,6 +138,40 @@ def test_folder_of_split_files_is_one_recording(tmp_path):
     store(tmp_path / "another.mcap", turns[0])
     recording = read_recording(rosbag(tmp_path, "drive/drive_0.mcap", '"drive_1.mcap"'))
     np.testing.assert_array_equal(np.sort((recording.stamp - START) // TURN), range(5))
+
+
+def written_by_rosbags(writer, release):
+    """Three scans, written by a library that shares nothing with this one."""
+    ros = get_typestore(release)
+    with writer:
+        topic = writer.add_connection("/scan", SCAN, typestore=ros)
+        for turn in range(3):
+            fields = vars(get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(scan(turn).to_bytes(), SCAN))
+            stamp = ros.types["builtin_interfaces/msg/Time"](**vars(fields["header"].stamp))
+            number = {"seq": turn} if release is Stores.ROS1_NOETIC else {}
+            fields["header"] = ros.types["std_msgs/msg/Header"](**number, stamp=stamp, frame_id="laser")
+            message = ros.types[SCAN](**fields)
+            serialize = ros.serialize_ros1 if number else ros.serialize_cdr
+            writer.write(topic, scan(turn).stamp, serialize(message, SCAN))
+
+
+@pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
+def test_recording_of_another_library_is_read_once_it_is_in_mcap(tmp_path, monkeypatch, kind):
+    path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
+    if kind == "ros1":
+        written_by_rosbags(rosbag1.Writer(path), Stores.ROS1_NOETIC)
+    else:
+        storage = rosbag2.StoragePlugin[kind.upper()]
+        written_by_rosbags(rosbag2.Writer(path, version=9, storage_plugin=storage), Stores.ROS2_HUMBLE)
+    if kind != "mcap":
+        # What the refusal says is what helps.
+        remedy = re.search(r"rosbags-convert .*mcap", refusal(path))[0]
+        remedy = re.sub("FILE|FOLDER", str(path), remedy).replace("OTHER", str(tmp_path / "new"))
+        monkeypatch.setattr("sys.argv", remedy.split())
+        with pytest.raises(SystemExit, match="0"):
+            convert()
+        path = tmp_path / "new"
+    np.testing.assert_array_equal(read_recording(path).ranges, [scan(turn).ranges for turn in range(3)])
 
 
 def test_folder_that_is_no_whole_recording_is_refused(tmp_path):
