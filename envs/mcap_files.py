@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Collection, Iterator
@@ -100,6 +101,21 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     for stored in messages.values():
         stored.sort(key=lambda message: message.log_time)
     return Contents(list(sources), messages, cut_off)
+
+
+def digest(path: str | os.PathLike[str]) -> str:
+    """SHA-256 of a recording, in hexadecimal; of a directory, of all its files one after the other.
+
+    Raises:
+        RecordingError: if there is no such recording.
+    """
+    whole = hashlib.sha256()
+    for file in _files(Path(path)):
+        _check_kind(file)
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                whole.update(block)
+    return whole.hexdigest()
 
 
 def _read_file(

@@ -21,7 +21,7 @@ from coil_rl.envs.recordings import Recording, read_recording
 from coil_rl.envs.sight import SAMPLES, SIGHT, to_car, to_world
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
-Path = str | os.PathLike[str]
+AnyPath = str | os.PathLike[str]
 
 
 class McapReplayEnv(EnvBase):
@@ -86,7 +86,7 @@ class McapReplayEnv(EnvBase):
 
     def __init__(
         self,
-        recordings: Path | Recording | Sequence[Path | Recording],
+        recordings: AnyPath | Recording | Sequence[AnyPath | Recording],
         perception: Perceive,
         *,
         scan: str = "/scan",

@@ -1,5 +1,6 @@
 """Recordings: what was recorded comes back as arrays, and what cannot be used is refused in one sentence."""
 
+import hashlib
 import json
 import re
 import warnings
@@ -14,6 +15,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from coil_rl.envs.cdr import definition
+from coil_rl.envs.mcap_files import digest
 from coil_rl.envs.recordings import RecordingError, read_recording
 from coil_rl.envs.ros_messages import Odometry, Twist
 
@@ -153,6 +155,16 @@ def written_by_rosbags(writer, release):
             message = ros.types[SCAN](**fields)
             serialize = ros.serialize_ros1 if number else ros.serialize_cdr
             writer.write(topic, scan(turn).stamp, serialize(message, SCAN))
+
+
+def test_digest_is_that_of_all_files_in_their_order(tmp_path):
+    parts = [store(tmp_path / f"{name}.mcap", scan(turn).to_bytes()) for turn, name in enumerate("ab")]
+    whole = hashlib.sha256(parts[0].read_bytes() + parts[1].read_bytes()).hexdigest()
+    assert digest(rosbag(tmp_path, "a.mcap", "b.mcap")) == whole
+    assert digest(rosbag(tmp_path, "b.mcap", "a.mcap")) != whole
+    assert digest(parts[0]) == hashlib.sha256(parts[0].read_bytes()).hexdigest()
+    with pytest.raises(RecordingError, match="No such file"):
+        digest(tmp_path / "missing.mcap")
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
