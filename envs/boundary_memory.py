@@ -1,4 +1,4 @@
-"""The observation of a robot that has no pose: what it last saw of a boundary, until it sees one again (A.3)."""
+"""The observation of a robot without a pose: what it last saw of a boundary, until it sees one again (A.3)."""
 
 from __future__ import annotations
 
@@ -55,9 +55,7 @@ class BoundaryMemory(nn.Module):
         if spline not in ("cubic", "quadratic"):
             raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
         if not 0 <= nearest < sight * farthest:
-            raise ValueError(
-                f"nearest={nearest} m must be at least 0 and below sight * farthest = {sight * farthest} m"
-            )
+            raise ValueError(f"nearest={nearest} m must be at least 0 and below {sight * farthest}, sight * farthest")
         self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
         self.sight, self.nearest, self.farthest = sight, nearest, farthest
         self.register_buffer("samples", torch.zeros(2, SAMPLES, 2, batch))
