@@ -6,6 +6,9 @@ from coil_rl.envs.level_files import load_track, load_tracks, save_track, shippe
 from coil_rl.envs.mcap_replay import McapReplayEnv
 from coil_rl.envs.recording_writer import RecordingWriter
 from coil_rl.envs.recordings import Recording, RecordingError, read_recording
+from coil_rl.envs.robot_track import robot_track
+from coil_rl.envs.simulated_drives import SimulatedDrive, labelling_drives, simulated_drive
+from coil_rl.envs.simulated_lidar import SimulatedLidar
 from coil_rl.envs.tabular_env import TabularEnv
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.envs.track_generator import random_track, random_tracks
@@ -17,14 +20,19 @@ __all__ = [
     "Recording",
     "RecordingError",
     "RecordingWriter",
+    "SimulatedDrive",
+    "SimulatedLidar",
     "TabularEnv",
     "Track",
     "TrackError",
+    "labelling_drives",
     "load_track",
     "load_tracks",
     "random_track",
     "random_tracks",
     "read_recording",
+    "robot_track",
     "save_track",
     "shipped_tracks",
+    "simulated_drive",
 ]
