@@ -1,5 +1,6 @@
 """The worlds: batched TorchRL envs and what they are made of."""
 
+from coil_rl.envs.cone_classifier import ConeClassifier, simulated_cone_classifier
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv
 from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_tracks
@@ -14,6 +15,7 @@ from coil_rl.envs.track import Track, TrackError
 from coil_rl.envs.track_generator import random_track, random_tracks
 
 __all__ = [
+    "ConeClassifier",
     "ConeTrackEnv",
     "DrivingTasksEnv",
     "McapReplayEnv",
@@ -34,5 +36,6 @@ __all__ = [
     "robot_track",
     "save_track",
     "shipped_tracks",
+    "simulated_cone_classifier",
     "simulated_drive",
 ]

@@ -1,0 +1,25 @@
+"""Training and measuring what the robot's perception knows: which clusters of a LiDAR scan are thick cones."""
+
+from coil_rl.perception.classifier import (
+    Training,
+    cone_classifier,
+    load_classifier,
+    save_classifier,
+    train_classifier,
+)
+from coil_rl.perception.labelling import LabelledClusters, Share, accuracy, label_clusters, recall
+from coil_rl.perception.simulated import train_on_simulated_drives
+
+__all__ = [
+    "LabelledClusters",
+    "Share",
+    "Training",
+    "accuracy",
+    "cone_classifier",
+    "label_clusters",
+    "load_classifier",
+    "recall",
+    "save_classifier",
+    "train_classifier",
+    "train_on_simulated_drives",
+]
