@@ -5,6 +5,7 @@ from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv
 from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_tracks
 from coil_rl.envs.mcap_replay import McapReplayEnv
+from coil_rl.envs.perception import Perception
 from coil_rl.envs.recording_writer import RecordingWriter
 from coil_rl.envs.recordings import Recording, RecordingError, read_recording
 from coil_rl.envs.robot_track import robot_track
@@ -19,6 +20,7 @@ __all__ = [
     "ConeTrackEnv",
     "DrivingTasksEnv",
     "McapReplayEnv",
+    "Perception",
     "Recording",
     "RecordingError",
     "RecordingWriter",
