@@ -11,6 +11,7 @@ from coil_rl.envs.recordings import Recording, RecordingError, read_recording
 from coil_rl.envs.robot_track import robot_track
 from coil_rl.envs.simulated_drives import SimulatedDrive, labelling_drives, simulated_drive
 from coil_rl.envs.simulated_lidar import SimulatedLidar
+from coil_rl.envs.simulated_robot import SimulatedRobotEnv
 from coil_rl.envs.tabular_env import TabularEnv
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.envs.track_generator import random_track, random_tracks
@@ -26,6 +27,7 @@ __all__ = [
     "RecordingWriter",
     "SimulatedDrive",
     "SimulatedLidar",
+    "SimulatedRobotEnv",
     "TabularEnv",
     "Track",
     "TrackError",

@@ -1,0 +1,262 @@
+"""The robot of the paper (section 4.2), simulated: a small car with a LiDAR between thin and thick cones.
+
+It drives on a physical track at 0.15 m/s, is steered once a turn of its LiDAR, and knows the world by its scans alone:
+cones hide one another, are taken for the other kind, or are not seen. What it writes has the keys and the scale of
+the cone world, so that any guide or policy of that world drives it unchanged. No real robot was measured for this.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import reduce
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from coil_rl.envs.boundary_memory import BoundaryMemory
+from coil_rl.envs.cone_classifier import simulated_cone_classifier
+from coil_rl.envs.cone_track import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
+from coil_rl.envs.perception import Perception
+from coil_rl.envs.robot_track import cones_of, robot_track
+from coil_rl.envs.sight import SAMPLES, to_car
+from coil_rl.envs.simulated_lidar import SimulatedLidar, driven
+from coil_rl.envs.track import SIDES, Track
+
+FINISH_RADIUS = 0.15  # m, so wide that nobody between the cones drives past it
+OUTLINE = (0.20, 0.12)  # m, length and width of the robot
+ON_THE_LINE = 0.02  # m: the middle of the robot this close to a boundary has left the track
+BOUNDARY_STEP = 0.005  # m
+
+
+class SimulatedRobotEnv(EnvBase):
+    """Simulated robots on one track, each by itself.
+
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes what `ConeTrackEnv` does:
+    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the simulation, `cone_count` [B, 2], `steering` [B, 1],
+    `reward`, `done`, `terminated`, `truncated` [B, 1], and under `info` the same entries in the robot's own metres, and
+    `valid` [B, 2], whether each side was seen in this scan. The reward is that of the cone world without the term
+    for cones: the robot cannot tell a new one from one that comes back. A robot crashes where its outline
+    touches a cone or its middle comes to the line between two. All state is in buffers; `scan` [B, P] m is the last
+    scan, infinite where nothing came back.
+
+    Args:
+        num_robots: B.
+        track: None for `robot_track()`.
+        perception: from scans to cones; None for one with the classifier that learned from simulated scans.
+        lidar: None for an RPLIDAR A1M8; its turns a second are the control steps.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        reward: weights, see `Reward`.
+        laps: completed laps that end an episode.
+        time_limit: s, then an episode is truncated.
+        speed: m/s.
+        car_length: L in m; by default that of the simulated car at a seventh of its size.
+        max_steering: degrees of an action of 1.
+        seed: of the LiDAR's noise.
+
+    Raises:
+        ValueError: for a value outside its range, naming it.
+
+    Example:
+        >>> from coil_rl.envs import SimulatedRobotEnv
+        >>> env = SimulatedRobotEnv(num_robots=2)
+        >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
+        torch.Size([2, 3, 20])
+    """
+
+    pose: Tensor
+    history: Tensor
+    steps: Tensor
+    lap: Tensor
+    clock: Tensor
+    on_line: Tensor
+    scan: Tensor
+
+    def __init__(
+        self,
+        num_robots: int = 1,
+        *,
+        track: Track | None = None,
+        perception: Perception | None = None,
+        lidar: SimulatedLidar | None = None,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        reward: dict[str, float] | None = None,
+        laps: int = 3,
+        time_limit: float = 200.0,
+        speed: float = 0.15,
+        car_length: float = 2 / 7,
+        max_steering: float = 80.0,
+        seed: int = 0,
+    ) -> None:
+        positive = {
+            "num_robots": num_robots, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
+            "max_steering": max_steering,
+        }  # fmt: skip
+        for name, given in positive.items():
+            if not 0 < given < math.inf:
+                raise ValueError(f"{name}={given} must be a finite number above 0")
+        if max_steering > 90:
+            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
+        check_weights("reward", reward or {}, Reward._fields)
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_robots]))
+        self.track = track or robot_track()
+        self.perception = perception or Perception(simulated_cone_classifier())
+        self.lidar = lidar or SimulatedLidar()
+        self.laps, self.max_steps = laps, round(time_limit * self.lidar.rate)
+        self.step_length, self.car_length = speed / self.lidar.rate, car_length
+        self.max_steering = math.radians(max_steering)
+        self.weights = {key: torch.tensor(float(x)) for key, x in Reward(**(reward or {}))._asdict().items()}
+        self.memory = BoundaryMemory(
+            num_robots, spline, smoothing, sight=self.perception.range_max * self.perception.scale
+        )
+        self.generator = torch.Generator()
+        self._survey()
+        self._declare_specs()
+        for name, value in {
+            "pose": self.start.expand(3, num_robots).clone(), "history": torch.zeros(HISTORY, num_robots),
+            "steps": torch.zeros(num_robots, dtype=torch.int64), "lap": torch.zeros(num_robots, dtype=torch.int64),
+            "clock": torch.full((num_robots,), -1), "on_line": torch.zeros(num_robots, dtype=torch.bool),
+            "scan": torch.full((num_robots, self.lidar.beams), torch.inf),
+        }.items():  # fmt: skip
+            self.register_buffer(name, value)
+        self.set_seed(seed)
+
+    def _survey(self) -> None:
+        """Note where everything stands."""
+        self.cones, self.radius = cones_of(self.track)
+        self.boundaries = [torch.as_tensor(self.track.boundary(side, BOUNDARY_STEP).T).float() for side in SIDES]
+        self.start = torch.tensor(self.track.start, dtype=torch.float32).unsqueeze(-1)
+        self.finish = torch.as_tensor(self.track.finish).float().unsqueeze(-1)
+
+    def get_extra_state(self) -> Tensor:
+        """The generator's state, so that `state_dict` also holds the noise yet to be drawn."""
+        return self.generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the generator."""
+        self.generator.set_state(state.cpu())
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self.generator.manual_seed(seed)
+
+    def _declare_specs(self) -> None:
+        robots = self.batch_size
+
+        def real(*shape: int) -> Unbounded:
+            return Unbounded((*robots, *shape), dtype=torch.float32)
+
+        def whole(*shape: int) -> Unbounded:
+            return Unbounded((*robots, *shape), dtype=torch.int64)
+
+        def flags(count: int) -> Binary:
+            return Binary(count, shape=(*robots, count), dtype=torch.bool)
+
+        info = Composite(
+            track=whole(1), lap=whole(1), lap_time=real(1), crashed=flags(1), clearance=real(1), smoothness=real(1),
+            pose=real(3), valid=flags(2), reward=Composite({term: real(1) for term in REWARD_TERMS}, shape=robots),
+            shape=robots,
+        )  # fmt: skip
+        self.observation_spec = Composite(
+            observation=Bounded(-1, 1, (*robots, 4 * SAMPLES)), cones=real(2, self.perception.kept_cones, 2),
+            cone_count=whole(2), steering=Bounded(-1, 1, (*robots, 1)), info=info, shape=robots,
+        )  # fmt: skip
+        self.action_spec = Bounded(-1, 1, (*robots, 1))
+        self.reward_spec = real(1)
+        self.done_spec = Composite({key: flags(1) for key in ("done", "terminated", "truncated")}, shape=robots)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        given = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(self.batch_size, dtype=torch.bool) if given is None else given.view(-1)
+        self.pose = torch.where(mask, self.start, self.pose)
+        for name, value in {"history": 0, "steps": 0, "lap": 0, "clock": -1, "on_line": False}.items():
+            setattr(self, name, getattr(self, name).masked_fill(mask, value))
+        # All robots measure, reset or not: which numbers are drawn next must not depend on the data.
+        standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
+        self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
+        self.memory.reset(mask)
+        # To see the same scan twice changes nothing for the others.
+        seen = self._see()
+        zero = torch.zeros(self.batch_size)
+        return self._tensordict(seen, zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero))
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].detach().view(-1).clamp(-1, 1)
+        roughness = (action - recent_mean(self.history)).abs()
+        self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
+        self.steps = self.steps + 1
+        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
+        phase = self.lidar.phase
+        on_the_way = driven(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
+        self.pose = driven(self.pose, torch.full_like(turn, self.step_length), turn)
+        self.scan = self._measure(on_the_way)
+        seen = self._see()
+
+        lap_time, finished = self._cross_the_line()
+        clearance, to_boundaries = self._clearance()
+        crashed = clearance <= 0
+        nothing, alive = torch.zeros_like(action), (~crashed).float()
+        outcome = Outcome(action, roughness, lap_time, finished, nothing, to_boundaries, crashed, alive)
+        terms = pay(outcome, self.weights)
+        terminated = crashed | (self.lap >= self.laps)
+        truncated = (self.steps >= self.max_steps) & ~terminated
+        out = self._tensordict(seen, lap_time, crashed, clearance, roughness, terms)
+        out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
+        out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
+        out["done"] = (terminated | truncated).unsqueeze(-1)
+        return out
+
+    def _measure(self, poses: Tensor) -> Tensor:
+        true, _ = self.lidar.cast(poses, self.cones, self.radius)
+        return self.lidar.measure(true, self.generator)[0]
+
+    def _see(self) -> dict[str, Tensor]:
+        """What the last scan shows, and what is remembered from before."""
+        cones, count = (torch.from_numpy(x) for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy()))
+        cones = cones.float()
+        observation, valid = self.memory(cones, count)
+        return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
+
+    def _cross_the_line(self) -> tuple[Tensor, Tensor]:
+        """Count laps; returns the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
+        inside = (self.pose[:2] - self.finish).norm(dim=0) < FINISH_RADIUS
+        entered = inside & ~self.on_line
+        finished = entered & (self.clock >= 0)
+        lap_time = (self.steps - self.clock) * finished / self.lidar.rate
+        self.on_line, self.lap = inside, self.lap + finished
+        self.clock = torch.where(entered, self.steps, self.clock)
+        return lap_time, finished
+
+    def _clearance(self) -> tuple[Tensor, Tensor]:
+        """How far each robot is from a crash [B] m, and from the left and the right boundary [2, B] m."""
+        place = self.pose[:2].unsqueeze(1)
+        beyond = to_car(self.pose, self.cones.unsqueeze(-1)).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
+        to_cone = (beyond.clamp(min=0).norm(dim=0) - self.radius.unsqueeze(-1)).amin(0)
+        lines = [(line.unsqueeze(-1) - place).norm(dim=0).amin(0) for line in self.boundaries]
+        to_boundaries = torch.stack(lines)
+        return torch.minimum(to_cone, to_boundaries.amin(0) - ON_THE_LINE), to_boundaries
+
+    def _tensordict(
+        self,
+        seen: dict[str, Tensor],
+        lap_time: Tensor,
+        crashed: Tensor,
+        clearance: Tensor,
+        smoothness: Tensor,
+        terms: dict[str, Tensor],
+    ) -> TensorDict:
+        columns = {
+            "track": torch.zeros_like(self.lap), "lap": self.lap, "lap_time": lap_time, "crashed": crashed,
+            "clearance": clearance, "smoothness": smoothness,
+        }  # fmt: skip
+        paid = {key: value.unsqueeze(-1) for key, value in terms.items()}
+        info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
+        info |= {"pose": self.pose.t(), "valid": seen["valid"], "reward": TensorDict(paid, self.batch_size)}
+        entries: dict[str, Any] = {key: seen[key] for key in ("observation", "cones", "cone_count")}
+        entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
+        return TensorDict(entries, self.batch_size, device=self.device)
