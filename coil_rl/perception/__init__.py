@@ -8,6 +8,7 @@ from coil_rl.perception.classifier import (
     train_classifier,
 )
 from coil_rl.perception.labelling import LabelledClusters, Share, accuracy, label_clusters, recall
+from coil_rl.perception.results import write_simulated_results
 from coil_rl.perception.simulated import train_on_simulated_drives
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "save_classifier",
     "train_classifier",
     "train_on_simulated_drives",
+    "write_simulated_results",
 ]
