@@ -124,11 +124,11 @@ def single_linkage(points: Points, gap: float = GAP) -> Integers:
         one, other, at = one[near], other[near] + 1, at[near]
         close = _closer(points, one, at, gap)
         joined.append((run[one[close]], run[at[close]]))
-    ends = tuple(np.concatenate(end) for end in zip(*joined, strict=True))
-    if not len(ends[0]):
+    first, second = (np.concatenate(end) for end in zip(*joined, strict=True))
+    if (first == second).all():  # which a graph takes long to say
         return run
     runs = int(run[-1]) + 1
-    graph = coo_array((np.ones(len(ends[0]), dtype=np.int8), ends), shape=(runs, runs))
+    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(runs, runs))
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[run]
 
 
