@@ -11,6 +11,7 @@ from coil_rl.envs.recordings import Recording, RecordingError, read_recording
 from coil_rl.envs.robot_track import robot_track
 from coil_rl.envs.simulated_drives import SimulatedDrive, labelling_drives, simulated_drive
 from coil_rl.envs.simulated_lidar import SimulatedLidar
+from coil_rl.envs.simulated_recordings import record_drives, save_drive
 from coil_rl.envs.simulated_robot import SimulatedRobotEnv
 from coil_rl.envs.tabular_env import TabularEnv
 from coil_rl.envs.track import Track, TrackError
@@ -37,7 +38,9 @@ __all__ = [
     "random_track",
     "random_tracks",
     "read_recording",
+    "record_drives",
     "robot_track",
+    "save_drive",
     "save_track",
     "shipped_tracks",
     "simulated_cone_classifier",

@@ -1,0 +1,95 @@
+import numpy as np
+import pytest
+import torch
+from mcap.reader import make_reader
+from torchrl.envs.utils import step_mdp
+
+from coil_rl.envs import (
+    McapReplayEnv,
+    Perception,
+    SimulatedRobotEnv,
+    read_recording,
+    record_drives,
+    save_drive,
+    simulated_cone_classifier,
+    simulated_drive,
+)
+from coil_rl.guides import ConstantGuide, SplineGuide
+
+
+def metadata(path):
+    with path.open("rb") as file:
+        return {entry.name: dict(entry.metadata) for entry in make_reader(file).iter_metadata()}
+
+
+def test_a_labelling_drive_reads_back_and_says_that_it_is_simulated(tmp_path):
+    drive, path = simulated_drive("left", seed=3), tmp_path / "left.mcap"
+    save_drive(drive, path)
+    recording = read_recording(path, strict=True)
+    assert np.array_equal(recording.ranges, drive.ranges.numpy())
+    np.testing.assert_allclose(recording.angles(0), drive.angles, atol=1e-6)
+    np.testing.assert_allclose(recording.seconds, drive.seconds, atol=1e-8)
+    np.testing.assert_allclose(recording.poses()[:, :2], drive.poses[:2, :, 0].t(), atol=1e-6)
+    assert metadata(path)["simulated"]["drive"] == "left_3"
+
+
+@pytest.fixture(scope="module")
+def live():
+    """What two robots saw and did in 25 steps of the guide."""
+    env = SimulatedRobotEnv(2, time_limit=25 / 5.5, seed=4)
+    rows, state = [], env.reset()
+    for _ in range(25):
+        step = env.step(SplineGuide()(state))
+        rows.append(step)
+        state = step_mdp(step)
+    return torch.stack(rows, 1)
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    paths = [tmp_path_factory.mktemp("drives") / f"{robot}.mcap" for robot in (0, 1)]
+    env = SimulatedRobotEnv(2, time_limit=25 / 5.5, seed=4)
+    record_drives(env, SplineGuide(), paths, {"policy": "spline"})
+    return paths
+
+
+def test_the_replay_shows_what_the_robot_saw_and_what_it_was_told(files, live):
+    replay = McapReplayEnv(files, Perception(simulated_cone_classifier()))
+    again = replay.rollout(100, SplineGuide())
+    assert again.shape == live.shape
+    for key in ("cones", "observation", "action"):
+        torch.testing.assert_close(again[key], live[key], atol=1e-3, rtol=0)
+    assert torch.equal(again["cone_count"], live["cone_count"])
+    assert torch.equal(again["info", "valid"], live["info", "valid"])
+    for robot, path in enumerate(files):
+        told, _ = read_recording(path).commands
+        expected = (live["action"][robot, :, 0] * np.radians(80)).sin() * 0.15 / (2 / 7)
+        np.testing.assert_allclose(told[:, 1], expected, atol=1e-6)
+        np.testing.assert_allclose(told[:, 0], 0.15, atol=1e-6)
+
+
+def test_odometry_tells_where_each_turn_began(files, live):
+    poses = read_recording(files[0]).poses()
+    # The first turn was made standing at the start, and each later one began where the robot was a step before.
+    np.testing.assert_allclose(poses[0], live["info", "pose"][0, 0], atol=1e-6)
+    np.testing.assert_allclose(poses[1:], live["info", "pose"][0, :-1], atol=1e-6)
+
+
+def test_a_recording_ends_with_its_robots_episode(tmp_path):
+    env = SimulatedRobotEnv(1)
+    record_drives(env, ConstantGuide(1.0), [tmp_path / "crash.mcap"])
+    recording = read_recording(tmp_path / "crash.mcap")
+    assert 5 < len(recording.log_time) == int(env.steps) < 40
+    assert metadata(tmp_path / "crash.mcap")["simulated"]["drive"] == "closed loop"
+
+
+def test_the_same_drive_is_the_same_file(tmp_path):
+    drive = simulated_drive("right", seed=0)
+    for name in ("a", "b"):
+        save_drive(drive, tmp_path / f"{name}.mcap")
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_there_must_be_a_file_for_each_robot(tmp_path):
+    with pytest.raises(ValueError, match="1 paths for 2 robots"):
+        record_drives(SimulatedRobotEnv(2), SplineGuide(), [tmp_path / "a.mcap"])
