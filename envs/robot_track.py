@@ -29,6 +29,11 @@ def robot_track() -> Track:
     return Track("robot (simulated)", left, right)
 
 
+def robot_tracks() -> list[Track]:
+    """The robot's track, as a list of one."""
+    return [robot_track()]
+
+
 def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
     """The cones of a robot's track: centres [2, M] m and radii [M] m, thin ones on the left and thick on the right."""
     chosen = [(ring, size) for ring, size, on in ((track.left, THIN, left), (track.right, THICK, right)) if on]

@@ -68,18 +68,18 @@ class SimulatedLidar:
 
         Args:
             poses: of the sensor as each beam is sent, [3, B, P] (m, m, radians).
-            cones: centres, [2, M] m.
-            radius: [M] m.
+            cones: centres, [2, M] m, or [2, B, M] where each sensor stands among others.
+            radius: [M] or [B, M] m.
 
         Returns:
             [B, P] m, infinite where a beam meets no cone, and the number of the cone it meets [B, P], -1 for none.
         """
         direction = poses[2] + self.angles
         ahead_x, ahead_y = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
-        x, y = cones[0] - poses[0].unsqueeze(-1), cones[1] - poses[1].unsqueeze(-1)
+        x, y = (stand.unsqueeze(-2) - at.unsqueeze(-1) for stand, at in zip(cones, poses[:2], strict=True))
         along = x * ahead_x + y * ahead_y
         beside = y * ahead_x - x * ahead_y
-        deep = radius.square() - beside.square()
+        deep = radius.square().unsqueeze(-2) - beside.square()
         reach = along - deep.clamp(min=0).sqrt()
         nearest, cone = torch.where((deep > 0) & (along > 0), reach, torch.inf).min(-1)
         return nearest, torch.where(nearest.isfinite(), cone, -1)

@@ -8,9 +8,11 @@ the cone world, so that any guide or policy of that world drives it unchanged. N
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any, Literal
 
+import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -30,10 +32,11 @@ FINISH_RADIUS = 0.15  # m, so wide that nobody between the cones drives past it
 OUTLINE = (0.20, 0.12)  # m, length and width of the robot
 ON_THE_LINE = 0.02  # m: the middle of the robot this close to a boundary has left the track
 BOUNDARY_STEP = 0.005  # m
+FAR = 1e3  # m
 
 
 class SimulatedRobotEnv(EnvBase):
-    """Simulated robots on one track, each by itself.
+    """Simulated robots on tracks between cones, each by itself.
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes what `ConeTrackEnv` does:
     `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the simulation, `cone_count` [B, 2], `steering` [B, 1],
@@ -44,8 +47,9 @@ class SimulatedRobotEnv(EnvBase):
     scan, infinite where nothing came back.
 
     Args:
-        num_robots: B.
-        track: None for `robot_track()`.
+        tracks: where to drive, in the robot's own metres; None for `robot_track()`.
+        num_cars: B.
+        assignment: "random" draws a track at each reset, "cyclic" keeps robot i on track i mod len(tracks).
         perception: from scans to cones; None for one with the classifier that learned from simulated scans.
         lidar: None for an RPLIDAR A1M8; its turns a second are the control steps.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
@@ -56,18 +60,19 @@ class SimulatedRobotEnv(EnvBase):
         speed: m/s.
         car_length: L in m; by default that of the simulated car at a seventh of its size.
         max_steering: degrees of an action of 1.
-        seed: of the LiDAR's noise.
+        seed: of the LiDAR's noise, and of the draw of tracks.
 
     Raises:
         ValueError: for a value outside its range, naming it.
 
     Example:
         >>> from coil_rl.envs import SimulatedRobotEnv
-        >>> env = SimulatedRobotEnv(num_robots=2)
+        >>> env = SimulatedRobotEnv(num_cars=2)
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([2, 3, 20])
     """
 
+    track: Tensor
     pose: Tensor
     history: Tensor
     steps: Tensor
@@ -78,9 +83,10 @@ class SimulatedRobotEnv(EnvBase):
 
     def __init__(
         self,
-        num_robots: int = 1,
+        tracks: Sequence[Track] | None = None,
+        num_cars: int = 1,
         *,
-        track: Track | None = None,
+        assignment: Literal["random", "cyclic"] = "random",
         perception: Perception | None = None,
         lidar: SimulatedLidar | None = None,
         spline: Literal["cubic", "quadratic"] = "cubic",
@@ -94,7 +100,7 @@ class SimulatedRobotEnv(EnvBase):
         seed: int = 0,
     ) -> None:
         positive = {
-            "num_robots": num_robots, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
+            "num_cars": num_cars, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
             "max_steering": max_steering,
         }  # fmt: skip
         for name, given in positive.items():
@@ -102,9 +108,14 @@ class SimulatedRobotEnv(EnvBase):
                 raise ValueError(f"{name}={given} must be a finite number above 0")
         if max_steering > 90:
             raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
+        if assignment not in ("random", "cyclic"):
+            raise ValueError(f"assignment={assignment!r} must be one of random, cyclic")
+        if tracks is not None and not tracks:
+            raise ValueError("tracks is empty; give at least one, or None for robot_track()")
         check_weights("reward", reward or {}, Reward._fields)
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_robots]))
-        self.track = track or robot_track()
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_cars]))
+        self.tracks = [robot_track()] if tracks is None else list(tracks)
+        self.assignment = assignment
         self.perception = perception or Perception(simulated_cone_classifier())
         self.lidar = lidar or SimulatedLidar()
         self.laps, self.max_steps = laps, round(time_limit * self.lidar.rate)
@@ -112,26 +123,30 @@ class SimulatedRobotEnv(EnvBase):
         self.max_steering = math.radians(max_steering)
         self.weights = {key: torch.tensor(float(x)) for key, x in Reward(**(reward or {}))._asdict().items()}
         self.memory = BoundaryMemory(
-            num_robots, spline, smoothing, sight=self.perception.range_max * self.perception.scale
+            num_cars, spline, smoothing, sight=self.perception.range_max * self.perception.scale
         )
         self.generator = torch.Generator()
         self._survey()
         self._declare_specs()
         for name, value in {
-            "pose": self.start.expand(3, num_robots).clone(), "history": torch.zeros(HISTORY, num_robots),
-            "steps": torch.zeros(num_robots, dtype=torch.int64), "lap": torch.zeros(num_robots, dtype=torch.int64),
-            "clock": torch.full((num_robots,), -1), "on_line": torch.zeros(num_robots, dtype=torch.bool),
-            "scan": torch.full((num_robots, self.lidar.beams), torch.inf),
+            "track": torch.arange(num_cars) % len(self.tracks), "pose": torch.zeros(3, num_cars),
+            "history": torch.zeros(HISTORY, num_cars),
+            "steps": torch.zeros(num_cars, dtype=torch.int64), "lap": torch.zeros(num_cars, dtype=torch.int64),
+            "clock": torch.full((num_cars,), -1), "on_line": torch.zeros(num_cars, dtype=torch.bool),
+            "scan": torch.full((num_cars, self.lidar.beams), torch.inf),
         }.items():  # fmt: skip
             self.register_buffer(name, value)
         self.set_seed(seed)
 
     def _survey(self) -> None:
-        """Note where everything stands."""
-        self.cones, self.radius = cones_of(self.track)
-        self.boundaries = [torch.as_tensor(self.track.boundary(side, BOUNDARY_STEP).T).float() for side in SIDES]
-        self.start = torch.tensor(self.track.start, dtype=torch.float32).unsqueeze(-1)
-        self.finish = torch.as_tensor(self.track.finish).float().unsqueeze(-1)
+        """Note where everything stands on each of the T tracks; what one has fewer of is filled up far away."""
+        stands = [cones_of(track) for track in self.tracks]
+        self.cones = _stacked([place for place, _ in stands], FAR)  # [2, T, M] m
+        self.radius = _stacked([radius.unsqueeze(0) for _, radius in stands], 0.0)[0]  # [T, M] m
+        lines = ([torch.tensor(track.boundary(side, BOUNDARY_STEP).T) for track in self.tracks] for side in SIDES)
+        self.boundaries = [_stacked(of_side, FAR) for of_side in lines]  # [2, T, points] m
+        self.starts = torch.tensor([track.start for track in self.tracks]).t()
+        self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
 
     def get_extra_state(self) -> Tensor:
         """The generator's state, so that `state_dict` also holds the noise yet to be drawn."""
@@ -173,10 +188,13 @@ class SimulatedRobotEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         given = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if given is None else given.view(-1)
-        self.pose = torch.where(mask, self.start, self.pose)
+        if self.assignment == "random":
+            # All robots draw and measure, reset or not: which numbers come next must not depend on the data.
+            drawn = torch.randint(len(self.tracks), self.batch_size, generator=self.generator)
+            self.track = torch.where(mask, drawn, self.track)
+        self.pose = torch.where(mask, self.starts[:, self.track], self.pose)
         for name, value in {"history": 0, "steps": 0, "lap": 0, "clock": -1, "on_line": False}.items():
             setattr(self, name, getattr(self, name).masked_fill(mask, value))
-        # All robots measure, reset or not: which numbers are drawn next must not depend on the data.
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
         self.memory.reset(mask)
@@ -212,7 +230,7 @@ class SimulatedRobotEnv(EnvBase):
         return out
 
     def _measure(self, poses: Tensor) -> Tensor:
-        true, _ = self.lidar.cast(poses, self.cones, self.radius)
+        true, _ = self.lidar.cast(poses, self.cones[:, self.track], self.radius[self.track])
         return self.lidar.measure(true, self.generator)[0]
 
     def _see(self) -> dict[str, Tensor]:
@@ -224,7 +242,7 @@ class SimulatedRobotEnv(EnvBase):
 
     def _cross_the_line(self) -> tuple[Tensor, Tensor]:
         """Count laps; returns the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
-        inside = (self.pose[:2] - self.finish).norm(dim=0) < FINISH_RADIUS
+        inside = (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
         entered = inside & ~self.on_line
         finished = entered & (self.clock >= 0)
         lap_time = (self.steps - self.clock) * finished / self.lidar.rate
@@ -234,11 +252,11 @@ class SimulatedRobotEnv(EnvBase):
 
     def _clearance(self) -> tuple[Tensor, Tensor]:
         """How far each robot is from a crash [B] m, and from the left and the right boundary [2, B] m."""
-        place = self.pose[:2].unsqueeze(1)
-        beyond = to_car(self.pose, self.cones.unsqueeze(-1)).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
-        to_cone = (beyond.clamp(min=0).norm(dim=0) - self.radius.unsqueeze(-1)).amin(0)
-        lines = [(line.unsqueeze(-1) - place).norm(dim=0).amin(0) for line in self.boundaries]
-        to_boundaries = torch.stack(lines)
+        stand, radius = self.cones[:, self.track].transpose(1, 2), self.radius[self.track].t()
+        beyond = to_car(self.pose, stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
+        to_cone = (beyond.clamp(min=0).norm(dim=0) - radius).amin(0)
+        place = self.pose[:2].unsqueeze(-1)
+        to_boundaries = torch.stack([(line[:, self.track] - place).norm(dim=0).amin(-1) for line in self.boundaries])
         return torch.minimum(to_cone, to_boundaries.amin(0) - ON_THE_LINE), to_boundaries
 
     def _tensordict(
@@ -251,7 +269,7 @@ class SimulatedRobotEnv(EnvBase):
         terms: dict[str, Tensor],
     ) -> TensorDict:
         columns = {
-            "track": torch.zeros_like(self.lap), "lap": self.lap, "lap_time": lap_time, "crashed": crashed,
+            "track": self.track, "lap": self.lap, "lap_time": lap_time, "crashed": crashed,
             "clearance": clearance, "smoothness": smoothness,
         }  # fmt: skip
         paid = {key: value.unsqueeze(-1) for key, value in terms.items()}
@@ -260,3 +278,12 @@ class SimulatedRobotEnv(EnvBase):
         entries: dict[str, Any] = {key: seen[key] for key in ("observation", "cones", "cone_count")}
         entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
         return TensorDict(entries, self.batch_size, device=self.device)
+
+
+def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:
+    """Tables [D, any] as one, [D, T, most]."""
+    most = max(table.shape[1] for table in tables)
+    wide = torch.full((len(tables[0]), len(tables), most), padding)
+    for index, table in enumerate(tables):
+        wide[:, index, : table.shape[1]] = table
+    return wide

@@ -36,7 +36,7 @@ def test_a_labelling_drive_reads_back_and_says_that_it_is_simulated(tmp_path):
 @pytest.fixture(scope="module")
 def live():
     """What two robots saw and did in 25 steps of the guide."""
-    env = SimulatedRobotEnv(2, time_limit=25 / 5.5, seed=4)
+    env = SimulatedRobotEnv(num_cars=2, time_limit=25 / 5.5, seed=4)
     rows, state = [], env.reset()
     for _ in range(25):
         step = env.step(SplineGuide()(state))
@@ -48,7 +48,7 @@ def live():
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     paths = [tmp_path_factory.mktemp("drives") / f"{robot}.mcap" for robot in (0, 1)]
-    env = SimulatedRobotEnv(2, time_limit=25 / 5.5, seed=4)
+    env = SimulatedRobotEnv(num_cars=2, time_limit=25 / 5.5, seed=4)
     record_drives(env, SplineGuide(), paths, {"policy": "spline"})
     return paths
 
@@ -76,7 +76,7 @@ def test_odometry_tells_where_each_turn_began(files, live):
 
 
 def test_a_recording_ends_with_its_robots_episode(tmp_path):
-    env = SimulatedRobotEnv(1)
+    env = SimulatedRobotEnv(num_cars=1)
     record_drives(env, ConstantGuide(1.0), [tmp_path / "crash.mcap"])
     recording = read_recording(tmp_path / "crash.mcap")
     assert 5 < len(recording.log_time) == int(env.steps) < 40
@@ -92,4 +92,4 @@ def test_the_same_drive_is_the_same_file(tmp_path):
 
 def test_there_must_be_a_file_for_each_robot(tmp_path):
     with pytest.raises(ValueError, match="1 paths for 2 robots"):
-        record_drives(SimulatedRobotEnv(2), SplineGuide(), [tmp_path / "a.mcap"])
+        record_drives(SimulatedRobotEnv(num_cars=2), SplineGuide(), [tmp_path / "a.mcap"])

@@ -6,7 +6,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
 from coil_rl import testing
-from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, robot_track, shipped_tracks
+from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, Track, robot_track, shipped_tracks
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.evaluation import drive
 from coil_rl.guides import ConstantGuide, SplineGuide
@@ -14,7 +14,7 @@ from coil_rl.transforms import GuideActions
 
 
 def robots(count=2, **world) -> SimulatedRobotEnv:
-    return SimulatedRobotEnv(count, **world)
+    return SimulatedRobotEnv(num_cars=count, **world)
 
 
 def steered(env, actions):
@@ -102,8 +102,8 @@ def test_whoever_does_not_steer_well_crashes_into_a_cone_or_leaves_the_track(act
 def test_clearance_is_from_the_outline_to_a_cone():
     env = robots(1)
     env.reset()
-    x, y, _ = env.track.start
-    env.cones, env.radius = torch.tensor([[x], [y]]) + 0.15 * torch.tensor([[0.0], [1.0]]), torch.tensor([0.045])
+    x, y, _ = robot_track().start
+    env.cones, env.radius = torch.tensor([x, y + 0.15]).view(2, 1, 1), torch.tensor([[0.045]])
     env.pose = torch.tensor([[x], [y], [0.0]])
     assert env._clearance()[0].item() == pytest.approx(0.15 - 0.06 - 0.045, abs=1e-5)
     env.pose[2] = math.pi / 2
@@ -130,16 +130,59 @@ def test_what_it_sees_follows_the_rules_of_its_perception():
     assert (near < robots(1).reset()["cone_count"]).all()
 
 
+def mirrored() -> Track:
+    """The robot's track driven the other way round."""
+    here = robot_track()
+    return Track("mirrored", left=here.right * [1, -1], right=here.left * [1, -1])
+
+
+def test_robots_drive_on_their_own_tracks():
+    env = robots(4, tracks=[robot_track(), mirrored()], assignment="cyclic", laps=1)
+    result = drive(env, SplineGuide(), names=["one", "other"])
+    assert [episode["track"] for episode in result.episodes] == ["one", "other"] * 2
+    assert all(episode["completed"] for episode in result.episodes)
+    ends = [line[:, 1].max() - line[:, 1].min() for line in result.lines]
+    assert all(end > 1 for end in ends)
+    assert result.lines[0][:, 1].mean() > 0.3 > -0.3 > result.lines[1][:, 1].mean()
+
+
+def test_a_robots_world_does_not_depend_on_the_tracks_of_others():
+    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
+    kept = {"lidar": exact, "assignment": "cyclic"}
+    alone = steered(robots(1, **kept), [0.2, -0.1])[-1]
+    among = steered(robots(2, tracks=[robot_track(), shorter()], **kept), [0.2, -0.1])[-1]
+    torch.testing.assert_close(alone["observation"][0], among["observation"][0])
+    torch.testing.assert_close(alone["info", "clearance"][0], among["info", "clearance"][0])
+
+
+def shorter() -> Track:
+    """A track with fewer cones."""
+    turn = torch.arange(0, 2 * math.pi, 2 * math.pi / 12).numpy()
+    circle = torch.tensor([[math.cos(t), math.sin(t)] for t in turn]).numpy()
+    return Track("ring", left=0.4 * circle, right=0.8 * circle)
+
+
+def test_tracks_are_drawn_at_random_at_each_reset():
+    env = robots(64, tracks=[robot_track(), mirrored()])
+    first, second = (env.reset()["info", "track"] for _ in range(2))
+    assert 15 < first.sum() < 49
+    assert not torch.equal(first, second)
+
+
 def test_a_policy_may_be_any_module_of_the_observation():
     policy = TensorDictModule(lambda seen: seen[..., :1] * 0, in_keys=["observation"], out_keys=["action"])
     assert drive(robots(1), policy).episodes[0]["crashed"]
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"num_robots": 0}, {"speed": -1}, {"laps": 0}, {"max_steering": 100}, {"car_length": math.inf}]
+    "wrong", [{"num_cars": 0}, {"speed": -1}, {"laps": 0}, {"max_steering": 100}, {"car_length": math.inf}]
 )
 def test_what_cannot_be_is_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
         SimulatedRobotEnv(**wrong)
+    with pytest.raises(ValueError, match="tracks is empty"):
+        SimulatedRobotEnv([])
+    with pytest.raises(ValueError, match="assignment='all' must be one of random, cyclic"):
+        SimulatedRobotEnv(assignment="all")
     with pytest.raises(ValueError, match="reward has no weight"):
         SimulatedRobotEnv(reward={"speed": 1.0})
