@@ -8,7 +8,7 @@ from coil_rl.envs.mcap_replay import McapReplayEnv
 from coil_rl.envs.perception import Perception
 from coil_rl.envs.recording_writer import RecordingWriter
 from coil_rl.envs.recordings import Recording, RecordingError, read_recording
-from coil_rl.envs.robot_track import robot_track
+from coil_rl.envs.robot_course import robot_track, robot_tracks
 from coil_rl.envs.simulated_drives import SimulatedDrive, labelling_drives, simulated_drive
 from coil_rl.envs.simulated_lidar import SimulatedLidar
 from coil_rl.envs.simulated_recordings import record_drives, save_drive
@@ -40,6 +40,7 @@ __all__ = [
     "read_recording",
     "record_drives",
     "robot_track",
+    "robot_tracks",
     "save_drive",
     "save_track",
     "shipped_tracks",

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coil_rl.envs.robot_track import THICK, THIN, cones_of, middle_line, robot_track
+from coil_rl.envs.robot_course import THICK, THIN, cones_of, middle_line, robot_track
 from coil_rl.envs.simulated_lidar import SimulatedLidar
 from coil_rl.envs.track import Track
 

@@ -23,7 +23,7 @@ from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.cone_classifier import simulated_cone_classifier
 from coil_rl.envs.cone_track import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
 from coil_rl.envs.perception import Perception
-from coil_rl.envs.robot_track import cones_of, robot_track
+from coil_rl.envs.robot_course import cones_of, robot_track
 from coil_rl.envs.sight import SAMPLES, to_car
 from coil_rl.envs.simulated_lidar import SimulatedLidar, driven
 from coil_rl.envs.track import SIDES, Track

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from coil_rl.envs import Perception, SimulatedLidar, simulated_cone_classifier, simulated_drive
-from coil_rl.envs.robot_track import THICK, THIN
+from coil_rl.envs.robot_course import THICK, THIN
 
 EXACT = SimulatedLidar(noise=0.0, noise_growth=0.0, no_return=0.0, outliers=0.0)
 

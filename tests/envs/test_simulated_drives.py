@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from coil_rl.envs import SimulatedLidar, labelling_drives, robot_track, simulated_drive
-from coil_rl.envs.robot_track import middle_line
+from coil_rl.envs.robot_course import middle_line
 
 
 @pytest.fixture(scope="module")

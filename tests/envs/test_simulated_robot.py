@@ -2,10 +2,13 @@ import math
 
 import pytest
 import torch
+from hydra import compose, initialize_config_module
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
+from coil_rl import config as _schema  # noqa: F401
 from coil_rl import testing
+from coil_rl.build import build_env
 from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, Track, robot_track, shipped_tracks
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.evaluation import drive
@@ -186,3 +189,16 @@ def test_what_cannot_be_is_refused(wrong):
         SimulatedRobotEnv(assignment="all")
     with pytest.raises(ValueError, match="reward has no weight"):
         SimulatedRobotEnv(reward={"speed": 1.0})
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+def test_configuration_builds_the_env_as_its_defaults_are(program):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose(program, ["env=simulated_robot", "track=robot", "budget.cars=2", "run_dir=unused"])
+    env = build_env(config, {**config.evaluation.env, "num_cars": 3}).base_env
+    assert isinstance(env, SimulatedRobotEnv)
+    plain = SimulatedRobotEnv(num_cars=3, assignment="cyclic")
+    for one, other in ((env, plain), (env.perception, plain.perception), (env.lidar, plain.lidar)):
+        numbers = {name: value for name, value in vars(other).items() if isinstance(value, (int, float))}
+        assert {name: vars(one)[name] for name in numbers} == pytest.approx(numbers, rel=1e-5)
+    assert {key: float(value) for key, value in env.weights.items()} == plain.weights

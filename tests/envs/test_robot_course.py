@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from coil_rl.envs import robot_track
-from coil_rl.envs.robot_track import THICK, THIN, cones_of, middle_line
+from coil_rl.envs.robot_course import THICK, THIN, cones_of, middle_line
 
 
 def test_a_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
