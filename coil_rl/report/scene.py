@@ -32,7 +32,7 @@ HEADER_GAP = 0.12
 FOOT_HEIGHT = 0.34
 TALLEST = 4.6
 MOST_IN_A_ROW = 3
-SCALE_BAR = 10  # m
+SCALE_BARS = (10, 1)  # m; the first that takes at most half the width
 CONE_RADIUS = 0.24  # m
 FINISH_LINE = 0.35  # m
 
@@ -130,11 +130,9 @@ class Scene:
     def _scale_bar(self) -> None:
         height = float(self.figure.get_size_inches()[1])
         x, y = self._metres(style.MARGIN, height - 0.14)
-        self.axes.plot(
-            [x, x, x + SCALE_BAR, x + SCALE_BAR], np.array([0.04, 0, 0, 0.04]) / self.scale + y, color=style.INK, lw=1
-        )
-        x += SCALE_BAR + 0.07 / self.scale
-        self.axes.text(x, y, f"{SCALE_BAR} m", size=8, va="center")
+        bar = next((bar for bar in SCALE_BARS if bar * self.scale <= style.WIDTH / 2), SCALE_BARS[-1])
+        self.axes.plot([x, x, x + bar, x + bar], np.array([0.04, 0, 0, 0.04]) / self.scale + y, color=style.INK, lw=1)
+        self.axes.text(x + bar + 0.07 / self.scale, y, f"{bar} m", size=8, va="center")
 
 
 def _track_handles() -> list[Line2D]:
