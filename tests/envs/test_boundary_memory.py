@@ -3,6 +3,7 @@ import torch
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.envs.boundary_memory import BoundaryMemory
+from coil_rl.guides import SplineGuide
 
 
 def seen(left=(), right=(), batch=1):
@@ -20,7 +21,7 @@ LEFT, RIGHT = [(1.5, 1.0), (3.0, 1.2), (5.0, 1.0)], [(1.5, -1.0), (3.0, -1.2)]
 def test_while_both_sides_show_two_cones_it_is_the_observation_of_the_cone_world():
     env = ConeTrackEnv(shipped_tracks("test"), 3, assignment="cyclic")
     memory = BoundaryMemory(3)
-    rollout = env.rollout(60, break_when_any_done=False)
+    rollout = env.rollout(60, SplineGuide(), break_when_any_done=False)
     both = 0
     for step in range(60):
         state = rollout[:, step]
