@@ -32,6 +32,7 @@ class GuideActions(Transform):
         out_key: where the advice goes, [*batch, n_guides, A], in action units.
 
     Raises:
+        TypeError: if the guides have no names.
         ValueError: without a guide, or if one does not write `action_key`.
 
     Example:
@@ -49,6 +50,8 @@ class GuideActions(Transform):
         action_key: NestedKey = "action",
         out_key: NestedKey = "guide_action",
     ) -> None:
+        if not isinstance(guides, Mapping):
+            raise TypeError(f"guides must be a table from name to guide, not {type(guides).__name__}")
         if not guides:
             raise ValueError("GuideActions needs at least one guide, none was given")
         for name, guide in guides.items():

@@ -66,7 +66,8 @@ def test_every_learner_builds_from_the_env(learner):
 def test_every_track_group_gives_tracks(track):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         node = compose("train", [f"track={track}", "run_dir=unused"]).track
-    assert len(build(node.train, "track.train")) > 3 <= len(build(node.test, "track.test"))
+    fewest = 1 if track == "robot" else 3  # whose course is one
+    assert min(len(build(node.train, "track.train")), len(build(node.test, "track.test"))) >= fewest
 
 
 def test_evaluate_composes():

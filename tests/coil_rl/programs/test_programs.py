@@ -124,7 +124,9 @@ def test_part_of_another_package_needs_no_change_here(tmp_path, monkeypatch):
     experiments = tmp_path / "conf" / "experiment"
     experiments.mkdir(parents=True)
     (experiments.parent / "guide").mkdir()
-    (experiments.parent / "guide" / "theirs.yaml").write_text("_target_: their_package.TheirGuide\nangle: 8\n")
+    (experiments.parent / "guide" / "theirs.yaml").write_text(
+        "# @package guide.theirs\n_target_: their_package.TheirGuide\nangle: 8\n"
+    )
     (experiments / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
     )
