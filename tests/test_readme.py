@@ -8,12 +8,15 @@ README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["cone world", "own env", "gymnasium"])
-def test_examples_run_as_printed(example):
+@pytest.mark.parametrize("example", EXAMPLES, ids=["cone world", "own env", "gymnasium", "recording"])
+def test_examples_run_as_printed(example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     found: dict = {}
     exec(compile(example, "README.md", "exec"), found)
     if "batch" in found:
         assert found["batch"]["guide_action"].shape == (64, 100, 1, 1)
+    if "steps" in found:
+        assert found["steps"]["cone_count"].sum() > 200
 
 
 def test_commands_exist():
