@@ -96,8 +96,10 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def _is_hidden(path: Path, folder: Path) -> bool:
-    """Whether this is Hydra's own copy of a configuration, in `.hydra`."""
-    return any(part.startswith(".") for part in path.relative_to(folder).parts)
+    """Whether this is Hydra's own copy of a configuration, in `.hydra`, or of what a run keeps for itself."""
+    inside = path.relative_to(folder).parts
+    above = [folder.joinpath(*inside[:depth]) for depth in range(len(inside) - 1)]
+    return any(part.startswith(".") for part in inside) or any((place / path.name).exists() for place in above)
 
 
 def _read(folder: Path) -> Run:

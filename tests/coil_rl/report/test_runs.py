@@ -77,3 +77,9 @@ def test_folders_without_runs_are_refused(tmp_path):
         read_runs([tmp_path])
     with pytest.raises(UserError, match="is not there; give a folder in which coil-train"):
         read_runs([tmp_path / "nowhere"])
+
+
+def test_what_a_run_keeps_for_itself_is_no_run(tmp_path):
+    run = make_run(tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}))
+    make_run(run / "proxies" / "spline", "proxy", 0, None)
+    assert [found.folder for found in read_runs([tmp_path])] == [run]
