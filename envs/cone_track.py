@@ -15,8 +15,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
+from coil_rl.envs.seeded import SeededEnv
 from coil_rl.envs.sight import SAMPLES, View, boundary_samples, encode, flat_index, to_car, to_world, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 from coil_rl.envs.track import Track
@@ -71,7 +71,7 @@ class Outcome(NamedTuple):
     alive: Tensor
 
 
-class ConeTrackEnv(EnvBase):
+class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
@@ -220,18 +220,6 @@ class ConeTrackEnv(EnvBase):
             "start_observation": observation.t(), "start_samples": samples, "start_sampled": sampled,
         }.items():  # fmt: skip
             self.register_buffer(name, value, persistent=False)
-
-    def get_extra_state(self) -> Tensor:
-        """The generator's state, so that `state_dict` also holds the tracks yet to be drawn."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator."""
-        self.generator.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.generator.manual_seed(seed)
 
     # Specs
 

@@ -17,13 +17,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
 
 from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.cone_classifier import simulated_cone_classifier
 from coil_rl.envs.cone_track import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
 from coil_rl.envs.perception import Perception
 from coil_rl.envs.robot_course import cones_of, robot_track
+from coil_rl.envs.seeded import SeededEnv
 from coil_rl.envs.sight import SAMPLES, to_car
 from coil_rl.envs.simulated_lidar import SimulatedLidar, driven
 from coil_rl.envs.track import SIDES, Track
@@ -35,7 +35,7 @@ BOUNDARY_STEP = 0.005  # m
 FAR = 1e3  # m
 
 
-class SimulatedRobotEnv(EnvBase):
+class SimulatedRobotEnv(SeededEnv):
     """Simulated robots on tracks between cones, each by itself.
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes what `ConeTrackEnv` does:
@@ -147,18 +147,6 @@ class SimulatedRobotEnv(EnvBase):
         self.boundaries = [_stacked(of_side, FAR) for of_side in lines]  # [2, T, points] m
         self.starts = torch.tensor([track.start for track in self.tracks]).t()
         self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
-
-    def get_extra_state(self) -> Tensor:
-        """The generator's state, so that `state_dict` also holds the noise yet to be drawn."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator."""
-        self.generator.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.generator.manual_seed(seed)
 
     def _declare_specs(self) -> None:
         robots = self.batch_size

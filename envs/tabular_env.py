@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Categorical, Composite, OneHot, Unbounded
-from torchrl.envs import EnvBase
+
+from coil_rl.envs.seeded import SeededEnv
 
 
-class TabularEnv(EnvBase):
+class TabularEnv(SeededEnv):
     """B agents, each in a state of a finite Markov decision process.
 
     Reads `action` [B], the number of an action. Writes `observation` [B, S], 1 at the state and else 0, and `reward`,
@@ -99,18 +100,6 @@ class TabularEnv(EnvBase):
         self.done_spec = Composite(
             {key: flag.clone() for key in ("done", "terminated", "truncated")}, shape=batch, device=device
         )
-
-    def get_extra_state(self) -> Tensor:
-        """The generator's state, so that `state_dict` also holds the chances yet to be taken."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator."""
-        self.generator.set_state(state.cpu())
-
-    def _set_seed(self, seed: int | None) -> None:
-        if seed is not None:
-            self.generator.manual_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)

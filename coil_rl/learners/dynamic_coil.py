@@ -121,8 +121,8 @@ class DynamicCoil(PPO):
             `moved_NAME`, how far its action is from what it was at the start, mean |g - g_start| over the batch.
         """
         phase, turn, rates = self.phases.number, self.phases.turn, self.rates(progress)
-        for parameters, rate in zip(self.groups(), rates, strict=True):
-            for parameter in parameters:
+        for group, rate in zip(self.optimiser.param_groups, rates, strict=True):
+            for parameter in group["params"]:
                 parameter.requires_grad_(rate > 0)
         metrics = super().update(batch, progress)
         ended = self.phases.advance(batch.numel(), float(batch["next", "reward"].mean()))

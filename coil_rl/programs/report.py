@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -115,9 +114,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    known = [field.name for field in fields(Report) if field.name != "defaults"]
-    for key in sorted(set(config).difference(known)):
-        raise UserError(f"there is no key {key}; the configuration has {', '.join(known)}{near(str(key), known)}")
+    app.check_keys(config, Report)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("a report is made once; leave out -m, and give several folders as folder=[ONE,OTHER]")
     if config.actions not in ACTIONS:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -66,9 +65,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    known = [field.name for field in fields(Reproduce) if field.name != "defaults"]
-    for key in sorted(set(config).difference(known)):
-        raise UserError(f"there is no key {key}; the configuration has {', '.join(known)}{near(str(key), known)}")
+    app.check_keys(config, Reproduce)
     chosen(config)
 
 

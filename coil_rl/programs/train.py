@@ -9,7 +9,6 @@ from omegaconf import DictConfig
 
 from coil_rl.errors import UserError
 from coil_rl.programs import app, run_folder, training
-from coil_rl.programs.judge import is_judged, outcome
 from coil_rl.trained import configuration
 
 
@@ -30,7 +29,7 @@ def resume(folder: Path) -> float:
     folder = folder.absolute()
     config.run_dir = str(folder)
     with run_folder.claimed(folder):
-        return outcome(folder) if is_judged(folder) else training.finish(config, folder, resumed=True)
+        return training.go_on(config, folder)
 
 
 def main() -> None:

@@ -35,13 +35,18 @@ def run(config: DictConfig, *, wait: bool = False) -> float:
     folder = Path(config.run_dir)
     with run_folder.claimed(folder, wait=wait):
         if config.existing == "resume" and run_folder.holds(folder, config):
-            return outcome(folder) if is_judged(folder) else finish(config, folder, resumed=True)
+            return go_on(config, folder)
         run_folder.begin(config, folder)
         return finish(config, folder)
 
 
+def go_on(config: DictConfig, folder: Path) -> float:
+    """Do what is left of a run that the folder holds, if anything is."""
+    return outcome(folder) if is_judged(folder) else finish(config, folder, resumed=True)
+
+
 def finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float:
-    """Do what is left of a run."""
+    """Train and judge, from the beginning or from the last checkpoint."""
     torch.set_num_threads(config.threads)
     try:
         agent = None if config.method.observes is None else learn(config, folder, resumed)
