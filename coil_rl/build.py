@@ -144,10 +144,15 @@ def build_guided_env(
 
 def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
     """The env of a configuration without any transform; `overrides` as in `build_env`."""
-    with open_dict(config):  # which keys the env takes is its own to say
-        node = OmegaConf.merge(config.env, dict(overrides or {}))
-    env: EnvBase = build(node, "env", EnvBase)
+    env: EnvBase = build(env_node(config, overrides), "env", EnvBase)
     return env
+
+
+def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The node `env` of a configuration with all references resolved; `overrides` as in `build_env`."""
+    with open_dict(config):  # which keys the env takes is its own to say
+        node: Any = OmegaConf.to_container(OmegaConf.merge(config.env, dict(overrides or {})), resolve=True)
+    return dict(node)
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:

@@ -22,9 +22,7 @@ def evaluate(config: DictConfig) -> float:
     seed, agent = config.seed, None
     if config.run is not None:
         config, agent = restore(Path(config.run), config)
-    # After the networks, so that a run's own sampled numbers come out again where its seed is given.
-    torch.manual_seed(seed)
-    judge(config, agent, folder)
+    judge(config, agent, folder, seed)
     return outcome(folder)
 
 

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+import torch
+from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
-from coil_rl.build import build, build_env, build_guided_env
+from coil_rl.build import build, build_env, build_guided_env, env_node
 from coil_rl.evaluation import PER_STEP, Drive, drive, summarise
 from coil_rl.files import whole_file
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
@@ -30,7 +32,7 @@ COLUMNS = {
 }
 
 
-def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) -> None:
+def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int) -> None:
     """Evaluate and write `episodes.csv`, `lines.png`, `lines.gif`, `evaluation.md` (means) and, last, `evaluation.csv`.
 
     Each guide drives each track once; an agent once by its deterministic action, `evaluation.repeats` times by sampled
@@ -40,6 +42,7 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         config: of a run.
         agent: its policy; None for the guide alone.
         folder: where the files go.
+        seed: of the sampled actions.
     """
     tracks = build(config.track.test, "track.test")
     names = [track.name for track in tracks]
@@ -54,10 +57,10 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path) 
         if actions == "deterministic":
             drives[f"{driver}, {advice}" if advice else driver] = driven
 
+    for driver, driven in drive_guides(config, config.evaluation.env, names).items():
+        note(driven, driver)
+    torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
-        bar.set_postfix_str("guide")
-        for driver, driven in drive_guides(config, config.evaluation.env, names, bar.update).items():
-            note(driven, driver)
         for advice, actions, repeats in [] if agent is None else _plan(config, agent):
             bar.set_postfix_str(", ".join(filter(None, (config.label, advice, actions))))
             env = build_env(config, {**config.evaluation.env, "num_cars": repeats * len(tracks)}, advice=advice)
@@ -91,7 +94,6 @@ def drive_guides(
     config: DictConfig,
     overrides: Mapping[str, Any],
     names: Sequence[str],
-    tick: Callable[[], Any],
     guides: Mapping[str, TensorDictModuleBase] | None = None,
 ) -> dict[str, Drive]:
     """Each guide of a run alone, on each track once, by what it goes as in tables: `guide`, or `guide NAME` of several.
@@ -100,13 +102,33 @@ def drive_guides(
         config: of the run.
         overrides: what to change in `env`; its tracks, one car each.
         names: of the tracks.
-        tick: called every step.
         guides: others than those of the configuration.
     """
+    if guides:
+        return _drive_guides(config, overrides, names, guides)
+    known = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+    return dict(_driven_before(OmegaConf.to_yaml({"env": env_node(config, overrides), **known}), tuple(names)))
+
+
+# The runs of a sweep share their guides, which drive the same lines again: as long as an agent takes to be judged.
+@lru_cache(maxsize=64)
+def _driven_before(known: str, names: tuple[str, ...]) -> dict[str, Drive]:
+    config: Any = OmegaConf.create(known)
+    return _drive_guides(config, {}, names)
+
+
+def _drive_guides(
+    config: DictConfig,
+    overrides: Mapping[str, Any],
+    names: Sequence[str],
+    guides: Mapping[str, TensorDictModuleBase] | None = None,
+) -> dict[str, Drive]:
     env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
     called = list(guides or config.guide)
     drivers = ["guide"] if len(called) == 1 else [f"guide {name}" for name in called]
-    return dict(zip(drivers, drive(env, policy, names=names, tick=tick).split(len(called)), strict=True))
+    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+        driven = drive(env, policy, names=names, tick=bar.update)
+    return dict(zip(drivers, driven.split(len(called)), strict=True))
 
 
 def is_judged(folder: Path) -> bool:

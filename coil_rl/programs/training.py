@@ -10,7 +10,6 @@ from pathlib import Path
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
-from tqdm import tqdm
 
 from coil_rl import checkpoint, proxies, trained
 from coil_rl.build import build, build_env, build_guides, build_learner, trains_guides
@@ -50,8 +49,7 @@ def finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float:
     torch.set_num_threads(config.threads)
     try:
         agent = None if config.method.observes is None else learn(config, folder, resumed)
-        torch.manual_seed(config.seed)
-        judge(config, agent, folder)
+        judge(config, agent, folder, config.seed)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"go on with: coil-train resume={folder}") from None
     return outcome(folder)
@@ -140,6 +138,5 @@ def _on_training_tracks(
     config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None
 ) -> dict[str, float]:
     names = [track.name for track in build(config.track.train, "track.train")]
-    with tqdm(unit="step", desc="guides on the training tracks", leave=False, mininterval=0.5) as bar:
-        drives = drive_guides(config, {"assignment": "cyclic"}, names, bar.update, guides)
+    drives = drive_guides(config, {"assignment": "cyclic"}, names, guides)
     return {driver: drive.mean_reward for driver, drive in drives.items()}
