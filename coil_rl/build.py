@@ -99,7 +99,20 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
     """
-    env = build_bare_env(config, overrides)
+    return as_its_agent_sees(config, build_bare_env(config, overrides), advice=advice)
+
+
+def as_its_agent_sees(config: DictConfig, env: EnvBase, *, advice: str | None = None) -> EnvBase:
+    """Any env with the transforms of a configuration around it.
+
+    Args:
+        config: with `method` and `degrade`.
+        env: without transforms.
+        advice: as for `build_env`.
+
+    Raises:
+        UserError: as `build`, and if the transforms do not fit together.
+    """
     transforms = build_transforms(config)
     if advice:
         transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl import checkpoint
-from coil_rl.build import build_env, build_guides, build_learner, trains_guides
+from coil_rl.build import as_its_agent_sees, build_env, build_guides, build_learner, trains_guides
 from coil_rl.config import Train
 from coil_rl.errors import UserError
 from coil_rl.sentence import sentence
@@ -61,15 +61,43 @@ def policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") 
         UserError: if it has no such policy, or one that does not fit.
     """
     learner = build_learner(config, env, guides(folder, config) if trains_guides(config) else None)
-    weights = folder / f"policy_{which}.pt"
+    path = weights(folder, which)
     try:
-        learner.policy.load_state_dict(checkpoint.load(weights, config.device))
+        learner.policy.load_state_dict(checkpoint.load(path, config.device))
     except (RuntimeError, TypeError, AttributeError) as error:
         raise UserError(
-            f"{weights} does not fit the networks that {folder / 'config.yaml'} describes; give the folder as it was"
+            f"{path} does not fit the networks that {folder / 'config.yaml'} describes; give the folder as it was"
         ) from error
     restored: TensorDictModuleBase = learner.policy
     return restored
+
+
+def weights(folder: Path, which: str = "last") -> Path:
+    """The file in which a run keeps its policy; `which` as in `policy`."""
+    return folder / f"policy_{which}.pt"
+
+
+def in_env(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") -> tuple[EnvBase, TensorDictModuleBase]:
+    """The policy of the run in a folder, and around an env what it needs to act there: its guides and transforms.
+
+    What reaches the env is what had reached the one it was trained in: a residual policy adds to its guide's action.
+
+    Args:
+        folder: of the run.
+        config: its configuration; its own `env` and tracks are not built.
+        env: without transforms, of any batch size.
+        which: as in `policy`.
+
+    Raises:
+        UserError: as `policy`; if the run has no agent, or its agent cannot act in this env.
+    """
+    if config.method.observes is None:
+        raise UserError(f"{folder} has no agent: its guide drives alone; name that guide instead")
+    try:
+        seen = as_its_agent_sees(config, env)
+        return seen, policy(folder, config, seen, which)
+    except UserError as error:
+        raise UserError(f"run {folder}: {error}") from error
 
 
 def guides(folder: Path, config: DictConfig) -> dict[str, TensorDictModuleBase]:

@@ -6,6 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl import checkpoint
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.build import build_env, build_learner
 from coil_rl.report import write_csv
 
 Row = dict[str, Any]
@@ -64,4 +71,19 @@ def make_sweep(folder: Path) -> Path:
         make_run(folder / f"{seed + 3}_ppo", "ppo", seed, guide + ppo, needs_guide=False)
     make_run(folder / "6_coil", "coil", 3, None)
     make_run(folder / "7_ppo", "ppo", 3, None)
+    return folder
+
+
+def make_untrained_run(folder: Path, *overrides: str) -> Path:
+    """A run as far as other programs read it: its configuration and a policy, which has learned nothing."""
+    folder.mkdir()
+    torch.manual_seed(0)
+    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*overrides, f"run_dir={folder}"])
+    if config.method.observes is not None:
+        policy = build_learner(config, build_env(config)).policy
+        checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
+    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    kept.logger = None
+    OmegaConf.save(kept, folder / "config.yaml")
     return folder

@@ -6,13 +6,9 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
 from PIL import Image
+from run_folders import make_untrained_run
 
-from coil_rl import checkpoint
-from coil_rl.build import build_env, build_learner
 from coil_rl.programs import listen
 
 TRACKS = ["track=generated", "track.test.count=1", "track.train.count=1"]
@@ -24,18 +20,7 @@ FILES = {
 
 
 def make_run(folder, *overrides):
-    """What coil-train leaves, as far as coil-listen reads it; the agent has learned nothing."""
-    folder.mkdir()
-    torch.manual_seed(0)
-    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*TRACKS, "env.time_limit=2", *overrides, f"run_dir={folder}"])
-    if config.method.observes is not None:
-        policy = build_learner(config, build_env(config)).policy
-        checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
-    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    kept.logger = None
-    OmegaConf.save(kept, folder / "config.yaml")
-    return folder
+    return make_untrained_run(folder, *TRACKS, "env.time_limit=2", *overrides)
 
 
 @pytest.fixture(scope="module")
