@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mcap.exceptions import RecordLengthLimitExceeded
-from mcap.records import Channel, Message, Schema
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -75,11 +75,13 @@ class Contents(NamedTuple):
         sources: of all topics.
         messages: of the topics asked for, each topic's in the order of their log times.
         cut_off: whether the recording ends too early.
+        notes: its metadata records, by name.
     """
 
     sources: list[Source]
     messages: dict[str, list[Stored]]
     cut_off: bool
+    notes: dict[str, dict[str, str]]
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
@@ -95,12 +97,13 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     """
     sources: dict[Source, None] = {}
     messages: dict[str, list[Stored]] = {topic: [] for topic in topics or ()}
+    notes: dict[str, dict[str, str]] = {}
     cut_off = False
     for file in _files(Path(path)):
-        cut_off |= _read_file(file, topics, sources, messages)
+        cut_off |= _read_file(file, topics, sources, messages, notes)
     for stored in messages.values():
         stored.sort(key=lambda message: message.log_time)
-    return Contents(list(sources), messages, cut_off)
+    return Contents(list(sources), messages, cut_off, notes)
 
 
 def digest(path: str | os.PathLike[str]) -> str:
@@ -119,7 +122,11 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 def _read_file(
-    file: Path, topics: Collection[str] | None, sources: dict[Source, None], messages: dict[str, list[Stored]]
+    file: Path,
+    topics: Collection[str] | None,
+    sources: dict[Source, None],
+    messages: dict[str, list[Stored]],
+    notes: dict[str, dict[str, str]],
 ) -> bool:
     """Add what a file holds; returns whether it ends too early."""
     size, whole = _check_kind(file)
@@ -142,6 +149,8 @@ def _read_file(
                     sources[source] = None
                     if topics is None or source.topic in topics:
                         wanted[record.id] = source, messages.setdefault(source.topic, [])
+                elif type(record) is Metadata:
+                    notes[record.name] = dict(record.metadata)
         # Damaged bytes make the libraries beneath raise almost anything.
         except Exception as error:
             if not whole and (stream.tell() >= size or isinstance(error, RecordLengthLimitExceeded)):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from coil_rl.envs.mcap_files import Contents, RecordingError, Source, read_messages
 from coil_rl.envs.ros_messages import LaserScan, decoder, from_fields
 
+SIMULATED = "simulated"  # the metadata record that says so
 SCAN, ODOMETRY, TWIST = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
 
 Floats = NDArray[np.float64]
@@ -39,6 +40,8 @@ class Recording:
         angle_increment: [N] radians from one range to the next, negative for a scanner that turns clockwise.
         odometry: where the robot was: [M, 3] m, m, radians, and at which log time and stamp [M] ns; None if unknown.
         commands: how it was told to move: [M, 2] m/s, radians/s, and at which log time [M] ns; None if unknown.
+        frame: in which the scanner measures.
+        simulated: whether the recording says that it is.
     """
 
     path: Path
@@ -51,6 +54,8 @@ class Recording:
     angle_increment: Floats
     odometry: tuple[Floats, Times, Times] | None = None
     commands: tuple[Floats, Times] | None = None
+    frame: str = "laser"
+    simulated: bool = False
 
     @property
     def seconds(self) -> Floats:
@@ -132,7 +137,7 @@ def read_recording(
 
     time, turns = _decoded(path, scan, contents)
     recording = _scans(path, scan, contents.cut_off, time, turns)
-    extra: dict[str, Any] = {}
+    extra: dict[str, Any] = {"simulated": SIMULATED in contents.notes}
     if odometry and contents.messages[odometry]:
         time, places = _decoded(path, odometry, contents)
         pose = np.array([(place.x, place.y, place.heading) for place in places])
@@ -164,6 +169,7 @@ def _scans(path: Path, topic: str, cut_off: bool, log_time: Times, turns: Sequen
     return {
         "path": path, "cut_off": cut_off, "log_time": log_time, "stamp": np.array([turn.stamp for turn in turns]),
         "ranges": ranges, "points": points, "angle_min": limits[:, 0], "angle_increment": limits[:, 1],
+        "frame": turns[0].frame,
     }  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Collection, Iterator
 from typing import Any
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from coil_rl.envs.cdr import encode
 from coil_rl.envs.mcap_files import read_messages
 from coil_rl.envs.recording_writer import RecordingWriter
+from coil_rl.envs.recordings import SIMULATED
 from coil_rl.envs.ros_messages import Twist, header
 from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
 
@@ -33,14 +35,17 @@ Times = NDArray[np.int64]
 
 
 def copy_topics(writer: RecordingWriter, path: str | os.PathLike[str], topics: Collection[str]) -> None:
-    """Copy topics of a recording as they stand; one that it does not have is left out.
+    """Copy topics of a recording as they stand, and the note that it is simulated; what it does not have is left out.
 
     Raises:
         RecordingError: as `read_messages`.
     """
-    for messages in read_messages(path, topics).messages.values():
+    contents = read_messages(path, topics)
+    for messages in contents.messages.values():
         for message in messages:
             writer.copy(message)
+    if SIMULATED in contents.notes:
+        writer.describe(SIMULATED, contents.notes[SIMULATED])
 
 
 def add_steering(
@@ -70,13 +75,14 @@ def add_sight(
     valid: NDArray[np.bool_],
     *,
     frame: str = "laser",
+    laser_yaw: float = 0.0,
     scale: float = 7.0,
     sight: float = SIGHT,
 ) -> None:
     """Add what every policy saw: `/coil/cones`, yellow left and blue right, `/coil/boundary` and `/coil/valid`.
 
-    A boundary that is only remembered is faded, and one that was never seen is left out. A scan is valid if both of
-    its sides are.
+    All of it is in the scanner's frame, so that it lies on the scan whatever else is known. A boundary that is only
+    remembered is faded, and one that was never seen is left out. A scan is valid if both of its sides are.
 
     Args:
         writer: of the recording to be.
@@ -85,18 +91,20 @@ def add_sight(
         count: [N, 2], how many are real.
         observation: [N, 20], of which the boundaries are drawn.
         valid: [N, 2], whether each side was seen.
-        frame: the name of the car's frame, which is the scanner's unless that one is turned.
+        frame: the name of the scanner's frame.
+        laser_yaw: radians, the bearing of its 0 in the car's frame, anticlockwise.
         scale: metres of the simulation in one of the robot's.
         sight: m, the distance that is 1 in the observation.
     """
-    lines = _boundaries(observation, sight) / scale
+    back = np.array([[math.cos(laser_yaw), -math.sin(laser_yaw)], [math.sin(laser_yaw), math.cos(laser_yaw)]]) / scale
+    lines, places = _boundaries(observation, sight) @ back, cones @ back
     known = np.logical_or.accumulate(valid, axis=0)
     for row, time in enumerate(log_time.tolist()):
         top = header(time, frame)
         found = [{"header": top, "action": DELETE_ALL}]
         drawn = [{"header": top, "action": DELETE_ALL}]
         for side, name in enumerate(SIDES):
-            found += _cones(top, name, cones[row, side, : count[row, side]] / scale)
+            found += _cones(top, name, places[row, side, : count[row, side]])
             if known[row, side]:
                 drawn.append(_line(top, name, lines[row, side], 1.0 if valid[row, side] else FADED))
         writer.add("/coil/cones", MARKERS, time=time, data=encode(MARKERS, {"markers": found}))

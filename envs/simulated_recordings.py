@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from coil_rl.envs.recording_writer import RecordingWriter
+from coil_rl.envs.recordings import SIMULATED
 from coil_rl.envs.ros_messages import LaserScan, Odometry, Twist
 from coil_rl.envs.simulated_drives import SimulatedDrive
 from coil_rl.envs.simulated_lidar import LEAST, MOST
@@ -89,7 +90,7 @@ def _write(
     times = [round(turn / rate * 1e9) for turn in range(len(ranges) + 1)]
     step = 2 * math.pi / len(angles)
     with RecordingWriter(path) as drive:
-        drive.describe("simulated", {"sensor": "simulated RPLIDAR A1M8", **notes})
+        drive.describe(SIMULATED, {"sensor": "simulated RPLIDAR A1M8", **notes})
         for turn, (began, over) in enumerate(pairwise(times)):
             scan = LaserScan(began, float(angles[0]), step, LEAST, MOST, ranges[turn].numpy(), 1 / rate)
             drive.add("/scan", "sensor_msgs/msg/LaserScan", time=over, data=scan.to_bytes())

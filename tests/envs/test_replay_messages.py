@@ -9,7 +9,7 @@ from drives import drive
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from coil_rl.envs import McapReplayEnv, RecordingWriter
+from coil_rl.envs import McapReplayEnv, RecordingWriter, read_recording
 from coil_rl.envs.mcap_files import read_messages
 from coil_rl.envs.replay_messages import add_sight, add_steering, copy_topics
 from coil_rl.guides import SplineGuide
@@ -27,7 +27,7 @@ def perception(ranges, angles):
     return cones, count
 
 
-def replay(folder, name):
+def replay(folder, name, **options):
     """A recording, and one with its scans and what a guide made of them."""
     source = drive(folder / "drive.mcap", SCANS, odometry=True, commands=True)
     env = McapReplayEnv(source, perception)
@@ -40,7 +40,7 @@ def replay(folder, name):
     with RecordingWriter(folder / name) as writer:
         copy_topics(writer, source, ["/scan", "/odom", "/tf"])
         add_steering(writer, "spline", recording.log_time, steering, omega, speed=0.15)
-        add_sight(writer, recording.log_time, *view, frame="base_link")
+        add_sight(writer, recording.log_time, *view, frame="base_link", **options)
     return source, folder / name, steering, omega
 
 
@@ -51,9 +51,13 @@ def made(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def read(made):
-    """The messages of each topic by another library, and their times."""
+    return by_another_library(made[1])
+
+
+def by_another_library(path):
+    """The messages of each topic, and their times."""
     found, times = {}, {}
-    with AnyReader([made[1]], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         for source, time, data in reader.messages():
             found.setdefault(source.topic, []).append(reader.deserialize(data, source.msgtype))
             times.setdefault(source.topic, []).append(time)
@@ -105,6 +109,29 @@ def test_boundary_runs_along_the_cones_and_fades_while_it_is_remembered(read):
         np.testing.assert_allclose(points, [(x, -1) for x in (2, 2.5, 3, 3.5, 4)], atol=1e-5)
         assert (lines["right"].color.a == 1) == (scan < 4)
     assert [message.data for message in read[0]["/coil/valid"]] == [False, False, True, True, False, False]
+
+
+def test_markers_lie_on_the_scan_of_a_lidar_that_looks_to_the_left(made, read, tmp_path):
+    turned, _ = by_another_library(replay(tmp_path, "turned.mcap", laser_yaw=math.radians(90))[1])
+    for topic in ("/coil/cones", "/coil/boundary"):
+        for straight, left in zip(read[0][topic], turned[topic], strict=True):
+            for one, other in zip(straight.markers[1:], left.markers[1:], strict=True):
+                for a, b in zip(one.points or [one.pose.position], other.points or [other.pose.position], strict=True):
+                    # Ahead of the car is to the right of such a LiDAR.
+                    assert (b.x, b.y) == pytest.approx((a.y, -a.x), abs=1e-6)
+
+
+def test_note_that_a_recording_is_simulated_comes_along(tmp_path):
+    source = drive(tmp_path / "drive.mcap", SCANS)
+    for note in ({}, {"simulated": {"sensor": "none"}, "rosbag2": {"topics": "others"}}):
+        with RecordingWriter(source) as writer:
+            copy_topics(writer, source, ["/scan"])
+            for name, entries in note.items():
+                writer.describe(name, entries)
+        with RecordingWriter(tmp_path / "copy.mcap") as writer:
+            copy_topics(writer, source, ["/scan"])
+        assert read_messages(tmp_path / "copy.mcap").notes == {k: v for k, v in note.items() if k == "simulated"}
+        assert read_recording(source).simulated == bool(note)
 
 
 def test_same_replay_makes_the_same_bytes(made, tmp_path):

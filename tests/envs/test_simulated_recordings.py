@@ -26,6 +26,7 @@ def test_a_labelling_drive_reads_back_and_says_that_it_is_simulated(tmp_path):
     drive, path = simulated_drive("left", seed=3), tmp_path / "left.mcap"
     save_drive(drive, path)
     recording = read_recording(path, strict=True)
+    assert recording.simulated
     assert np.array_equal(recording.ranges, drive.ranges.numpy())
     np.testing.assert_allclose(recording.angles(0), drive.angles, atol=1e-6)
     np.testing.assert_allclose(recording.seconds, drive.seconds, atol=1e-8)
