@@ -48,6 +48,7 @@ CHOICES = {
     "evaluation.policy": ("last", "best"),
     "evaluation.guides": ("phases", "ends"),
     "existing": ("refuse", "resume"),
+    "policy": ("last", "best"),
 }
 
 
@@ -60,7 +61,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    _check_values(config)
+    check_values(config)
     training = OmegaConf.get_type(config) is Train
     for part in ("train", "test") if training else ("test",):
         if not build(config.track.get(part), f"track.{part}"):
@@ -69,7 +70,7 @@ def check(config: DictConfig) -> None:
         check_node(config.env, "env")
         env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
         for name, guide in build_guides(config).items():
-            _check_guide(guide, env, f"guide.{name}")
+            check_guide(guide, env, f"guide.{name}")
         build_all(config.degrade, "degrade")
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
@@ -79,12 +80,22 @@ def check(config: DictConfig) -> None:
                 "take another"
             )
         _check_training(config)
-    _make_folder(Path(config.run_dir))
+    make_folder(Path(config.run_dir))
 
 
-def _check_values(config: DictConfig) -> None:
+def check_values(config: DictConfig) -> None:
+    """Refuse keys that there are not, and numbers and choices outside of what is possible.
+
+    Args:
+        config: of any program.
+
+    Raises:
+        UserError: for the first of them.
+    """
     for name in ("", "budget", "evaluation", "method"):
         node = OmegaConf.select(config, name) if name else config
+        if node is None:  # not every program has all of these
+            continue
         known = [field.name for field in fields(node._metadata.object_type) if field.name != "defaults"]
         for key in sorted(set(node).difference(known)):
             inside = name or "the configuration"
@@ -97,8 +108,7 @@ def _check_values(config: DictConfig) -> None:
         value = OmegaConf.select(config, name)
         if value is not None and value not in choices:
             raise UserError(f"{name}={value} must be one of {', '.join(choices)}")
-    frames = config.budget.cars * config.budget.steps
-    if frames > LARGEST_BATCH:
+    if "budget" in config and (frames := config.budget.cars * config.budget.steps) > LARGEST_BATCH:
         raise UserError(f"budget.cars x budget.steps={frames} must be at most {LARGEST_BATCH}")
     for name in ("device", "env.device"):
         if isinstance(device := OmegaConf.select(config, name), str):
@@ -114,7 +124,17 @@ def _check_device(key: str, name: str) -> None:
         raise UserError(f"{key}={name} cannot be used ({str(error).splitlines()[0]}); take {key}=cpu") from error
 
 
-def _check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
+def check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
+    """Refuse a guide that cannot act in an env.
+
+    Args:
+        guide: any.
+        env: any.
+        name: what a person calls it.
+
+    Raises:
+        UserError: if it reads what the env does not write, or its action has another shape.
+    """
     data = env.reset()
     for key in guide.in_keys:
         if key not in data.keys(True):
@@ -156,7 +176,12 @@ def _name(key: str | Iterable[Any]) -> str:
     return key if isinstance(key, str) else ".".join(map(str, key))
 
 
-def _make_folder(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make the folder of a run.
+
+    Raises:
+        UserError: if nothing can be written there.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):

@@ -139,6 +139,24 @@ class Listen(Common):
 
 
 @dataclass
+class Replay:
+    """Configuration of `coil-replay`."""
+
+    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
+    recording: Any = MISSING
+    runs: list[str] = field(default_factory=list)
+    policy: str = "last"
+    strict: bool = False
+    preset: dict[str, Any] = MISSING
+    env: dict[str, Any] = MISSING
+    guide: dict[str, Any] = field(default_factory=dict)
+    seed: int = 0
+    device: str = "cpu"
+    threads: int = 1
+    run_dir: str = MISSING
+
+
+@dataclass
 class Reproduce:
     """Configuration of `coil-reproduce`."""
 
@@ -157,4 +175,5 @@ ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
 ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
 ConfigStore.instance().store(name="report_schema", node=Report)
 ConfigStore.instance().store(name="listen_schema", node=Listen)
+ConfigStore.instance().store(name="replay_schema", node=Replay)
 ConfigStore.instance().store(name="reproduce_schema", node=Reproduce)

@@ -60,7 +60,7 @@ def installed(wheel: Path) -> Path:
 
 
 def test_wheel_holds_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
-    patterns = {"coil_rl": ["*.py", "py.typed"], "envs": ["*.py", "*.json", "tracks/**/*.csv"]}
+    patterns = {"coil_rl": ["*.py", "*.json", "py.typed"], "envs": ["*.py", "*.json", "tracks/**/*.csv"]}
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"]}
     expected = {
         (path.relative_to(tree) if folder == "coil_rl" else "coil_rl" / path.relative_to(tree)).as_posix()
