@@ -71,10 +71,25 @@ class BoundaryMemory(nn.Module):
         Returns:
             The observation [B, 20], a side never valid yet reading as zeros; and which sides are valid now [B, 2].
         """
+        return self.remember(*self.estimate(cones, count))
+
+    def estimate(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """What cones say by themselves, whatever is remembered; of any batch.
+
+        Args:
+            cones: as for `forward`.
+            count: as for `forward`.
+
+        Returns:
+            The samples of the boundary [2, 5, 2, B] m, and which sides are valid [2, B].
+        """
         samples = boundary_samples(cones.permute(3, 2, 1, 0), count.t(), self.fit)
         distance, _ = polar(*samples)
         plausible = (distance >= self.nearest) & (distance <= self.sight * self.farthest)
-        valid = (count.t() >= 2) & plausible.all(0)
+        return samples, (count.t() >= 2) & plausible.all(0)
+
+    def remember(self, samples: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Take in what `estimate` made of the cones seen now; returns what `forward` does."""
         self.samples = torch.where(valid, samples, self.samples)
         self.known = torch.where(valid, torch.ones_like(self.known), self.known)
         return encode(self.samples, self.known, self.sight), valid.t()
