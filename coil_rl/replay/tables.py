@@ -11,7 +11,7 @@ from coil_rl.replay.open_loop import OpenLoop
 from coil_rl.report import markdown_table
 
 NOTES = """
-Actions are fractions of {largest:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean size.
+Actions are fractions of {largest:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean |omega|.
 from X: how far they disagree, mean |a - x|. Nobody steered here: each policy was asked after every scan what it would
 do, in a drive that went another way. recorded is what the robot was told, as the action by which it turns as fast."""
 
