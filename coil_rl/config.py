@@ -9,10 +9,14 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, OmegaConf
 
+from coil_rl.fingerprint import fingerprint
+
 # Two runs started within a microsecond of each other still get folders of their own.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
 # What a table has entries for, as part of a label: ${names:${degrade},intact}
 OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, table)) or none, replace=True)
+# What a run is, as part of the name of its folder: ${label}_seed${seed}_${fingerprint:}
+OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 
 
 @dataclass

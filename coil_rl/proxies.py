@@ -7,8 +7,6 @@ that uses proxies keeps copies of them in its own folder.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +20,7 @@ from coil_rl import trained
 from coil_rl.build import build_env, build_guides, build_learner
 from coil_rl.config import Train
 from coil_rl.files import whole_folder
+from coil_rl.fingerprint import fingerprint
 
 FILES = ("config.yaml", "policy_last.pt")  # what of a run its policy is made from
 
@@ -43,7 +42,7 @@ def configuration(config: DictConfig, name: str) -> DictConfig:
     # The guide alone, whatever others the configuration has and whatever they are for.
     proxy["method"]["transforms"]["advice"]["guides"] = {name: node}
     wanted = {
-        **{key: whole[key] for key in ("preset", "track", "device", "threads", "run_dir")},
+        **{key: whole[key] for key in ("preset", "track", "device", "threads")},
         **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
         "proxy": {},
         "env": whole["env"] | proxy["env"],
@@ -52,9 +51,8 @@ def configuration(config: DictConfig, name: str) -> DictConfig:
         "evaluation": {"env": whole["evaluation"]["env"], "gif": False},
         "existing": "resume",
     }
-    described = json.dumps({key: value for key, value in wanted.items() if key != "run_dir"}, sort_keys=True)
-    wanted["run_dir"] = f"{proxy['folder']}/{name}_{hashlib.sha256(described.encode()).hexdigest()[:10]}"
     made: Any = OmegaConf.merge(OmegaConf.structured(Train), wanted)
+    made.run_dir = f"{proxy['folder']}/{name}_{fingerprint(made)}"
     return made
 
 

@@ -13,11 +13,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.files import remove_unfinished, whole_file
+from coil_rl.fingerprint import UNLIKE
 from coil_rl.programs.versions import versions
 from coil_rl.trained import configuration
-
-# What two runs of one configuration may differ in; a configuration that was read holds the defaults of its type.
-UNLIKE = ("run_dir", "logger", "existing", "defaults")
 
 
 @contextmanager
