@@ -32,6 +32,7 @@ class Group:
         is_guide: whether this is a guide.
         guide: the drives of the best guide beside which an agent drove, if one did.
         needs_guide: whether it needs the guide when it drives; None where that is no question.
+        seed_numbers: of the seeds, in their order; none for a guide.
     """
 
     name: str
@@ -42,6 +43,7 @@ class Group:
     is_guide: bool = False
     guide: Group | None = None
     needs_guide: bool | None = None
+    seed_numbers: tuple[int, ...] = ()
 
     @property
     def title(self) -> str:
@@ -147,12 +149,17 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     guides = _guides(of_label)
     agents: list[Group] = []
     for label, alike in of_label.items():
-        drives = [drive for run in alike for drive in run.drives if not drive.is_guide and drive.actions == actions]
-        variants = [
-            Group(label, advice, *_stack(label, [drive for drive in drives if drive.advice == advice]),
-                  guide=next(iter(guides.get(label, ())), None), needs_guide=None if advice else alike[0].needs_guide)
-            for advice in dict.fromkeys(drive.advice for drive in drives)
-        ]  # fmt: skip
+        drives = [(run.seed, drive) for run in alike for drive in run.drives]
+        agent = [(seed, drive) for seed, drive in drives if not drive.is_guide and drive.actions == actions]
+        variants = []
+        for advice in dict.fromkeys(drive.advice for _, drive in agent):
+            seeds, of_advice = zip(*[(seed, drive) for seed, drive in agent if drive.advice == advice], strict=True)
+            variants.append(
+                Group(
+                    label, advice, *_stack(label, of_advice), guide=next(iter(guides.get(label, ())), None),
+                    needs_guide=None if advice else alike[0].needs_guide, seed_numbers=seeds,
+                )
+            )  # fmt: skip
         agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
     own = {group.name: group.iqm for group in reversed(agents)}  # the first of each label: its advice is not altered
     agents.sort(key=lambda group: (-own[group.name], group.name))

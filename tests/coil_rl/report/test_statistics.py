@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap
+from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap, wins
 
 SCORES = st.lists(st.floats(-1000, 1000), min_size=1, max_size=30)
 
@@ -123,3 +123,16 @@ def test_probability_of_improvement_is_the_share_of_pairs_that_are_won(seed, cou
 def test_tables_of_different_tracks_are_not_compared():
     with pytest.raises(ValueError, match=r"same tracks, not empty; got the shapes \(1, 2\) and \(1, 3\)"):
         probability_of_improvement([[1.0, 2.0]], [[1.0, 2.0, 3.0]])
+
+
+def test_wins_are_of_the_same_seed_on_the_same_track():
+    x, y = [[3.0, 1.0], [0.0, 5.0]], [[2.0, 1.0], [4.0, 4.0]]
+    np.testing.assert_array_equal(wins(x, y), [[1, 0.5], [0, 1]])
+    np.testing.assert_array_equal(wins(x, [[2.0, 2.0]]), [[1, 0], [0, 1]], "the same with each seed")
+    shuffled = probability_of_improvement([[1.0], [2.0], [3.0]], [[0.5], [1.5], [2.5]])
+    assert wins([[1.0], [2.0], [3.0]], [[0.5], [1.5], [2.5]]).mean() == 1 > shuffled
+
+
+def test_wins_of_different_seeds_are_refused():
+    with pytest.raises(ValueError, match=r"same seeds and tracks; got the shapes \(3, 1\) and \(2, 1\)"):
+        wins([[1.0]] * 3, [[1.0]] * 2)
