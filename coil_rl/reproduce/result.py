@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 
 from coil_rl.files import whole_file
 from coil_rl.report import style
+from coil_rl.report.runs import Run
 
 
 class Result(ABC):
@@ -30,6 +31,20 @@ class Result(ABC):
         Returns:
             The page, Markdown: the table, and what there is to say about it.
         """
+
+
+class OfRuns(ABC):
+    """A table or figure of the paper that is made from training runs.
+
+    Attributes:
+        experiments: the files of `conf/experiment` whose runs it takes.
+    """
+
+    experiments: Sequence[str]
+
+    @abstractmethod
+    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
+        """Make it: as that of a `Result`, from the finished runs of each experiment by its name."""
 
 
 @contextmanager

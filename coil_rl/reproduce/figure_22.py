@@ -1,0 +1,75 @@
+"""Figure 22 of the paper: how the return grows with training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coil_rl.errors import UserError
+from coil_rl.report import draw_learning_curves, markdown_table, write_csv
+from coil_rl.report.curve import TRAINING, mean_curve
+from coil_rl.report.runs import GUIDE, Run
+from coil_rl.reproduce.result import OfRuns
+from coil_rl.reproduce.verdict import interval
+
+PARTS = {"quarter": (0.25, "a quarter"), "half": (0.5, "half"), "end": (1.0, "all")}
+
+NOTES = """
+The return is the mean over the last 100 finished episodes on the training tracks, actions sampled; the curve is the
+mean of the runs, the band the 95 % bootstrap interval of that mean. The guide alone earns {guide} there. Up to the
+guide: the first frames after which the mean of the runs is not below that. The paper draws three curves of each method
+and prints no numbers."""
+
+
+class Figure22(OfRuns):
+    """Learning curves, and the guide's own return as a line.
+
+    Args:
+        experiments: in one world.
+        labels: that are drawn; the line is the guide of the first.
+    """
+
+    def __init__(self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo")) -> None:
+        if not labels:
+            raise ValueError("labels=[] draws nothing; give at least one")
+        self.experiments, self.labels = list(experiments), list(labels)
+
+    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
+        """Make it: see `OfRuns`."""
+        there = [run for experiment in self.experiments for run in runs[experiment]]
+        of_label = {label: [run for run in there if run.label == label and run.curve] for label in self.labels}
+        for label, found in of_label.items():
+            if not found:
+                known = ", ".join(dict.fromkeys(run.label for run in there))
+                raise UserError(f"no run of {', '.join(self.experiments)} is called {label}; there are {known}")
+        curves = {label: [run.curve for run in found] for label, found in of_label.items()}
+        own = [max(run.guide_returns.values()) for run in of_label[self.labels[0]] if run.guide_returns]
+        guide = float(np.mean(own)) if own else None
+        rows, table = [], []
+        for label, curve in curves.items():
+            frames, mean, low, high = mean_curve(curve, TRAINING)
+            points = zip(frames, mean, low, high, strict=True)
+            rows += [dict(zip(("label", "frames", "mean", "low", "high"), (label, *p), strict=True)) for p in points]
+            line: dict[str, Any] = {"label": label, "runs": len(curve)}
+            for part, (share, _) in PARTS.items():
+                line |= {part: None, f"{part}_interval": None}
+                if len(frames):
+                    at = int(np.abs(frames - share * frames[-1]).argmin())
+                    ends = interval(low[at], high[at]) if len(curve) > 1 else None
+                    line |= {part: mean[at], f"{part}_interval": ends}
+            passed = frames[mean >= guide] if guide is not None else frames[:0]
+            table.append(line | {"passed": passed[0] if len(passed) else None})
+        write_csv(rows, stem.with_suffix(".csv"))
+        draw_learning_curves(
+            curves, stem.with_suffix(".png"), guides={} if guide is None else {GUIDE: guide},
+            title="Figure 22: the return in training",
+        )  # fmt: skip
+        columns = {"label": ("method", ""), "runs": ("runs", "d")}
+        for part, (_, text) in PARTS.items():
+            columns |= {part: (f"return after {text} of the frames", ".1f"), f"{part}_interval": ("95 %", "")}
+        columns |= {"passed": ("frames up to the guide", ",.0f")}
+        notes = NOTES.strip().format(guide="an unknown return" if guide is None else f"{guide:.1f}")
+        return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"
