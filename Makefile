@@ -1,10 +1,11 @@
 PYTHON ?= python3.11
 ARGS ?=
+BUDGET ?= smoke
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench test test-all kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce test test-all kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -31,6 +32,9 @@ evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
 bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='device=cuda'
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/coil-benchmark $(ARGS)
+
+reproduce: $(INSTALLED) ## make every result of the paper again, as small as can be; in earnest with BUDGET=paper
+	$(BIN)/coil-reproduce all=true budget=$(BUDGET) $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)

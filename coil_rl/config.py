@@ -161,13 +161,29 @@ class Replay:
 
 
 @dataclass
+class RunsBudget:
+    """How many runs results are made from, and what they are given."""
+
+    name: str = MISSING
+    seeds: int = MISSING
+    note: str | None = None
+    every: list[str] = field(default_factory=list)
+    only: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass
 class Reproduce:
     """Configuration of `coil-reproduce`."""
 
     defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
-    table: int | None = None
-    figure: int | None = None
-    claim: str | None = None
+    table: Any = None
+    figure: Any = None
+    claim: Any = None
+    all: bool = False
+    budget: RunsBudget = field(default_factory=RunsBudget)
+    train: list[str] = field(default_factory=list)
+    known_problems: list[str] = field(default_factory=list)
+    cannot: list[str] = field(default_factory=list)
     results: dict[str, Any] = MISSING
     run_dir: str = MISSING
 

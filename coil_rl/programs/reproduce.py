@@ -2,36 +2,78 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from omegaconf import DictConfig
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig
+from tqdm import tqdm
 
 from coil_rl.build import build
 from coil_rl.config import Reproduce
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
-from coil_rl.programs import app
-from coil_rl.reproduce import Result
+from coil_rl.programs import app, sweeps
+from coil_rl.programs.versions import versions
+from coil_rl.report.runs import Run, read_runs
+from coil_rl.reproduce import OfRuns, Result, pages
 from coil_rl.signature import near
 
 KINDS = ("table", "figure", "claim")
+LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
+ALL = "RESULTS.md"
 
 
 def reproduce(config: DictConfig) -> None:
-    """Make what was asked for; print each page and leave it in the folder with its numbers and its picture."""
+    """Do the runs that are missing, make what was asked for, print it and leave it in the folder with RESULTS.md."""
     folder = Path(config.run_dir)
-    names = chosen(config)
-    # All are built before the first is made: a mistake shall cost seconds.
-    results = {name: build(config.results[name], f"results.{name}", Result) for name in names}
-    for name in names:
-        if (folder / f"{name}.md").exists():
-            raise UserError(f"{folder} already holds {name}; choose another folder with hydra.run.dir=FOLDER")
+    folder.mkdir(parents=True, exist_ok=True)
+    # All are built before the first run begins: a mistake shall cost seconds.
+    results = {name: _built(config, name) for name in chosen(config)}
+    runs = done(config, [result for result in results.values() if isinstance(result, OfRuns)])
+    commit = versions()["commit"]
     for name, result in results.items():
-        text = result.make(folder / name)
-        with whole_file(folder / f"{name}.md") as unfinished:
-            unfinished.write_text(text + "\n", encoding="utf-8")
-        print(f"{text}\n")
-    print(f"reproduce: {', '.join(names)} made; see {folder}")
+        used: Sequence[Run] = ()
+        if isinstance(result, OfRuns):
+            used = [run for experiment in dict.fromkeys(result.experiments) for run in runs[experiment]]
+            text = result.make(folder / name, runs)
+        else:
+            text = result.make(folder / name)
+        text = pages.page(text, name, config.budget.note, pages.origin(command(config, _asked(name)), commit, used))
+        _write(folder / f"{name}.md", text)
+        print(text)
+    kept = {str(name): folder / f"{name}.md" for name in config.results}
+    commands = {name: command(config, _asked(name)) for name in kept}
+    texts = {name: path.read_text(encoding="utf-8") if path.exists() else None for name, path in kept.items()}
+    everything = command(config, "all=true")
+    _write(
+        folder / ALL,
+        pages.results(texts, commands, everything, config.budget.note, config.known_problems, config.cannot),
+    )
+    print(f"reproduce: {', '.join(results)} made; see {folder / ALL}")
+
+
+def done(config: DictConfig, results: Sequence[OfRuns]) -> Mapping[str, Sequence[Run]]:
+    """The runs of all experiments that some results are made from, by experiment, after those missing were done."""
+    wanted = list(dict.fromkeys(experiment for result in results for experiment in result.experiments))
+    budget, seeds = config.budget, range(config.budget.seeds)
+    with tqdm(wanted, unit="experiment", desc="which runs", leave=False, delay=1) as bar:
+        found = [
+            sweeps.planned(name, [*budget.every, *budget.only.get(name, []), *config.train], seeds) for name in bar
+        ]
+    launcher = [word for word in HydraConfig.get().overrides.hydra if word.startswith(LAUNCHER)]
+    for sweep in found:
+        sweeps.run(sweep, launcher)
+    return {sweep.experiment: read_runs(sweep.all_folders) for sweep in found}
+
+
+def _built(config: DictConfig, name: str) -> Result | OfRuns:
+    made: Any = build(config.results[name], f"results.{name}")
+    if not isinstance(made, Result | OfRuns):
+        raise UserError(f"results.{name}: it makes {type(made).__name__}, but Result or OfRuns is wanted")
+    return made
 
 
 def chosen(config: DictConfig) -> list[str]:
@@ -40,23 +82,38 @@ def chosen(config: DictConfig) -> list[str]:
     Raises:
         UserError: for one that does not exist, and if nothing was asked for.
     """
-    wanted: dict[str, str] = {}
+    known = {_asked(name): str(name) for name in config.results}
+    if config.all:
+        return list(known.values())
+    wanted: list[str] = []
     for kind in KINDS:
-        if config[kind] is not None:
-            wanted[f"{kind}={config[kind]}"] = config[kind] if kind == "claim" else f"{kind}_{config[kind]}"
-    known = {_asked(name): name for name in config.results}
-    for asked, name in wanted.items():
-        if known.get(asked) != name:
-            raise UserError(f"{asked} cannot be made; there are {', '.join(known)}{near(asked, known)}")
+        given = config[kind]
+        for one in given if isinstance(given, ListConfig) else [] if given is None else [given]:
+            asked = f"{kind}={one}"
+            if asked not in known:
+                raise UserError(f"{asked} cannot be made; there are {', '.join(known)}{near(asked, known)}")
+            wanted.append(known[asked])
     if not wanted:
-        raise UserError(f"nothing is asked for; give one of {', '.join(known)}, or several")
-    return list(wanted.values())
+        raise UserError(f"nothing is asked for; give one of {', '.join(known)}, or several, or all=true")
+    return list(dict.fromkeys(wanted))
 
 
-def _asked(name: str) -> str:
+def command(config: DictConfig, asked: str) -> str:
+    """The command that makes a result again, with the choices of this one."""
+    given = HydraConfig.get().overrides.task
+    others = [word for word in given if not word.startswith(tuple(f"{key}=" for key in (*KINDS, "all", "budget")))]
+    return " ".join(["coil-reproduce", asked, f"budget={config.budget.name}", *others])
+
+
+def _asked(name: Any) -> str:
     """How a person asks for a result."""
     kind, _, number = str(name).partition("_")
     return f"{kind}={number}" if kind in KINDS and number.isdecimal() else f"claim={name}"
+
+
+def _write(path: Path, text: str) -> None:
+    with whole_file(path) as unfinished:
+        unfinished.write_text(text, encoding="utf-8")
 
 
 def check(config: DictConfig) -> None:
@@ -66,6 +123,10 @@ def check(config: DictConfig) -> None:
         UserError: in one sentence, what is wrong.
     """
     app.check_keys(config, Reproduce)
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        raise UserError("results are made one after the other; leave out -m, and ask for several as in table=[1,4]")
+    if config.budget.seeds < 1:
+        raise UserError(f"budget.seeds={config.budget.seeds} must be at least 1")
     chosen(config)
 
 

@@ -1,7 +1,11 @@
 from pathlib import Path
 
 import pytest
+from hydra import initialize_config_module
 from programs import called
+from run_folders import driven, make_run
+
+from coil_rl.programs import sweeps
 
 
 @pytest.fixture(autouse=True)
@@ -17,37 +21,85 @@ def outcome(*arguments):
 
 def test_results_leave_their_pages_numbers_and_pictures_and_print_the_pages():
     code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
-    files = {path.name for path in Path("run").iterdir()} - {".hydra"}
+    files = {path.name for path in Path("run").iterdir()}
+    made = {f"{name}.{ending}" for name in ("table_1", "figure_6") for ending in ("md", "csv", "png")}
     assert code == 0
-    assert files == {f"{name}.{ending}" for name in ("table_1", "figure_6") for ending in ("md", "csv", "png")}
+    assert files == made | {"RESULTS.md"}
     pages = [Path("run", f"{name}.md").read_text() for name in ("table_1", "figure_6")]
-    assert out == f"{pages[0]}\n{pages[1]}\nreproduce: table_1, figure_6 made; see {Path('run').absolute()}\n"
+    end = f"reproduce: table_1, figure_6 made; see {Path('run').absolute() / 'RESULTS.md'}"
+    assert out == f"{pages[0]}\n{pages[1]}\n{end}\n"
+    assert "Made by `coil-reproduce table=1 budget=paper` at commit `" in pages[0]
 
 
-def test_a_choice_of_a_result_reaches_it():
+def test_a_choice_of_a_result_reaches_it_and_its_page():
     assert outcome("figure=6", "results.figure_6.iterations=7", "hydra.run.dir=run")[0] == 0
     assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
+    assert "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`" in Path("run/figure_6.md").read_text()
 
 
-def test_a_folder_with_the_result_is_not_written_to_again():
-    assert outcome("table=1", "hydra.run.dir=run")[0] == 0
-    code, _, error = outcome("table=1", "hydra.run.dir=run")
+def test_all_results_that_were_made_come_together_whatever_asked_for_them():
+    assert outcome("table=1", "budget=smoke")[0] == 0
+    first = Path("outputs/reproduce/smoke/table_1.md").read_text()
+    assert outcome("table=1", "budget=smoke")[0] == 0
+    assert Path("outputs/reproduce/smoke/table_1.md").read_text() == first
+    assert outcome("table=[1]", "figure=[6]", "budget=smoke")[0] == 0
+    text = Path("outputs/reproduce/smoke/RESULTS.md").read_text()
+    assert text.count("This is a smoke test") == 1
+    assert "## Table 1" in text
+    assert "## Figure 6" in text
+    assert "- `coil-reproduce table=4 budget=smoke`" in text.split("## Not made yet")[1]
+    assert "The guide's row of table 5" in text
+
+
+@pytest.fixture
+def two_runs(monkeypatch):
+    """The runs of COIL and PPO that a figure asks for are there; what else is started is noted."""
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        sweep = sweeps.planned("paper", [], [0])
+    for folder, label in zip(sweep.all_folders, ("coil", "ppo"), strict=True):
+        make_run(folder, label, 0, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
+    started = []
+
+    def start(words):
+        started.append(words)
+        return 3
+
+    monkeypatch.setattr(sweeps, "start", start)
+    return sweep, started
+
+
+def test_runs_that_are_there_are_used_and_one_that_is_gone_is_done_again_alone(two_runs):
+    sweep, started = two_runs
+    choices = ["experiments=[paper]", "labels=[coil,ppo]"]
+    asked = ["figure=22", "budget.seeds=1", *(f"results.figure_22.{choice}" for choice in choices)]
+    code, out, _ = outcome(*asked)
+    assert (code, started) == (0, [])
+    assert "2 runs with the seeds 0, done at commit `unknown`. Frames of training: 20,000 (coil, ppo)." in out
+    assert outcome(*asked)[1] == out
+    (sweep.all_folders[1] / "evaluation.csv").unlink()
+    code, _, error = outcome(*asked, "hydra/launcher=basic")
     assert code == 2
-    assert "already holds table_1; choose another folder with hydra.run.dir=FOLDER" in error
+    assert "a sweep of paper ended with code 3" in error
+    (command,) = started
+    assert command == ["-m", "+experiment=paper", "method=ppo", "seed=0", "hydra/launcher=basic"]
 
 
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("", "nothing is asked for; give one of table=1, figure=6"),
-        ("table=3", "table=3 cannot be made; there are table=1, figure=6"),
+        ("", "nothing is asked for; give one of table=1, table=4"),
+        ("table=3", "table=3 cannot be made; there are table=1, table=4"),
+        ("table=[1,3]", "table=3 cannot be made; there are table=1, table=4"),
         ("claim=table_1", "claim=table_1 cannot be made"),
-        ("table=one", "table='one' must be a whole number or null"),
+        ("table=one", "table=one cannot be made; there are table=1"),
         ("tabel=1", "there is no key tabel"),
         ("+other=1", "there is no key other"),
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
         ("table=1 +results.table_1.x=0", "results.table_1: Table1 takes no x; it takes tolerance"),
-        ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "but Result is wanted"),
+        ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "Result or OfRuns is wanted"),
+        ("table=1 budget=small", "there is no budget=small; budget can be full, paper, smoke"),
+        ("table=1 budget.seeds=0", "budget.seeds=0 must be at least 1"),
+        ("-m table=1,4", "leave out -m, and ask for several as in table=[1,4]"),
     ],
 )
 def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words):
