@@ -7,6 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.objectives.value import GAE
 
+from coil_rl.learners.limits import check_numbers
+
 
 class Advantages:
     """Generalised advantage estimation (Schulman et al. 2016) with as few looks at states as will do.
@@ -18,9 +20,13 @@ class Advantages:
         critic: writes `state_value` [..., 1].
         gamma: discount.
         gae_lambda: lambda, how far rewards are trusted over the critic.
+
+    Raises:
+        ValueError: for a number that is not between 0 and 1.
     """
 
     def __init__(self, critic: TensorDictModuleBase, gamma: float, gae_lambda: float) -> None:
+        check_numbers(0, 1, gamma=gamma, gae_lambda=gae_lambda)
         self.critic = critic
         self.estimate = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, vectorized=False)
 

@@ -154,13 +154,13 @@ def test_the_policys_loss_is_that_of_the_steps_in_which_it_acts():
     ppo.advantage(batch)
     flat = batch.select(*ppo.learned_from).reshape(-1)
     acted = flat["agent_acts"].squeeze(-1)
-    losses = ppo._losses(flat)
+    losses = ppo.shared_losses(flat)
     other = flat.clone()
     other["advantage"][~acted] = 1e6
     other["action_log_prob"][~acted] = -1e6
-    assert torch.equal(ppo._losses(other)["loss_objective"], losses["loss_objective"])
+    assert torch.equal(ppo.shared_losses(other)["loss_objective"], losses["loss_objective"])
     other["value_target"][~acted] += 1
-    assert not torch.equal(ppo._losses(other)["loss_critic"], losses["loss_critic"])
+    assert not torch.equal(ppo.shared_losses(other)["loss_critic"], losses["loss_critic"])
 
 
 def test_a_gain_of_zero_begins_with_the_action_zero():
