@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
 from coil_rl import networks
+from coil_rl.learners.advantages import standardised
 from coil_rl.learners.guide_loss import AuxiliaryLoss
 from coil_rl.learners.limits import check_numbers
 from coil_rl.schedules import Schedule, schedule
@@ -49,6 +50,7 @@ class ActorCritic:
     loss: LossModule
     epochs = 1
     entropy: Schedule | None = None
+    standardise = False  # advantages, in each minibatch
 
     def __init__(
         self,
@@ -160,6 +162,8 @@ class ActorCritic:
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """TorchRL's losses of a minibatch [N], scalars."""
+        if self.standardise:
+            minibatch = minibatch.copy().set("advantage", standardised(minibatch["advantage"]))
         losses: TensorDictBase = self.loss(minibatch)
         return losses
 

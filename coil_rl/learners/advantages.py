@@ -50,3 +50,8 @@ class Advantages:
     def _values(self, states: TensorDictBase) -> torch.Tensor:
         value: torch.Tensor = self.critic(states.select(*self.critic.in_keys))["state_value"]
         return value
+
+
+def standardised(advantage: torch.Tensor) -> torch.Tensor:
+    """Shifted and scaled to a mean of 0 and a standard deviation of 1, over all entries."""
+    return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
