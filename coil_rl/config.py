@@ -19,6 +19,20 @@ OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, t
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 
 
+def agent_label(*, _root_: Any) -> str:
+    """What an agent is called: by its method, and by its learner where that is neither PPO nor the method's own."""
+    name = str(_root_.method.name)
+    if OmegaConf.is_missing(_root_, "learner") or _root_.method.learner != "agent":
+        return name
+    kind = str(_root_.learner.get("_target_", "")).rpartition(".")[2].lower()
+    if kind in ("", "ppo"):
+        return name
+    return kind if name == "ppo" else f"{name}_{kind}"
+
+
+OmegaConf.register_new_resolver("agent_label", agent_label, replace=True)
+
+
 @dataclass
 class Budget:
     """How much experience a run collects, and how much of it between two updates."""
@@ -42,12 +56,13 @@ class Evaluation:
 
 @dataclass
 class Method:
-    """What the agent learns from, if there is an agent."""
+    """What the agent learns from, if there is an agent, and by what kind of learner."""
 
     name: str = MISSING
     observes: list[str] | None = MISSING
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
+    learner: str = "agent"
 
 
 @dataclass
