@@ -1,0 +1,43 @@
+"""Every on-policy learner solves CartPole-v1: a mean of 475 steps over 100 episodes."""
+
+import pytest
+import torch
+from cart_poles import CartPoles
+from torchrl.envs import RewardSum, TransformedEnv
+
+from coil_rl.learners import A2C, TRPO, Reinforce
+from coil_rl.rollout import Rollout
+from coil_rl.schedules import Linear
+
+FRAMES = 300_000
+
+
+def frames_to_solve(learner, carts, steps, seed=0, **options):
+    """How many it takes, or None if more than `FRAMES`."""
+    torch.manual_seed(seed)
+    env = TransformedEnv(CartPoles(carts, seed), RewardSum())
+    made = learner(env, gamma=0.98, seed=seed, **options)
+    rollout = Rollout(env, made.policy, steps, [*made.keys, ("next", "episode_reward")])
+    lengths = []
+    while rollout.taken * carts < FRAMES:
+        batch = rollout.collect()
+        made.update(batch, rollout.taken * carts / FRAMES)
+        # Time first, as the last hundred are those that ended last.
+        ended, length = (batch["next", key].transpose(0, 1) for key in ("done", "episode_reward"))
+        lengths = [*lengths, *length[ended].tolist()][-100:]
+        if len(lengths) == 100 and sum(lengths) >= 475 * 100:
+            return rollout.taken * carts
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("learner", "options"),
+    [
+        (TRPO, {"carts": 32, "steps": 64, "learning_rate": 1e-3}),
+        (A2C, {"carts": 16, "steps": 16, "learning_rate": Linear(3e-3, 0.0), "gae_lambda": 0.8}),
+        (Reinforce, {"carts": 32, "steps": 128, "learning_rate": Linear(1e-2, 0.0), "minibatches": 4}),
+    ],
+)
+def test_a_learner_solves_it(learner, options):
+    assert frames_to_solve(learner, **options) is not None
