@@ -117,12 +117,11 @@ def test_steps_in_which_the_guide_acts_teach_the_critic_alone(learner):
         assert all(torch.equal(old, new) != changes for old, new in zip(*nets, strict=True))
 
 
-@pytest.mark.parametrize("learner", [A2C, Reinforce])
-def test_under_a_heavy_loss_it_does_as_the_guide_says(learner):
+def test_under_a_heavy_loss_it_does_as_the_guide_says():
     torch.manual_seed(0)
     env = worlds.cones(cars=16)
-    made = learner(env, auxiliary=[GuideLoss(100.0)], minibatches=8, learning_rate=1e-2)
-    rollout = Rollout(env, made.policy, 32, made.keys)
+    made = A2C(env, auxiliary=[GuideLoss(100.0)], minibatches=8, learning_rate=1e-2)
+    rollout = Rollout(env, made.policy, 16, made.keys)
     losses = [made.update(rollout.collect())["loss_guide"] for _ in range(6)]
     assert losses[-1] < losses[0] - 1
 
