@@ -92,7 +92,7 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
     """The env of a configuration as its agent sees it, which also adds up the task's reward as `episode_reward`.
 
     Args:
-        config: with `env`, `method` and `degrade`.
+        config: with `env`, `method`, `degrade` and `action`.
         overrides: what to change in `env`.
         advice: which of `evaluation.advice` comes last, and degrades the advice once more.
 
@@ -106,18 +106,15 @@ def as_its_agent_sees(config: DictConfig, env: EnvBase, *, advice: str | None = 
     """Any env with the transforms of a configuration around it.
 
     Args:
-        config: with `method` and `degrade`.
+        config: with `method`, `degrade` and `action`.
         env: without transforms.
         advice: as for `build_env`.
 
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
     """
-    transforms = build_transforms(config)
-    if advice:
-        transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
     # The sum comes first, before a method changes what the agent is paid.
-    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    env = TransformedEnv(env, Compose(RewardSum(), *build_transforms(config, advice)))
     try:
         env.observation_spec  # noqa: B018  transforms look at what stands before them once they are asked
     except (KeyError, ValueError) as error:
@@ -125,10 +122,21 @@ def as_its_agent_sees(config: DictConfig, env: EnvBase, *, advice: str | None = 
     return env
 
 
-def build_transforms(config: DictConfig) -> list[Transform]:
-    """The transforms of a method, and after them those that degrade what its guides say, if it asks any."""
-    transforms, degrade = build_all(config.method.transforms, "method.transforms"), build_all(config.degrade, "degrade")
-    return transforms + degrade if transforms else []
+def build_transforms(config: DictConfig, advice: str | None = None) -> list[Transform]:
+    """The transforms of a method, those that degrade what its guides say, if it asks any, and what makes choices of it.
+
+    Args:
+        config: with `method`, `degrade` and `action`.
+        advice: as in `build_env`.
+    """
+    transforms = build_all(config.method.transforms, "method.transforms")
+    if transforms:
+        transforms += build_all(config.degrade, "degrade")
+    if advice:
+        transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
+    if config.action:
+        transforms.append(build(config.action, "action", Transform))
+    return transforms
 
 
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:

@@ -75,6 +75,7 @@ class Common:
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
     degrade: dict[str, Any] = field(default_factory=dict)
+    action: dict[str, Any] = field(default_factory=dict)
     method: Method = field(default_factory=Method)
     also_observes: list[str] = field(default_factory=list)
     budget: Budget = field(default_factory=Budget)

@@ -7,6 +7,7 @@ from coil_rl.transforms.degraded_advice import (
     PartialAdvice,
     ScaledAdvice,
 )
+from coil_rl.transforms.discrete_actions import DiscreteActions
 from coil_rl.transforms.displaced_advice import DelayedAdvice, RemovedAdvice, ShuffledAdvice
 from coil_rl.transforms.drawn_advice import NoisyAdvice, RandomAdvice
 from coil_rl.transforms.guide_actions import GuideActions
@@ -17,6 +18,7 @@ __all__ = [
     "BiasedAdvice",
     "DegradedAdvice",
     "DelayedAdvice",
+    "DiscreteActions",
     "GuideActions",
     "JumpStart",
     "MixedAction",

@@ -38,7 +38,7 @@ class LearnedGuide(TensorDictModuleBase):
         env = TransformedEnv(build_bare_env(config, {"num_cars": 1}), Compose(*build_transforms(config)))
         self.policy, self.transforms = policy(folder, config, env, which), None
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
-        if config.method.needs_guide:
+        if config.method.needs_guide or config.action:
             self.transforms = env.transform
             self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
         # Transforms know their env by a weak reference; in a tuple it is no module of this one.

@@ -20,11 +20,10 @@ def composed(*overrides, name="train"):
         return compose(name, [*overrides])
 
 
-@pytest.fixture(scope="module", params=["ppo", "coil", "residual_coil", "jump_start"])
+@pytest.fixture(scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"])
 def run(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / request.param
-    folder.mkdir()
-    train(composed(*TINY, f"method={request.param}", f"run_dir={folder}"))
+    folder = tmp_path_factory.mktemp("run")
+    train(composed(*TINY, *f"method={request.param}".split(), f"run_dir={folder}"))
     return folder
 
 
