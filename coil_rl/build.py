@@ -190,7 +190,18 @@ def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorD
 
 def trains_guides(config: DictConfig) -> bool:
     """Whether the learner of a configuration asks for guides, to improve them."""
-    return "guides" in takes(_target(config.learner.get("_target_"), "learner"))
+    return learner_kind(config) == "guides"
+
+
+def learner_kind(config: DictConfig) -> str:
+    """What the learner of a configuration does, going by what it asks for.
+
+    Returns:
+        `guides` if it improves guides beside an agent, `imitation` if it asks where the advice is, to imitate it, or
+        else `agent`.
+    """
+    asked = takes(_target(config.learner.get("_target_"), "learner"))
+    return "guides" if "guides" in asked else "imitation" if "advice_key" in asked else "agent"
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:

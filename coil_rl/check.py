@@ -25,6 +25,7 @@ from coil_rl.build import (
     build_guides,
     build_learner,
     check_node,
+    learner_kind,
     trains_guides,
 )
 from coil_rl.config import Train
@@ -33,6 +34,12 @@ from coil_rl.proxies import untrained
 from coil_rl.signature import near
 
 LARGEST = 2**63 - 1
+# What a learner may be there for, in words, and the name of one.
+LEARNERS = {
+    "agent": ("learns from reward", "ppo"),
+    "imitation": ("imitates a guide", "forest"),
+    "guides": ("improves its guides", "dynamic_coil"),
+}
 # Lowest and highest value; most of the highest only keep a slip of the keyboard from filling the memory.
 LIMITS = {
     "seed": (0, LARGEST),
@@ -49,6 +56,7 @@ CHOICES = {
     "evaluation.guides": ("phases", "ends"),
     "existing": ("refuse", "resume"),
     "policy": ("last", "best"),
+    "method.learner": tuple(LEARNERS),
 }
 
 
@@ -63,6 +71,8 @@ def check(config: DictConfig) -> None:
     """
     check_values(config)
     training = OmegaConf.get_type(config) is Train
+    if training and config.method.observes is not None:
+        _check_learner(config)
     for part in ("train", "test") if training else ("test",):
         if not build(config.track.get(part), f"track.{part}"):
             raise UserError(f"track.{part} gives no tracks; give at least one")
@@ -143,6 +153,17 @@ def check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
     shape, wanted = action.shape, env.action_spec.shape
     if shape != wanted:
         raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
+
+
+def _check_learner(config: DictConfig) -> None:
+    """A method whose learner is of another kind than it means would still run, and be something else."""
+    kind, (purpose, example) = learner_kind(config), LEARNERS[config.method.learner]
+    if kind != config.method.learner:
+        given = config.learner["_target_"].rpartition(".")[2]
+        raise UserError(
+            f"method={config.method.name} needs a learner that {purpose}, such as learner={example}, "
+            f"but {given} is one that {LEARNERS[kind][0]}"
+        )
 
 
 def _check_training(config: DictConfig) -> None:

@@ -151,8 +151,10 @@ def test_mistake_of_training_is_one_sentence(started, arguments, words):
             "method=rfc ~method.transforms.advice",
             "but there is no advice; put GuideActions with",
         ),
-        ("method=kickstart learner=linear", "learner: Imitation takes no auxiliary; it takes env, in_keys, regressor"),
-        ("method=ppo learner=linear", "learner: the env has no entry guide_action to imitate; it has observation"),
+        (
+            "method=oil ~method.transforms.advice ~method.transforms.takeover",
+            "no entry guide_action to imitate; it has",
+        ),
         ("label=guide", "label=guide cannot name an agent"),
         ("existing=maybe", "existing=maybe must be one of refuse, resume"),
         ("+evaluation.advice.odd=3", "evaluation.advice.odd=3 names nothing to build"),
