@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
+from tensordict.nn import NormalParamExtractor, TensorDictModuleBase
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
@@ -114,6 +114,20 @@ class NormalHead(nn.Module):
         return loc, self.log_scale.exp().expand_as(loc)
 
 
+class SpreadHead(nn.Module):
+    """A network's output as mean and standard deviation of a normal distribution, both different in every state."""
+
+    def __init__(self, network: Network, scale: float) -> None:
+        super().__init__()
+        self.network = network
+        self.split = NormalParamExtractor(f"biased_softplus_{scale}", scale_lb=1e-3)
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation, [*batch, A] each; for an output of 0 that is `scale`."""
+        loc, scale = self.split(self.network(*inputs))
+        return loc, scale
+
+
 class Keyed(TensorDictModuleBase):
     """A module from some entries of a tensordict to others.
 
@@ -172,6 +186,25 @@ def actor(
         kind = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
         return ProbabilisticActor(module, ["logits"], distribution_class=kind, **common)
     module = Keyed(NormalHead(network, size, scale), in_keys, ["loc", "scale"])
+    return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
+
+
+def spread_actor(
+    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5, gain: float = 0.01
+) -> ProbabilisticActor:
+    """As `actor`, for numbers only and with a standard deviation that depends on the state.
+
+    Args:
+        env: for its specs.
+        in_keys: what the agent observes.
+        hidden: widths of the hidden layers.
+        scale: standard deviation at the start, before squashing.
+        gain: size of the last layer's weights at the start.
+    """
+    spec = env.action_spec
+    network = Network(env, in_keys, hidden, 2 * spec.shape[-1], gain)
+    module = Keyed(SpreadHead(network, scale), in_keys, ["loc", "scale"])
+    common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
     return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
 
 

@@ -39,6 +39,8 @@ class ResidualAction(_CombinedAction):
         guide: which row of the advice.
     """
 
+    alters = "scale"
+
     def __init__(self, scale: float | Schedule = 1.0, guide: int = 0) -> None:
         super().__init__(guide=guide)
         self.scale = scale
@@ -54,6 +56,8 @@ class MixedAction(_CombinedAction):
         weight: of the agent, a number or a schedule over the run. One that ends with 1 leaves the agent alone.
         guide: which row of the advice.
     """
+
+    alters = "weight"
 
     def __init__(self, weight: float | Schedule, guide: int = 0) -> None:
         super().__init__(guide=guide)

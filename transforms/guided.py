@@ -29,7 +29,11 @@ class Guided(Transform):
 
     Attributes:
         progress: share of the run that is over, for the schedules; whoever trains sets it.
+        alters: the name of the number by which it alters what an action leads to or pays; empty if it only has a say in
+            who acts. Where that number follows a schedule, steps of the past say what is no longer so.
     """
+
+    alters: str = ""
 
     def __init__(
         self,

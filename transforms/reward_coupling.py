@@ -39,6 +39,8 @@ class RewardCoupling(Guided):
         True
     """
 
+    alters = "beta"
+
     def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", guide: int = 0) -> None:
         if norm not in ORDERS:
             raise ValueError(f"norm={norm!r} must be one of {', '.join(ORDERS)}")

@@ -1,0 +1,102 @@
+"""Which learner goes with which method, and how those that do not are refused."""
+
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_module
+
+from coil_rl import config as _schema  # noqa: F401
+from coil_rl.build import build_env, build_learner
+from coil_rl.check import check
+from coil_rl.errors import UserError
+from coil_rl.rollout import Rollout
+
+METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
+DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]
+IMITATION = ["dagger", "oil"]
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.cars=4", "budget.steps=8"]
+OFF_POLICY = ["learner.starts=16", "learner.batch_size=8", "learner.ratio=1", "learner.hidden=[8]"]
+GIVEN = {"dqn": OFF_POLICY, "sac": OFF_POLICY, "ppo": ["learner.epochs=1", "learner.minibatches=2", "action=choices"]}
+
+REFUSED = {method: "needs a learner that imitates a guide, such as learner=forest, but" for method in IMITATION}
+REFUSED |= {method: "needs a learner that improves its guides, such as learner=dynamic_coil, but" for method in DYNAMIC}
+WITHOUT_REPLAY = {
+    "kickstart": "learner: (DQN|SAC) takes no auxiliary; it takes env, in_keys, hidden",
+    "mixing": "learner: weight of MixedAction changes over the run, and with it what an action leads to",
+}
+
+
+def composed(folder, *overrides):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", [*TINY, *overrides, f"run_dir={folder}"])
+
+
+def words(method, learner):
+    return REFUSED.get(method) or (None if learner == "ppo" else WITHOUT_REPLAY.get(method))
+
+
+PAIRS = [(method, learner) for method in METHODS if method != "guide" for learner in GIVEN]
+
+
+SLOW = [name for name in DYNAMIC if name != "dynamic_coil_sequential"]  # refused as that one is
+
+
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    [pytest.param(*pair, marks=pytest.mark.slow if pair[0] in SLOW else []) for pair in PAIRS if words(*pair)],
+)
+def test_what_makes_no_sense_is_refused_in_one_sentence(method, learner, tmp_path):
+    config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
+    with pytest.raises(UserError, match=words(method, learner)):
+        check(config)
+
+
+FAST = [("coil_rfc", "dqn"), ("residual_coil", "dqn"), ("jump_start", "dqn"), ("coil", "sac"), ("residual", "sac"),
+        ("coil_multi", "ppo")]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("method", "learner"),
+    [pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow) for pair in PAIRS if not words(*pair)],
+)
+def test_what_makes_sense_learns(method, learner, tmp_path):
+    config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
+    check(config)
+    env = build_env(config)
+    built = build_learner(config, env)
+    rollout = Rollout(env, built.policy, config.budget.steps, built.keys)
+    for _ in range(2):
+        metrics = built.update(rollout.collect())
+    assert (built.policy(env.reset())["action"].dtype.is_floating_point) == (learner == "sac")
+    assert method == "jump_start" or metrics.get("minibatches", 4) == 4
+
+
+def test_a_mixture_that_stays_the_same_may_be_replayed(tmp_path):
+    check(composed(tmp_path, "method=mixing", "learner=sac", "method.transforms.mixing.weight=0.5"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ("learner=dqn action=continuous", "DQN takes one of a few choices, but this env takes numbers"),
+        ("learner=sac action=choices", "SAC acts by numbers, but this env takes one of a few choices"),
+        ("method=kickstart learner=linear", "such as learner=ppo, but Imitation is one that imitates a guide"),
+        ("method=ppo learner=dynamic_coil", "such as learner=ppo, but DynamicCoil is one that improves its guides"),
+        ("method=oil learner=dynamic_coil", "but DynamicCoil is one that improves its guides"),
+        ("method=dynamic_coil_sequential action=choices", "guides learn through actions that are numbers"),
+        ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
+        ("learner=dqn action.choices=[0.0,2.0]", r"choices=\[0.0, 2.0\] must lie between the action's bounds -1.0"),
+        ("learner=dqn learner.capacity=10", "learner: capacity=10 must be at least 1 and at least starts=5000"),
+    ],
+)
+def test_other_mistakes_are_one_sentence(overrides, sentence, tmp_path):
+    with pytest.raises(UserError, match=sentence):
+        check(composed(tmp_path, *overrides.split()))
+
+
+def test_off_policy_learners_choose_their_action_and_their_batches(tmp_path):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
+    assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
+    assert [config.budget.cars * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 16_384]
+    assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1
