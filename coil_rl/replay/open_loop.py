@@ -21,7 +21,7 @@ from coil_rl.envs.recordings import Recording
 
 RECORDED = "recorded"  # what the robot was told, as if it were one more policy
 ANSWER = (("next", "steering"), ("next", "omega"), ("next", "info", "smoothness"))
-SIGHT = ("cones", "cone_count", "observation", ("info", "valid"))
+SEEN = ("cones", "cone_count", "observation", ("info", "valid"))
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -126,7 +126,7 @@ def _of_recording(replay: McapReplayEnv, row: int, asked: Mapping[str, TensorDic
     if recording.commands is not None:
         steering[RECORDED] = _recorded(*recording.commands, recording.log_time, replay.turn_rate, replay.max_steering)
     seen = next(iter(own.values()))  # which is the same for all
-    cones, count, observation, valid = (seen[key].numpy() for key in SIGHT)
+    cones, count, observation, valid = (seen[key].numpy() for key in SEEN)
     return OpenLoop(recording, cones, count, observation, valid, steering, replay.max_steering)
 
 
