@@ -8,64 +8,17 @@ the distance to the nearest boundary. A step then reads a few numbers per car.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from coil_rl.envs.splines import slots_in_use
 from coil_rl.envs.track import Track
+from coil_rl.envs.track_tables import SECTORS, Grid, Nearby, boundary_distances, nearby
 
-SECTORS = 12
-FAR = 3.0  # m: the distance field stops here, wider than any track
 EXACT = 1.0  # m: a clearance up to this counts every cone, a larger one perhaps only the boundaries
-
-
-class Grid(nn.Module):
-    """Square cells over each of several areas, numbered through, with one number looked up per cell.
-
-    Args:
-        lows: lower left corner of each area, [T, 2] m.
-        highs: upper right corner of each area, [T, 2] m.
-        cell: edge of a cell in m.
-    """
-
-    low: Tensor
-    last: Tensor
-    columns: Tensor
-    offset: Tensor
-
-    def __init__(self, lows: NDArray[np.float64], highs: NDArray[np.float64], cell: float, dtype: torch.dtype) -> None:
-        super().__init__()
-        self.cell = cell
-        shape = np.ceil((highs - lows) / cell).astype(np.int64) + 1
-        sizes = shape.prod(axis=1)
-        self.register_buffer("low", torch.as_tensor(lows.T.copy(), dtype=dtype), persistent=False)
-        self.register_buffer("last", torch.as_tensor(shape.T - 2, dtype=dtype), persistent=False)
-        self.register_buffer("columns", torch.as_tensor(shape[:, 0]), persistent=False)
-        self.register_buffer("offset", torch.as_tensor(np.cumsum(sizes) - sizes), persistent=False)
-
-    def nodes(self, track: int) -> NDArray[np.float64]:
-        """The lower left corners of one area's cells, [cells, 2] m, in the order of their numbers."""
-        low = self.low[:, track].double().numpy()
-        columns, rows = (int(last) + 2 for last in self.last[:, track])
-        x, y = low[0] + self.cell * np.arange(columns), low[1] + self.cell * np.arange(rows)
-        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-    def locate(self, track: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Number of the cell, its area's columns, and where in the cell ([2, B], 0 to 1) each position [2, B] lies.
-
-        A position outside its area counts as the nearest cell.
-        """
-        at = (position - self.low.index_select(1, track)) / self.cell
-        corner = torch.minimum(at.floor().clamp_(min=0), self.last.index_select(1, track))
-        column, row = corner.long().unbind(0)
-        columns = self.columns.index_select(0, track)
-        number = torch.addcmul(self.offset.index_select(0, track) + column, row, columns)
-        return number, columns, (at - corner).clamp_(0, 1)
 
 
 class TrackMap(nn.Module):
@@ -123,13 +76,17 @@ class TrackMap(nn.Module):
         self._keep("finish", np.stack([track.finish for track in tracks], axis=1), dtype)
         self._keep("starts", np.array([track.start for track in tracks]).T, dtype)
 
+        areas = [(tuple(low.tolist()), tuple(high.tolist())) for low, high in zip(lows, highs, strict=True)]
         self.cells = Grid(lows, highs, cell, dtype)
-        self._list_candidates(rings, sight, half_field_of_view)
+        self._keep_nearby(
+            [
+                nearby(track, *area, cell, dtype, sight, half_field_of_view, cone_radius + EXACT)
+                for track, area in zip(tracks, areas, strict=True)
+            ],
+            [len(left) for left, _ in rings],
+        )
         self.fine = Grid(lows, highs, field_cell, dtype)
-        field = [
-            _boundary_distances(track, tuple(lows[index].tolist()), tuple(highs[index].tolist()), field_cell, dtype)
-            for index, track in enumerate(tracks)
-        ]
+        field = [boundary_distances(track, *area, field_cell, dtype) for track, area in zip(tracks, areas, strict=True)]
         self._keep("field", np.concatenate(field), dtype)
 
     def __len__(self) -> int:
@@ -138,45 +95,27 @@ class TrackMap(nn.Module):
     def _keep(self, name: str, values: NDArray[np.generic], dtype: torch.dtype) -> None:
         self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values), dtype=dtype), persistent=False)
 
-    def _list_candidates(
-        self, rings: list[tuple[NDArray[np.float64], NDArray[np.float64]]], sight: float, half_field_of_view: float
-    ) -> None:
+    def _keep_nearby(self, found: list[Nearby], lefts: list[int]) -> None:
         """Fill `candidate` [blocks * SECTORS, 2 * most], `listed`, `block` (its block for each cell) and `near`.
 
         `listed` says how many candidates the side that has more of them really has.
         """
-        half_diagonal = self.cells.cell * np.sqrt(0.5)
-        heading = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
-        padding = np.array([[self.slots - 1], [2 * self.slots - 1]])
+        missing = self.slots - 1
+        padding = np.array([[missing], [self.slots + missing]])
         seen, blocks, nears = [padding * np.ones((SECTORS, 1, 1), dtype=np.int64)], [], []
         filled = 1
-        for index, pair in enumerate(rings):
-            centre = self.cells.nodes(index) + self.cells.cell / 2
-            visible = np.zeros((len(centre), SECTORS, 2, self.slots), dtype=bool)
-            touching = np.zeros((len(centre), 2, self.slots), dtype=bool)
-            for side, ring in enumerate(pair):
-                offset = ring - centre[:, None]
-                distance = np.linalg.norm(offset, axis=-1)
-                turn = np.arctan2(offset[..., 1], offset[..., 0])[:, None] - heading[:, None]
-                turn = np.abs((turn + np.pi) % (2 * np.pi) - np.pi)
-                # The car is somewhere in its cell and its heading somewhere in its sector.
-                slack = np.arcsin(np.minimum(1, half_diagonal / np.maximum(distance, 1e-9)))[:, None]
-                ahead = (turn <= half_field_of_view + np.pi / SECTORS + slack + 1e-3) | (slack >= np.pi / 2)
-                within = distance <= sight + half_diagonal + 1e-3
-                visible[:, :, side, : len(ring)] = within[:, None] & ahead
-                touching[:, side, : len(ring)] = distance <= self.cone_radius + EXACT + half_diagonal + 1e-3
-            used = visible.any(axis=(1, 2, 3))
+        for (used, visible, near), left in zip(found, lefts, strict=True):
             blocks.append(np.where(used, filled + np.cumsum(used) - 1, 0))
             filled += int(used.sum())
-            places = _columns(visible[used], self.slots - 1) + np.array([[0], [self.slots]])
+            places = np.where(visible < 0, missing, visible) + np.array([[0], [self.slots]])
             seen.append(places.reshape(-1, 2, places.shape[-1]))
-            nears.append(_columns(touching.reshape(len(centre), -1), self.slots - 1))
+            nears.append(np.where(near < 0, missing, np.where(near < left, near, near - left + self.slots)))
         candidate = _stack(seen, padding)
         self.most = candidate.shape[-1]
         self._keep("candidate", candidate.reshape(-1, 2 * self.most), torch.int16)
         self._keep("listed", (candidate != padding).sum(-1).max(-1).reshape(-1), torch.int16)
         self._keep("block", np.concatenate(blocks), torch.int64)
-        self._keep("near", _stack(nears, np.array([self.slots - 1])), torch.int32)
+        self._keep("near", _stack(nears, np.array([missing])), torch.int32)
 
     def cell(self, track: Tensor, position: Tensor) -> Tensor:
         """The cell [B] in which a car of these tracks [B] at this position [2, B] m is."""
@@ -205,7 +144,7 @@ class TrackMap(nn.Module):
         """How far a car on one of these tracks [B] at this position [2, B] m is from the left and the right boundary.
 
         Returns:
-            [2, B] in m, at most FAR.
+            [2, B] in m, at most 3.
         """
         node, columns, (right, up) = self.fine.locate(track, position)
         right, up = right.unsqueeze(-1), up.unsqueeze(-1)
@@ -237,28 +176,6 @@ class TrackMap(nn.Module):
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
         index = (slot + track.int() * (2 * self.slots)).flatten()
         return self.cones.index_select(1, index).view(2, *slot.shape)
-
-
-# A program builds the same tracks into several envs, and this is the slowest part of building.
-@lru_cache(maxsize=64)
-def _boundary_distances(
-    track: Track, low: tuple[float, float], high: tuple[float, float], cell: float, dtype: torch.dtype
-) -> NDArray[np.float64]:
-    """Distance of each grid node of one track from its left and its right boundary, at most FAR: [nodes, 2] m."""
-    nodes = Grid(np.array([low]), np.array([high]), cell, dtype).nodes(0)
-    trees = [cKDTree(track.boundary(side, 0.02)) for side in ("left", "right")]
-    distances = [tree.query(nodes, distance_upper_bound=FAR, workers=-1)[0] for tree in trees]
-    return np.minimum(np.stack(distances, axis=1), FAR)
-
-
-def _columns(mask: NDArray[np.bool_], padding: int) -> NDArray[np.int64]:
-    """The places of each last row's True entries, ascending, padded to the longest: [..., N] to [..., most]."""
-    counts = mask.sum(axis=-1)
-    columns = np.full((*mask.shape[:-1], max(1, int(counts.max()))), padding)
-    *row, column = np.nonzero(mask)
-    first = np.cumsum(counts) - counts.ravel()
-    columns[(*row, np.arange(len(column)) - np.repeat(first, counts.ravel()))] = column
-    return columns
 
 
 def _stack(tables: list[NDArray[np.int64]], padding: NDArray[np.int64]) -> NDArray[np.int64]:
