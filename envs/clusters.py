@@ -14,8 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -107,29 +105,23 @@ def single_linkage(points: Points, gap: float = GAP) -> Integers:
         return np.zeros(0, dtype=np.int64)
     total = np.arange(len(points.scan))
     scan_begin = np.searchsorted(points.scan, np.arange(points.scans + 1))
-    begin, size = scan_begin[points.scan], np.diff(scan_begin)[points.scan]
+    begin, end = scan_begin[points.scan], scan_begin[points.scan + 1]
     apart = (points.scan[1:] != points.scan[:-1]) | ~_closer(points, total[:-1], total[1:], gap)
     run = np.concatenate([[0], np.cumsum(apart)])
-    first_after = np.append(np.flatnonzero(apart) + 1, len(total))[run]
+    behind_run = np.append(np.flatnonzero(apart) + 1, len(total))[run]
 
     # Within half a turn: a pair farther apart one way around is nearer the other way. The slack is for rounding.
     with np.errstate(divide="ignore"):
         reach = np.where(points.distance > gap, np.arcsin(np.minimum(1, gap / points.distance)), np.pi) + 1e-9
-    one, other = total, first_after
-    joined: list[tuple[Integers, Integers]] = []
-    while len(one):
-        past = other >= begin[one] + size[one]
-        at = other - past * size[one]
-        near = (other - one < size[one]) & (points.bearing[at] - points.bearing[one] + past * TURN <= reach[one])
-        one, other, at = one[near], other[near] + 1, at[near]
-        close = _closer(points, one, at, gap)
-        joined.append((run[one[close]], run[at[close]]))
-    first, second = (np.concatenate(end) for end in zip(*joined, strict=True))
-    if (first == second).all():  # which a graph takes long to say
-        return run
-    runs = int(run[-1]) + 1
-    graph = coo_array((np.ones(len(first), dtype=np.int8), (first, second)), shape=(runs, runs))
-    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)[run]
+    farthest, turn = points.bearing + reach, points.scan * (2 * TURN)
+    around = farthest >= TURN
+    last = np.searchsorted(turn + points.bearing, turn + farthest - TURN * around, side="right")
+    count = np.maximum(np.minimum(last + around * (end - begin), total + end - begin) - behind_run, 0)
+    one = np.repeat(total, count)
+    other = np.arange(len(one)) + np.repeat(behind_run - np.cumsum(count) + count, count)
+    other = np.where(other < end[one], other, other - (end - begin)[one])
+    close = _closer(points, one, other, gap)
+    return _joined(run, run[one[close]], run[other[close]])
 
 
 def measure(points: Points, label: Integers, least: int = 2) -> Clusters:
@@ -145,12 +137,12 @@ def measure(points: Points, label: Integers, least: int = 2) -> Clusters:
     if not len(order):
         none = np.zeros(0, dtype=np.int64)
         return Clusters(none, none, none, np.zeros((0, 2)), np.zeros((0, 3)))
-    first = _firsts(label[order])
-    order = _unwrapped(points.bearing, order, first)
+    first, last = _blocks(label[order])
+    order = _unwrapped(points.bearing, order, first, last)
     x, y, distance = points.x[order], points.y[order], points.distance[order]
-    size = np.diff(first, append=len(order))
-    last = first + size - 1
-    step = np.hypot(np.diff(x, prepend=x[0]), np.diff(y, prepend=y[0]))
+    size = last - first + 1
+    step = np.zeros(len(order))
+    step[1:] = np.hypot(x[1:] - x[:-1], y[1:] - y[:-1])
     step[first] = 0
     width = np.hypot(x[last] - x[first], y[last] - y[first])
     depth = np.maximum.reduceat(distance, first) - np.minimum.reduceat(distance, first)
@@ -159,26 +151,38 @@ def measure(points: Points, label: Integers, least: int = 2) -> Clusters:
     return Clusters(label[order[first]], points.scan[order[first]], size, centroid, features)
 
 
+def _joined(label: Integers, one: Integers, other: Integers) -> Integers:
+    """The labels [M] after those of each pair have become one; again they are counted from 0."""
+    lowest = np.arange(int(label[-1]) + 1)
+    while (lowest[one] != lowest[other]).any():
+        for low, high in ((one, other), (other, one)):
+            np.minimum.at(lowest, lowest[high], lowest[low])
+        lowest = lowest[lowest]
+    kept = lowest == np.arange(len(lowest))
+    return (np.cumsum(kept) - 1)[lowest][label]
+
+
 def _closer(points: Points, one: Integers, other: Integers, gap: float) -> NDArray[np.bool_]:
     x, y = points.x[one] - points.x[other], points.y[one] - points.y[other]
     return np.asarray(x * x + y * y < gap * gap)
 
 
-def _firsts(label: Integers) -> Integers:
-    """Where each of the blocks of equal labels begins."""
-    return np.flatnonzero(np.diff(label, prepend=label[0] - 1))
+def _blocks(label: Integers) -> tuple[Integers, Integers]:
+    """Where each of the blocks of equal labels begins, and its last place."""
+    ends = np.flatnonzero(label[1:] != label[:-1])
+    return np.append(0, ends + 1), np.append(ends, len(label) - 1)
 
 
-def _unwrapped(bearing: Array, order: Integers, first: Integers) -> Integers:
+def _unwrapped(bearing: Array, order: Integers, first: Integers, last: Integers) -> Integers:
     """The order [M] in which clusters that lie across bearing 0 begin behind their widest gap."""
-    turned, size = bearing[order], np.diff(first, append=len(order))
+    turned = bearing[order]
     # Whoever spans at most half a turn leaves the widest gap outside already.
-    if not (turned[first + size - 1] - turned[first] > np.pi).any():
+    if not (turned[last] - turned[first] > np.pi).any():
         return order
-    cluster = np.repeat(np.arange(len(first)), size)
+    cluster = np.repeat(np.arange(len(first)), last - first + 1)
     gap = np.diff(turned, prepend=turned[0])
-    gap[first] = TURN - (turned[first + size - 1] - turned[first])
+    gap[first] = TURN - (turned[last] - turned[first])
     widest = np.flatnonzero(gap == np.maximum.reduceat(gap, first)[cluster])
-    start = widest[_firsts(cluster[widest])]
+    start = widest[_blocks(cluster[widest])[0]]
     before = np.arange(len(order)) < start[cluster]
     return order[np.lexsort((turned + TURN * before, cluster))]
