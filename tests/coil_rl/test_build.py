@@ -1,3 +1,4 @@
+import math
 from pathlib import Path
 
 import pytest
@@ -101,3 +102,11 @@ def test_overrides_change_the_env_and_leave_the_configuration():
     env = build_env(config, {"num_cars": 2, "assignment": "cyclic"})
     assert env.batch_size == torch.Size([2])
     assert config.env.assignment == "random"
+
+
+def test_the_authors_see_farther_and_wider_with_a_smaller_robot():
+    config = composed("preset=authors", "env=simulated_robot")
+    env = build_bare_env(config, {"num_cars": 1, "tracks": None})
+    seen = env.perception
+    assert (seen.range_max, math.degrees(seen.bearing_max), seen.scale) == pytest.approx((1.25, 120, 5.625))
+    assert env.memory.sight == config.preset.perception.sight == 1.25 * 5.625
