@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,7 @@ class Recording:
         odometry: where the robot was: [M, 3] m, m, radians, and at which log time and stamp [M] ns; None if unknown.
         commands: how it was told to move: [M, 2] m/s, radians/s, and at which log time [M] ns; None if unknown.
         frame: in which the scanner measures.
-        simulated: whether the recording says that it is.
+        notes: its metadata records, by name.
     """
 
     path: Path
@@ -55,7 +55,12 @@ class Recording:
     odometry: tuple[Floats, Times, Times] | None = None
     commands: tuple[Floats, Times] | None = None
     frame: str = "laser"
-    simulated: bool = False
+    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the recording says that it is."""
+        return SIMULATED in self.notes
 
     @property
     def seconds(self) -> Floats:
@@ -137,7 +142,7 @@ def read_recording(
 
     time, turns = _decoded(path, scan, contents)
     recording = _scans(path, scan, contents.cut_off, time, turns)
-    extra: dict[str, Any] = {"simulated": SIMULATED in contents.notes}
+    extra: dict[str, Any] = {"notes": contents.notes}
     if odometry and contents.messages[odometry]:
         time, places = _decoded(path, odometry, contents)
         pose = np.array([(place.x, place.y, place.heading) for place in places])

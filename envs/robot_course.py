@@ -1,14 +1,21 @@
-"""The track of the simulated robot: six metres in the shape of a bean, a straight, left turns and a right turn."""
+"""The track of the simulated robot: six metres in the shape of a bean, a straight, left turns and a right turn.
+
+And what a robot meets on any such track: where the cones stand, and how far it is from a crash.
+"""
 
 from __future__ import annotations
 
+import json
+from collections.abc import Mapping, Sequence
 from functools import cache
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from coil_rl.envs.track import Track
+from coil_rl.envs.sight import to_car
+from coil_rl.envs.track import SIDES, Track, TrackError
 
 Array = NDArray[np.float64]
 
@@ -18,7 +25,11 @@ HALF_WIDTH = 0.18
 RADIUS = 0.58
 RIGHT_TURN = np.pi / 3
 CONE_GAP = 0.23
-STEP = 0.005
+STEP = 0.005  # m, of lines that are sampled
+
+OUTLINE = (0.20, 0.12)  # m, length and width of the robot
+ON_THE_LINE = 0.02  # m: the middle of the robot this close to a boundary has left the track
+FAR = 1e3  # m
 
 
 @cache
@@ -29,12 +40,76 @@ def robot_track() -> Track:
     return Track("robot (simulated)", left, right)
 
 
-def robot_tracks() -> list[Track]:
-    """The robot's track, as a list of one."""
-    return [robot_track()]
+def robot_tracks(scale: float = 1.0) -> list[Track]:
+    """The robot's track, as a list of one.
+
+    Args:
+        scale: times its size: at 7 a car of the cone world drives where the robot does.
+    """
+    track = robot_track()
+    return [track if scale == 1 else Track(track.name, track.left * scale, track.right * scale)]
 
 
-def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[torch.Tensor, torch.Tensor]:
+def track_notes(track: Track) -> dict[str, str]:
+    """A track as notes for a recording, which `noted_track` reads."""
+    places = {"left": track.left.tolist(), "right": track.right.tolist(), "start": track.start}
+    return {"name": track.name, **{key: json.dumps(value) for key, value in places.items()}}
+
+
+def noted_track(notes: Mapping[str, str]) -> Track:
+    """The track of `track_notes`; the notes of other programs need `left` and `right`, each [[x, y], ...] m.
+
+    Raises:
+        TrackError: in one sentence, what is wrong with the notes.
+    """
+    try:
+        left, right, start = (json.loads(notes.get(key, "null")) for key in ("left", "right", "start"))
+        rings = [np.array(ring, dtype=np.float64).reshape(-1, 2) for ring in (left, right)]
+    except (ValueError, TypeError) as error:
+        raise TrackError(f"The track's cones cannot be read ({error}); note each side as [[x, y], ...] in m.") from None
+    return Track(notes.get("name", "track"), left=rings[0], right=rings[1], start=start)
+
+
+class RobotCourse:
+    """Where everything stands on each of T tracks, and how far robots are from a crash there.
+
+    Args:
+        tracks: in the robot's own metres.
+
+    Example:
+        >>> course = RobotCourse([robot_track()])
+        >>> clearance, _ = course.clearance(torch.tensor([0]), torch.tensor([robot_track().start]).t())
+        >>> round(clearance.item(), 2)
+        0.08
+    """
+
+    def __init__(self, tracks: Sequence[Track]) -> None:
+        stands = [cones_of(track) for track in tracks]
+        # What a track has fewer of is filled up far away.
+        self.cones = _stacked([place for place, _ in stands], FAR)  # [2, T, M] m
+        self.radius = _stacked([radius.unsqueeze(0) for _, radius in stands], 0.0)[0]  # [T, M] m
+        lines = ([torch.tensor(track.boundary(side, STEP).T) for track in tracks] for side in SIDES)
+        self.boundaries = [_stacked(of_side, FAR) for of_side in lines]  # [2, T, points] m each
+
+    def clearance(self, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
+        """How far robots are from a crash: their outline from a cone, their middle from the line between two.
+
+        Args:
+            track: [B], on which each is.
+            pose: [3, B] m, m, radians.
+
+        Returns:
+            [B] m, zero or less is a crash; and how far their middles are from the left and the right boundary, [2, B].
+        """
+        stand, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
+        beyond = to_car(pose, stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
+        to_cone = (beyond.clamp(min=0).norm(dim=0) - radius).amin(0)
+        place = pose[:2].unsqueeze(-1)
+        to_boundaries = torch.stack([(line[:, track] - place).norm(dim=0).amin(-1) for line in self.boundaries])
+        return torch.minimum(to_cone, to_boundaries.amin(0) - ON_THE_LINE), to_boundaries
+
+
+def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Tensor, Tensor]:
     """The cones of a robot's track: centres [2, M] m and radii [M] m, thin ones on the left and thick on the right."""
     chosen = [(ring, size) for ring, size, on in ((track.left, THIN, left), (track.right, THICK, right)) if on]
     if not chosen:
@@ -82,3 +157,12 @@ def _evenly(ring: Array, spacing: float) -> Array:
     travelled = np.concatenate([[0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
     at = np.linspace(0, travelled[-1], round(travelled[-1] / spacing), endpoint=False)
     return np.stack([np.interp(at, travelled, axis) for axis in closed.T], axis=1)
+
+
+def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:
+    """Tables [D, any] as one, [D, T, most]."""
+    most = max(table.shape[1] for table in tables)
+    wide = torch.full((len(tables[0]), len(tables), most), padding)
+    for index, table in enumerate(tables):
+        wide[:, index, : table.shape[1]] = table
+    return wide

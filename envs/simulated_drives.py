@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from coil_rl.envs.robot_course import THICK, THIN, cones_of, middle_line, robot_track
-from coil_rl.envs.simulated_lidar import SimulatedLidar
+from coil_rl.envs.simulated_lidar import SimulatedLidar, cast
 from coil_rl.envs.track import Track
 
 Sides = Literal["left", "right", "both"]
@@ -30,6 +30,8 @@ class SimulatedDrive:
 
     Attributes:
         name: of the drive.
+        track: on which it was.
+        sides: whose cones stood there.
         seconds: [T], when each scan began.
         angles: [P] radians, of the beams.
         ranges: [T, P] m, infinite for no return.
@@ -41,6 +43,8 @@ class SimulatedDrive:
     """
 
     name: str
+    track: Track
+    sides: Sides
     seconds: Tensor
     angles: Tensor
     ranges: Tensor
@@ -91,10 +95,10 @@ def simulated_drive(
     place, radius = cones_of(track, left=sides != "right", right=sides != "left")
     true, hit = lidar.cast(poses, place, radius)
     ranges, stray = lidar.measure(true, generator)
-    alone = [lidar.cast(poses, place[:, [m]], radius[[m]])[0].isfinite().sum(-1) for m in range(len(radius))]
-    met = torch.stack([(hit == m).sum(-1) for m in range(len(radius))], -1)
     return SimulatedDrive(
         name=f"{sides}_{seed}",
+        track=track,
+        sides=sides,
         seconds=torch.arange(len(ranges), dtype=torch.float64) / lidar.rate,
         angles=lidar.angles,
         ranges=ranges,
@@ -102,13 +106,28 @@ def simulated_drive(
         poses=poses,
         cones=place,
         radius=radius,
-        visibility=met / torch.stack(alone, -1).clamp(min=1),
+        visibility=visibility(poses, lidar.angles, place, radius, hit),
     )
 
 
 def labelling_drives(seeds: Sequence[int], **drive: object) -> list[SimulatedDrive]:
     """For each seed a drive past the left cones alone and one past the right cones alone."""
     return [simulated_drive(side, seed, **drive) for seed in seeds for side in ("left", "right")]  # type: ignore
+
+
+def visibility(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor) -> Tensor:
+    """Share of the beams that would meet a cone if it stood alone and do meet it, [T, M]; 0 where none would.
+
+    Args:
+        poses: of the sensor as each beam is sent, [3, T, P] (m, m, radians).
+        angles: of the beams, [P] radians.
+        cones: centres, [2, M] m.
+        radius: [M] m.
+        hit: [T, P], the cone that each beam meets.
+    """
+    alone = [cast(poses, angles, cones[:, [m]], radius[[m]])[0].isfinite().sum(-1) for m in range(len(radius))]
+    met = torch.stack([(hit == m).sum(-1) for m in range(len(radius))], -1)
+    return met / torch.stack(alone, -1).clamp(min=1)
 
 
 def _swaying(line: Tensor, sway: float, waves: float, start: float) -> Tensor:

@@ -74,15 +74,7 @@ class SimulatedLidar:
         Returns:
             [B, P] m, infinite where a beam meets no cone, and the number of the cone it meets [B, P], -1 for none.
         """
-        direction = poses[2] + self.angles
-        ahead_x, ahead_y = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
-        x, y = (stand.unsqueeze(-2) - at.unsqueeze(-1) for stand, at in zip(cones, poses[:2], strict=True))
-        along = x * ahead_x + y * ahead_y
-        beside = y * ahead_x - x * ahead_y
-        deep = radius.square().unsqueeze(-2) - beside.square()
-        reach = along - deep.clamp(min=0).sqrt()
-        nearest, cone = torch.where((deep > 0) & (along > 0), reach, torch.inf).min(-1)
-        return nearest, torch.where(nearest.isfinite(), cone, -1)
+        return cast(poses, self.angles, cones, radius)
 
     def measure(self, true: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """What the sensor says of true distances.
@@ -102,6 +94,19 @@ class SimulatedLidar:
         said = (said / self.quantum).round() * self.quantum
         lost = (fate >= 1 - self.no_return) | (said < LEAST) | (said > MOST)
         return torch.where(lost, torch.inf, said), stray
+
+
+def cast(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """What `SimulatedLidar.cast` does, for any sensor whose beams have the bearings `angles` [P] radians."""
+    direction = poses[2] + angles
+    ahead_x, ahead_y = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
+    x, y = (stand.unsqueeze(-2) - at.unsqueeze(-1) for stand, at in zip(cones, poses[:2], strict=True))
+    along = x * ahead_x + y * ahead_y
+    beside = y * ahead_x - x * ahead_y
+    deep = radius.square().unsqueeze(-2) - beside.square()
+    reach = along - deep.clamp(min=0).sqrt()
+    nearest, cone = torch.where((deep > 0) & (along > 0), reach, torch.inf).min(-1)
+    return nearest, torch.where(nearest.isfinite(), cone, -1)
 
 
 def driven(pose: Tensor, distance: Tensor, turn: Tensor) -> Tensor:

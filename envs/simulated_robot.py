@@ -22,17 +22,13 @@ from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.cone_classifier import simulated_cone_classifier
 from coil_rl.envs.cone_track import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
 from coil_rl.envs.perception import Perception
-from coil_rl.envs.robot_course import cones_of, robot_track
+from coil_rl.envs.robot_course import RobotCourse, robot_track
 from coil_rl.envs.seeded import SeededEnv
-from coil_rl.envs.sight import SAMPLES, to_car
+from coil_rl.envs.sight import SAMPLES
 from coil_rl.envs.simulated_lidar import SimulatedLidar, driven
-from coil_rl.envs.track import SIDES, Track
+from coil_rl.envs.track import Track
 
 FINISH_RADIUS = 0.15  # m, so wide that nobody between the cones drives past it
-OUTLINE = (0.20, 0.12)  # m, length and width of the robot
-ON_THE_LINE = 0.02  # m: the middle of the robot this close to a boundary has left the track
-BOUNDARY_STEP = 0.005  # m
-FAR = 1e3  # m
 
 
 class SimulatedRobotEnv(SeededEnv):
@@ -126,7 +122,9 @@ class SimulatedRobotEnv(SeededEnv):
             num_cars, spline, smoothing, sight=self.perception.range_max * self.perception.scale
         )
         self.generator = torch.Generator()
-        self._survey()
+        self.course = RobotCourse(self.tracks)
+        self.starts = torch.tensor([track.start for track in self.tracks]).t()
+        self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
         self._declare_specs()
         for name, value in {
             "track": torch.arange(num_cars) % len(self.tracks), "pose": torch.zeros(3, num_cars),
@@ -137,16 +135,6 @@ class SimulatedRobotEnv(SeededEnv):
         }.items():  # fmt: skip
             self.register_buffer(name, value)
         self.set_seed(seed)
-
-    def _survey(self) -> None:
-        """Note where everything stands on each of the T tracks; what one has fewer of is filled up far away."""
-        stands = [cones_of(track) for track in self.tracks]
-        self.cones = _stacked([place for place, _ in stands], FAR)  # [2, T, M] m
-        self.radius = _stacked([radius.unsqueeze(0) for _, radius in stands], 0.0)[0]  # [T, M] m
-        lines = ([torch.tensor(track.boundary(side, BOUNDARY_STEP).T) for track in self.tracks] for side in SIDES)
-        self.boundaries = [_stacked(of_side, FAR) for of_side in lines]  # [2, T, points] m
-        self.starts = torch.tensor([track.start for track in self.tracks]).t()
-        self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
 
     def _declare_specs(self) -> None:
         robots = self.batch_size
@@ -204,7 +192,7 @@ class SimulatedRobotEnv(SeededEnv):
         seen = self._see()
 
         lap_time, finished = self._cross_the_line()
-        clearance, to_boundaries = self._clearance()
+        clearance, to_boundaries = self.course.clearance(self.track, self.pose)
         crashed = clearance <= 0
         nothing, alive = torch.zeros_like(action), (~crashed).float()
         outcome = Outcome(action, roughness, lap_time, finished, nothing, to_boundaries, crashed, alive)
@@ -218,7 +206,7 @@ class SimulatedRobotEnv(SeededEnv):
         return out
 
     def _measure(self, poses: Tensor) -> Tensor:
-        true, _ = self.lidar.cast(poses, self.cones[:, self.track], self.radius[self.track])
+        true, _ = self.lidar.cast(poses, self.course.cones[:, self.track], self.course.radius[self.track])
         return self.lidar.measure(true, self.generator)[0]
 
     def _see(self) -> dict[str, Tensor]:
@@ -237,15 +225,6 @@ class SimulatedRobotEnv(SeededEnv):
         self.on_line, self.lap = inside, self.lap + finished
         self.clock = torch.where(entered, self.steps, self.clock)
         return lap_time, finished
-
-    def _clearance(self) -> tuple[Tensor, Tensor]:
-        """How far each robot is from a crash [B] m, and from the left and the right boundary [2, B] m."""
-        stand, radius = self.cones[:, self.track].transpose(1, 2), self.radius[self.track].t()
-        beyond = to_car(self.pose, stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
-        to_cone = (beyond.clamp(min=0).norm(dim=0) - radius).amin(0)
-        place = self.pose[:2].unsqueeze(-1)
-        to_boundaries = torch.stack([(line[:, self.track] - place).norm(dim=0).amin(-1) for line in self.boundaries])
-        return torch.minimum(to_cone, to_boundaries.amin(0) - ON_THE_LINE), to_boundaries
 
     def _tensordict(
         self,
@@ -266,12 +245,3 @@ class SimulatedRobotEnv(SeededEnv):
         entries: dict[str, Any] = {key: seen[key] for key in ("observation", "cones", "cone_count")}
         entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
         return TensorDict(entries, self.batch_size, device=self.device)
-
-
-def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:
-    """Tables [D, any] as one, [D, T, most]."""
-    most = max(table.shape[1] for table in tables)
-    wide = torch.full((len(tables[0]), len(tables), most), padding)
-    for index, table in enumerate(tables):
-        wide[:, index, : table.shape[1]] = table
-    return wide

@@ -1,8 +1,11 @@
+import math
+
 import numpy as np
 import pytest
+import torch
 
-from coil_rl.envs import robot_track
-from coil_rl.envs.robot_course import THICK, THIN, cones_of, middle_line
+from coil_rl.envs import TrackError, robot_track, robot_tracks
+from coil_rl.envs.robot_course import THICK, THIN, RobotCourse, cones_of, middle_line, noted_track, track_notes
 
 
 def test_a_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
@@ -38,3 +41,31 @@ def test_thin_cones_are_left_and_thick_ones_right():
     np.testing.assert_allclose(cones_of(track, right=False)[0].T, track.left, atol=1e-6)
     with pytest.raises(ValueError, match="neither left nor right"):
         cones_of(track, left=False, right=False)
+
+
+@pytest.mark.parametrize(("heading", "half"), [(0.0, 0.06), (math.pi / 2, 0.10)])
+def test_clearance_is_from_the_outline_to_a_cone(heading, half):
+    course = RobotCourse([robot_track()])
+    x, y, _ = robot_track().start
+    course.cones, course.radius = torch.tensor([x, y + 0.15]).view(2, 1, 1), torch.tensor([[0.045]])
+    clearance, _ = course.clearance(torch.tensor([0]), torch.tensor([[x], [y], [heading]]))
+    assert clearance.item() == pytest.approx(0.15 - half - 0.045, abs=1e-5)
+
+
+def test_a_noted_track_is_the_track():
+    again = noted_track(track_notes(robot_track()))
+    assert np.array_equal(again.left, robot_track().left)
+    assert np.array_equal(again.right, robot_track().right)
+    assert again.start == pytest.approx(robot_track().start)
+    assert again.name == robot_track().name
+
+
+@pytest.mark.parametrize("notes", [{}, {"left": "[[0, 0]", "right": "[]"}, {"left": "[1, 2, 3]", "right": "[]"}])
+def test_notes_that_hold_no_track_are_refused(notes):
+    with pytest.raises(TrackError, match="note each side as"):
+        noted_track(notes)
+
+
+def test_a_track_seven_times_as_large_is_as_long_as_seven():
+    (large,) = robot_tracks(scale=7.0)
+    assert large.length == pytest.approx(7 * robot_track().length, rel=1e-3)

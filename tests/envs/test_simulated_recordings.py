@@ -2,19 +2,25 @@ import numpy as np
 import pytest
 import torch
 from mcap.reader import make_reader
+from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
 from coil_rl.envs import (
+    ConeTrackEnv,
     McapReplayEnv,
     Perception,
+    RecordingError,
     SimulatedRobotEnv,
     read_recording,
     record_drives,
+    robot_track,
     save_drive,
     simulated_cone_classifier,
     simulated_drive,
 )
-from coil_rl.guides import ConstantGuide, SplineGuide
+from coil_rl.envs.simulated_recordings import surveyed_drive, track_of
+from coil_rl.guides import ConstantGuide, FollowAdvice, SplineGuide
+from coil_rl.transforms import GuideActions
 
 
 def metadata(path):
@@ -94,3 +100,31 @@ def test_the_same_drive_is_the_same_file(tmp_path):
 def test_there_must_be_a_file_for_each_robot(tmp_path):
     with pytest.raises(ValueError, match="1 paths for 2 robots"):
         record_drives(SimulatedRobotEnv(num_cars=2), SplineGuide(), [tmp_path / "a.mcap"])
+
+
+def test_a_drive_past_both_sides_tells_where_the_cones_stood(files, tmp_path):
+    for side in ("left", "both"):
+        save_drive(simulated_drive(side, seed=3), tmp_path / f"{side}.mcap")
+    assert "track" not in read_recording(tmp_path / "left.mcap").notes
+    for path in (*files, tmp_path / "both.mcap"):
+        track = track_of(read_recording(path))
+        assert np.array_equal(track.left, robot_track().left)
+
+
+def test_a_robot_with_transforms_is_recorded_as_one_without(files, tmp_path):
+    env = SimulatedRobotEnv(num_cars=2, time_limit=25 / 5.5, seed=4)
+    advised = TransformedEnv(env, GuideActions({"spline": SplineGuide()}))
+    record_drives(advised, FollowAdvice(advised), [tmp_path / "0.mcap", tmp_path / "1.mcap"], {"policy": "spline"})
+    for robot, path in enumerate(files):
+        assert (tmp_path / f"{robot}.mcap").read_bytes() == path.read_bytes()
+
+
+def test_only_simulated_robots_are_recorded(ring):
+    with pytest.raises(ValueError, match="env is a ConeTrackEnv; give a SimulatedRobotEnv"):
+        record_drives(ConeTrackEnv([ring]), SplineGuide(), ["a.mcap"])
+
+
+def test_what_does_not_note_a_track_is_no_surveyed_drive(tmp_path):
+    save_drive(simulated_drive("left", seed=3), tmp_path / "left.mcap")
+    with pytest.raises(RecordingError, match="does not tell where its cones stood"):
+        surveyed_drive(read_recording(tmp_path / "left.mcap"))

@@ -102,17 +102,6 @@ def test_whoever_does_not_steer_well_crashes_into_a_cone_or_leaves_the_track(act
     assert all(episode["reward"] < -90 for episode in episodes)
 
 
-def test_clearance_is_from_the_outline_to_a_cone():
-    env = robots(1)
-    env.reset()
-    x, y, _ = robot_track().start
-    env.cones, env.radius = torch.tensor([x, y + 0.15]).view(2, 1, 1), torch.tensor([[0.045]])
-    env.pose = torch.tensor([[x], [y], [0.0]])
-    assert env._clearance()[0].item() == pytest.approx(0.15 - 0.06 - 0.045, abs=1e-5)
-    env.pose[2] = math.pi / 2
-    assert env._clearance()[0].item() == pytest.approx(0.15 - 0.10 - 0.045, abs=1e-5)
-
-
 def test_the_guide_drives_its_laps_without_a_crash():
     result = drive(robots(3, laps=1), SplineGuide())
     assert all(episode["completed"] and not episode["crashed"] for episode in result.episodes)
