@@ -49,6 +49,7 @@ OPERATORS: Columns = {
     "ms_per_step": ("ms a step", ".3f"),
     "share": ("share", ".0%"),
 }
+ROBOT: Columns = {"what": ("scans of 360 points", ""), "scans_per_s": ("scans/s", ",.0f")}
 NUMBERS: Columns = {"what": ("what", ""), "value": ("value", ",.2f")}
 GOALS: Columns = {"what": ("ratio or size", ""), "value": ("value", ",.2f"), "goal": ("goal", ""), "met": ("met", "")}
 
@@ -58,12 +59,14 @@ TABLES: Mapping[str, tuple[str, Columns]] = {
     "compiled": ("Driving under torch.compile", COMPILED),
     "training": ("Training, and the same by hand", TRAINING),
     "shares": ("Where the time of an update goes, collecting included", SHARES),
+    "robot": ("The robot's recordings and its perception", ROBOT),
 }
 
 SPEED_OVER_ONE_CAR = 500.0
 SPEED_OVER_PLAIN = 0.9
 SPEED_OVER_SB3 = 10.0
 STATE_BYTES = 2000.0
+SCANS_PER_S = 1000.0
 
 
 def summarise(results: Mapping[str, Any]) -> str:
@@ -107,6 +110,9 @@ def goals(results: Mapping[str, Any]) -> list[dict[str, Any]]:
     for row in sb3.get("stable_baselines3", []):
         what = f"PPO training, {sb3['cars']} x {sb3['steps']} / Stable-Baselines3 with {_envs(row['envs'])}"
         at_least(what, row["ratio"], SPEED_OVER_SB3)
+    for row in results.get("robot", []):
+        if row["what"].startswith("perception"):
+            at_least(f"{row['what']} (scans/s)", row["scans_per_s"], SCANS_PER_S)
     if "memory" in results:
         value = results["memory"]["state_bytes_per_car"]
         rows.append({"what": "bytes of state a car", "value": value, "goal": f"< {STATE_BYTES:g}",

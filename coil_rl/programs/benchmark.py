@@ -15,6 +15,7 @@ from tqdm import tqdm
 from coil_rl.benchmark.driving import measure_compiled, measure_driving, measure_operators
 from coil_rl.benchmark.fresh import measure_memory, measure_start
 from coil_rl.benchmark.picture import draw_driving
+from coil_rl.benchmark.robot import measure_robot
 from coil_rl.benchmark.summary import goals, summarise
 from coil_rl.benchmark.training import measure_shares, measure_training
 from coil_rl.benchmark.turns import Turns
@@ -32,6 +33,7 @@ PARTS: Mapping[str, Callable[[DictConfig, Turns], Any]] = {
     "env": measure_driving,
     "training": measure_training,
     "shares": measure_shares,
+    "robot": measure_robot,
     "oracle": measure_oracle,
     "sb3": measure_sb3,
     "profile": lambda config, _: measure_operators(config, config.compare_cars),

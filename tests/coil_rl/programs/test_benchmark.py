@@ -5,7 +5,7 @@ import pytest
 from PIL import Image
 from programs import called, program
 
-PARTS = ["start", "memory", "env", "training", "shares", "oracle", "sb3", "profile"]
+PARTS = ["start", "memory", "env", "training", "shares", "robot", "oracle", "sb3", "profile"]
 
 
 @pytest.mark.slow
@@ -29,6 +29,7 @@ def test_quick_benchmark_measures_everything(tmp_path):
         assert all(share > 0 or (key, row["method"]) == (1, "ppo") for key, share in enumerate(shares))
     assert found["start"]["total_s"] > found["start"]["import_s"] > 0
     assert 172 < found["memory"]["state_bytes_per_car"] < 2000
+    assert [row["scans_per_s"] > 0 for row in found["robot"]] == [True] * 3
     assert found["oracle"]["ratio"] > 0
     assert found["profile"]["operators"][0]["ms_per_step"] > 0
     if importlib.util.find_spec("stable_baselines3"):
