@@ -6,9 +6,9 @@ from coil_rl.perception.classifier import (
     load_classifier,
     save_classifier,
     train_classifier,
+    train_on_drives,
 )
 from coil_rl.perception.labelling import LabelledClusters, Share, accuracy, label_clusters, recall
-from coil_rl.perception.results import write_simulated_results
 from coil_rl.perception.simulated import train_on_simulated_drives
 
 __all__ = [
@@ -22,6 +22,6 @@ __all__ = [
     "recall",
     "save_classifier",
     "train_classifier",
+    "train_on_drives",
     "train_on_simulated_drives",
-    "write_simulated_results",
 ]

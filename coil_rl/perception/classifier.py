@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,9 +20,11 @@ from coil_rl.envs.clusters import FEATURES
 from coil_rl.envs.cone_classifier import ConeClassifier
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
+from coil_rl.perception.labelling import Scans, one_sided
 
 Array = NDArray[np.float64]
 FOLDS = 5
+EVERY = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,10 +34,14 @@ class Training:
     Attributes:
         pipeline: the standardisation and the support vector machine, learned from everything.
         accuracy: [folds], share of the clusters of left-out drives that were told right.
+        right: how many of them all.
+        total: of how many.
     """
 
     pipeline: Pipeline
     accuracy: Array
+    right: int
+    total: int
 
 
 def train_classifier(
@@ -67,13 +74,36 @@ def train_classifier(
     if thick.all() or not thick.any():
         raise UserError(f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing")
     pipeline = make_pipeline(StandardScaler(), SVC(C=C, gamma=gamma))
-    accuracy = []
+    right = []
     for train, test in GroupKFold(folds).split(features, thick, drives):
         if len(np.unique(thick[train])) < 2:
             raise UserError("without one fold of drives only one kind of cone is left; number the drives in pairs")
         fitted = clone(pipeline).fit(features[train], thick[train])
-        accuracy.append(float((fitted.predict(features[test]) == thick[test]).mean()))
-    return Training(pipeline.fit(features, thick), np.array(accuracy))
+        right.append(fitted.predict(features[test]) == thick[test])
+    accuracy = np.array([fold.mean() for fold in right])
+    return Training(pipeline.fit(features, thick), accuracy, sum(int(fold.sum()) for fold in right), len(features))
+
+
+def train_on_drives(left: Sequence[Scans], right: Sequence[Scans], folds: int = FOLDS, every: int = EVERY) -> Training:
+    """Learn from drives past left cones alone and drives past right cones alone: nobody has to label anything.
+
+    Args:
+        left: scans of the former.
+        right: scans of the latter; the k-th drives of both are left out together.
+        folds: of the cross-validation, at most.
+        every: of so many scans one is learned from, for neighbouring ones show nearly the same.
+
+    Raises:
+        UserError: as `train_classifier`.
+    """
+    if min(len(left), len(right)) < 2:
+        found = f"{len(left)} drives past left cones and {len(right)} past right ones"
+        raise UserError(f"{found} are too few to learn from; record two of each, better five")
+    pairs = min(len(left), len(right))
+    thin, thick = one_sided(left, every), one_sided(right, every)
+    features = np.concatenate([thin.features, thick.features])
+    kind = np.arange(len(features)) >= len(thin.features)
+    return train_classifier(features, kind, np.concatenate([thin.drive, thick.drive]) % pairs, min(folds, pairs))
 
 
 def cone_classifier(pipeline: Pipeline) -> ConeClassifier:

@@ -1,4 +1,4 @@
-"""From simulated drives to what the classifier learns from and is measured with."""
+"""From drives to what the classifier learns from, which needs no person, and to what it is measured with."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from coil_rl.envs.simulated_drives import SimulatedDrive
 from coil_rl.envs.simulated_lidar import LEAST
 
 Array = NDArray[np.float64]
+Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and the bearings of their beams [P] radians
 
 RANGE = 1.0  # m
 MARGIN = 0.15  # m, points are kept so far beyond
@@ -72,11 +73,39 @@ class Share:
         return float(low), float(high)
 
 
+@dataclass(frozen=True, eq=False)
+class OneSided:
+    """Clusters of drives past cones of one kind, so that all of them are of that kind.
+
+    Attributes:
+        features: [N, 3] m, width, depth, girth.
+        drive: [N], the place of each one's drive among those given.
+    """
+
+    features: Array
+    drive: NDArray[np.int64]
+
+
+def one_sided(drives: Sequence[Scans], every: int = 1) -> OneSided:
+    """The clusters within 1 m of drives past the cones of one side alone.
+
+    Args:
+        drives: their scans.
+        every: of so many scans one is looked at.
+    """
+    found = []
+    for ranges, angles in drives:
+        points = points_of(ranges[::every], angles, LEAST, RANGE + MARGIN)
+        clusters = measure(points, single_linkage(points))
+        found.append(clusters.features[np.hypot(*clusters.centroid.T) <= RANGE])
+    return OneSided(np.concatenate(found), np.repeat(np.arange(len(found)), [len(features) for features in found]))
+
+
 def label_clusters(drives: Sequence[SimulatedDrive], farthest: float = RANGE) -> LabelledClusters:
     """The clusters of drives, by the cone that most of a cluster's points are of; those of strays only are left out.
 
     Args:
-        drives: simulated ones, of any sides.
+        drives: those whose truth is known, past any sides.
         farthest: m, clusters with a centroid beyond are left out.
     """
     columns: list[list[NDArray[np.generic]]] = []

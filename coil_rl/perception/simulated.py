@@ -11,25 +11,16 @@ import numpy as np
 
 from coil_rl.envs.simulated_drives import labelling_drives
 from coil_rl.files import whole_file
-from coil_rl.perception.classifier import Training, cone_classifier, train_classifier
-from coil_rl.perception.labelling import label_clusters
+from coil_rl.perception.classifier import Training, cone_classifier, train_on_drives
 
 SEEDS = range(5)
-EVERY = 4
 DIGITS = 9
 
 
-def train_on_simulated_drives(seeds: Sequence[int] = SEEDS, every: int = EVERY) -> Training:
-    """Train on a simulated drive past left cones and one past right cones for each seed, one fold a seed.
-
-    Args:
-        seeds: of the drives.
-        every: of so many scans one is learned from, for neighbouring ones show nearly the same.
-    """
-    labelled = label_clusters(labelling_drives(seeds))
-    kept = labelled.scan % every == 0
-    pair = labelled.drive // 2
-    return train_classifier(labelled.features[kept], labelled.thick[kept], pair[kept], folds=len(seeds))
+def train_on_simulated_drives(seeds: Sequence[int] = SEEDS) -> Training:
+    """Train on a simulated drive past left cones and one past right cones for each seed, one fold a seed."""
+    drives = [(drive.ranges.numpy(), drive.angles.numpy()) for drive in labelling_drives(seeds)]
+    return train_on_drives(drives[::2], drives[1::2])
 
 
 def write_simulated_cone_classifier(path: str | os.PathLike[str]) -> None:

@@ -2,10 +2,23 @@
 
 from coil_rl.reproduce.figure_6 import Figure6
 from coil_rl.reproduce.figure_22 import Figure22
+from coil_rl.reproduce.figure_25 import Figure25
 from coil_rl.reproduce.result import OfRuns, Result
 from coil_rl.reproduce.table_1 import Table1
 from coil_rl.reproduce.table_4 import Table4
 from coil_rl.reproduce.table_5 import Table5
+from coil_rl.reproduce.table_6 import Table6
 from coil_rl.reproduce.tabular_coil import TabularCoil
 
-__all__ = ["Figure6", "Figure22", "OfRuns", "Result", "Table1", "Table4", "Table5", "TabularCoil"]
+__all__ = [
+    "Figure6",
+    "Figure22",
+    "Figure25",
+    "OfRuns",
+    "Result",
+    "Table1",
+    "Table4",
+    "Table5",
+    "Table6",
+    "TabularCoil",
+]

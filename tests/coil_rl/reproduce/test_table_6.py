@@ -1,0 +1,91 @@
+import csv
+
+import numpy as np
+import pytest
+import torch
+from drives import drive as circle
+from PIL import Image
+
+from coil_rl.envs import RecordingError, SimulatedRobotEnv, read_recording, record_drives
+from coil_rl.errors import UserError
+from coil_rl.evaluation import drive
+from coil_rl.guides import ConstantGuide, SplineGuide
+from coil_rl.reproduce import Table6
+
+
+@pytest.fixture(scope="module")
+def crash(tmp_path_factory):
+    """A robot that steers to the left until it crashes, and another one that the guide drives for 20 seconds."""
+    folder = tmp_path_factory.mktemp("drives")
+    record_drives(SimulatedRobotEnv(seed=4), ConstantGuide(1.0), [folder / "crash.mcap"], {"policy": "constant"})
+    env = SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4)
+    record_drives(env, SplineGuide(), [folder / "0.mcap", folder / "1.mcap"], {"policy": "guide"})
+    return folder
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_recordings_tell_what_the_simulation_measured(crash, tmp_path):
+    page = Table6([str(crash)]).make(tmp_path / "table_6")
+    rows = {row["recording"]: row for row in rows_of(tmp_path / "table_6.csv")}
+    live = drive(SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4), SplineGuide()).episodes
+    for robot, episode in enumerate(live):
+        row = rows[f"{robot}.mcap"]
+        assert float(row["smoothness"]) == pytest.approx(episode["smoothness"], abs=1e-5)
+        assert float(row["clearance"]) == pytest.approx(episode["clearance"], abs=1e-5)
+        assert row["crashed"] == "False"
+        assert float(row["off_centre"]) < 0.05
+    (ended,) = drive(SimulatedRobotEnv(seed=4), ConstantGuide(1.0)).episodes
+    assert rows["crash.mcap"]["crashed"] == "True"
+    assert float(rows["crash.mcap"]["clearance"]) == pytest.approx(ended["clearance"], abs=1e-5)
+    assert "## Table 6: the robot (simulated)" in page
+    assert "| guide    |      2 |    0 |       0 |" in page
+    assert "sways, stays central" in page
+    assert Image.open(tmp_path / "table_6.png").width == 1600
+
+
+def test_a_recording_of_another_robot_has_what_its_odometry_and_commands_tell(tmp_path):
+    file = circle(tmp_path / "mine.mcap", scans=250, odometry=True, commands=True)
+    page = Table6([str(file)]).make(tmp_path / "table_6")
+    (row,) = rows_of(tmp_path / "table_6.csv")
+    # On a circle of 1 m at 0.15 m/s; the same action is told all the time, which is new for twenty steps.
+    assert float(row["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-3)
+    assert row["laps"] == "1"
+    action = np.arcsin(2 / 7) / np.radians(80)
+    weights = np.exp(-0.1 * np.arange(20))
+    jerks = action * (1 - np.append(0, weights.cumsum()) / weights.sum())
+    assert float(row["smoothness"]) == pytest.approx(jerks.sum() / 250, rel=1e-3)
+    assert row["crashed"] == row["method"].replace("mine", "") == ""
+    assert "simulated" not in page
+    assert "| mine   |      1 |    1 |       - |" in page
+
+
+def test_without_odometry_a_robot_did_what_it_was_told(tmp_path):
+    file = circle(tmp_path / "mine.mcap", scans=250, commands=True)
+    Table6([str(file)]).make(tmp_path / "table_6")
+    (row,) = rows_of(tmp_path / "table_6.csv")
+    assert float(row["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-2)
+
+
+def test_drivers_can_be_named(crash, tmp_path):
+    recordings = {"coil": [str(crash / "0.mcap")], "ppo": [str(crash / "1.mcap")]}
+    Table6(recordings).make(tmp_path / "table_6")
+    assert [row["method"] for row in rows_of(tmp_path / "table_6.csv")] == ["coil", "ppo"]
+
+
+def test_the_last_place_is_in_the_recording(crash):
+    env = SimulatedRobotEnv(seed=4)
+    state = env.rollout(200, ConstantGuide(1.0))
+    poses, _, _ = read_recording(crash / "crash.mcap").odometry
+    torch.testing.assert_close(torch.from_numpy(poses[-1]).float(), state["next", "info", "pose"][0, -1])
+
+
+def test_nothing_and_what_is_no_recording_are_refused(tmp_path):
+    with pytest.raises(UserError, match="recordings is empty"):
+        Table6([])
+    (tmp_path / "none.mcap").write_bytes(b"none")
+    with pytest.raises(RecordingError, match="is not an MCAP file"):
+        Table6([str(tmp_path / "none.mcap")])
