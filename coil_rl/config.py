@@ -188,6 +188,17 @@ class RunsBudget:
 
 
 @dataclass
+class Robot(Common):
+    """Configuration of `coil-robot`."""
+
+    steps: list[str] = MISSING
+    runs: list[str] = field(default_factory=list)
+    recordings: Any = field(default_factory=list)
+    figure_25: dict[str, Any] = MISSING
+    table_6: dict[str, Any] = MISSING
+
+
+@dataclass
 class Reproduce:
     """Configuration of `coil-reproduce`."""
 
@@ -212,4 +223,5 @@ ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
 ConfigStore.instance().store(name="report_schema", node=Report)
 ConfigStore.instance().store(name="listen_schema", node=Listen)
 ConfigStore.instance().store(name="replay_schema", node=Replay)
+ConfigStore.instance().store(name="robot_schema", node=Robot)
 ConfigStore.instance().store(name="reproduce_schema", node=Reproduce)

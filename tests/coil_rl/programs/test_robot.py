@@ -1,0 +1,101 @@
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from programs import called
+
+import coil_rl.config  # noqa: F401  registers the typed roots
+from coil_rl import checkpoint
+from coil_rl.build import build_env, build_learner
+from coil_rl.envs import McapReplayEnv, Perception, read_recording, simulated_cone_classifier
+from coil_rl.guides import SplineGuide
+
+SHORT = ["evaluation.repeats=1", "env.time_limit=2"]
+SMALL = [*SHORT, "figure_25.pairs=2", "figure_25.tests=1"]
+
+
+def make_run(folder, *overrides):
+    """What coil-train leaves, as far as coil-robot reads it; the agent has learned nothing."""
+    folder.mkdir()
+    torch.manual_seed(0)
+    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
+        config = compose("train", ["track=robot", "track.train.scale=7", *overrides, f"run_dir={folder}"])
+    if config.method.observes is not None:
+        checkpoint.save(build_learner(config, build_env(config)).policy.state_dict(), folder / "policy_last.pt")
+    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    kept.logger = None
+    OmegaConf.save(kept, folder / "config.yaml")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs")
+    make_run(folder / "coil", "method=coil", "seed=3")
+    make_run(folder / "residual", "method=residual", "learner.action_gain=1.0")
+    make_run(folder / "guide", "method=guide")
+    make_run(folder / "tasks", "method=ppo", "env=driving_tasks", "also_observes=[task]")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_all_steps_leave_recordings_a_classifier_and_both_tables(runs):
+    done = called("robot", *SMALL, f"runs=[{runs}/coil]", "hydra.run.dir=run")
+    run = Path("run")
+    names = {f"{page}.{ending}" for page in ("figure_25", "table_6") for ending in ("md", "csv", "png")}
+    assert {path.name for path in run.iterdir()} - {".hydra"} == {*names, "cones.skops", "labelling", "drives"}
+    assert {path.name for path in (run / "drives").iterdir()} == {"00_guide_0.mcap", "01_coil_seed3_0.mcap"}
+    assert len(list((run / "labelling").iterdir())) == 5
+    pages = [(run / f"{page}.md").read_text() for page in ("figure_25", "table_6")]
+    last = f"robot: record, train, drive, table done; see {run.absolute()}"
+    assert done.stdout == f"{pages[0]}\n{pages[1]}\n{last}\n"
+    assert [row["method"] for row in rows_of(run / "table_6.csv")] == ["guide", "coil"]
+
+    # Anybody's recordings make the same table again.
+    called("robot", "steps=[table]", "recordings=[run/drives]", "hydra.run.dir=again")
+    assert Path("again/table_6.csv").read_bytes() == (run / "table_6.csv").read_bytes()
+
+
+def test_what_a_transform_made_of_the_action_is_what_the_robot_was_told(runs):
+    called("robot", "steps=[drive]", *SHORT, f"runs=[{runs}/residual]", "hydra.run.dir=run")
+    recording = read_recording("run/drives/01_residual_seed0_0.mcap")
+    guide = McapReplayEnv(recording, Perception(simulated_cone_classifier())).rollout(100, SplineGuide())
+    told = recording.commands[0][:, 1]
+    # A residual agent that has not learned yet adds little to its guide.
+    advised = (guide["action"][0, :, 0] * torch.pi * 80 / 180).sin() * 0.15 / (2 / 7)
+    assert 0 < (torch.from_numpy(told) - advised).abs().mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("steps=[]", "steps=[] must be some of record, train, drive, table"),
+        ("steps=[dirve]", "steps=['dirve'] must be some of record, train, drive, table"),
+        ("steps=[table]", "recordings is empty and nothing is driven; give recordings=[FILE,...]"),
+        ("steps=[table] recordings=[none.mcap]", "none.mcap cannot be read (No such file or directory)"),
+        ("steps=[train] figure_25.left=[none.mcap]", "figure_25: left=['none.mcap'] and right=[] must both be given"),
+        ("runs=[nowhere]", "runs=nowhere is not the folder of a run: it has no config.yaml"),
+        ("runs=[{runs}/guide]", "trained no agent: its method is guide; let its guide drive instead"),
+        ("runs=[{runs}/tasks]", "sees task, which SimulatedRobotEnv does not write"),
+        ("env=cone_track", "guide drives a ConeTrackEnv; give env=simulated_robot"),
+        ("step=[table]", "there is no key step"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words, runs):
+    done = called("robot", *arguments.format(runs=runs).split(), code=2)
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("robot: ")
+    assert words in sentence
+    assert not list(Path().iterdir())
