@@ -172,8 +172,13 @@ def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = Non
 def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """The node `env` of a configuration with all references resolved; `overrides` as in `build_env`."""
     with open_dict(config):  # which keys the env takes is its own to say
-        node: Any = OmegaConf.to_container(OmegaConf.merge(config.env, dict(overrides or {})), resolve=True)
-    return dict(node)
+        node = OmegaConf.merge(config.env, dict(overrides or {}))
+        for key, value in (overrides or {}).items():
+            # What another target takes is not what the one before took.
+            if isinstance(value, (Mapping, DictConfig)) and "_target_" in value:
+                OmegaConf.update(node, key, value, merge=False)
+    resolved: Any = OmegaConf.to_container(node, resolve=True)
+    return dict(resolved)
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:

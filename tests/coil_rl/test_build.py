@@ -42,6 +42,15 @@ def test_every_guide_advises_on_what_the_env_shows(guide):
         check_guide(guide_module, data)
 
 
+def test_an_override_with_another_target_keeps_nothing_of_the_one_before():
+    config = composed("env=simulated_robot")
+    tracks = {"_target_": "coil_rl.envs.robot_tracks", "scale": 1.0}
+    env = build_bare_env(config, {"tracks": tracks, "reward": {"finish": 1.0}})
+    assert [track.name for track in env.tracks] == ["robot (simulated)"]
+    assert env.weights["finish"] == 1
+    assert env.weights["crash"] == -100
+
+
 def test_a_guide_drives_as_its_advice_is_degraded():
     config = composed("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
     env, policy = build_guided_env(config, {"num_cars": 4})
