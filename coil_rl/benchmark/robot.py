@@ -5,7 +5,9 @@ from __future__ import annotations
 import itertools
 import statistics
 import tempfile
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from coil_rl.envs import Perception, read_recording, save_drive, simulated_cone_
 
 
 def measure_robot(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:
-    """One row a subject: scans per second, of a simulated lap of the robot with 360 points a scan."""
+    """One row a subject: scans per second of a core's time, of a simulated lap with 360 points a scan."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "lap.mcap"
         save_drive(simulated_drive("both", config.seed), path)
@@ -40,7 +42,8 @@ def measure_robot(config: DictConfig, turns: Turns) -> list[dict[str, Any]]:
         subjects: dict[str, Callable[[], int]] = {
             "reading MCAP": read, "perception, a recording at once": all_at_once, "perception, one scan at a time": one,
         }  # fmt: skip
-        rates = turns.rates(subjects)
+        # What is promised is absolute, so other processes must not count.
+        rates = replace(turns, clock=time.process_time).rates(subjects)
     return [
         {"what": what, "scans_per_s": statistics.median(rounds), "rounds": rounds} for what, rounds in rates.items()
     ]
