@@ -119,7 +119,10 @@ def start(words: Sequence[str]) -> int:
     """Let `coil-train` do what these words say, in a process of its own; returns its exit code."""
     # Its tables are not what was asked for; bars and mistakes go to standard error.
     command = [sys.executable, "-m", "coil_rl.programs.train", *words]
-    return subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode
+    try:
+        return subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt("the same command goes on") from None
 
 
 def _composed(experiment: str, *overrides: str) -> Any:

@@ -13,7 +13,7 @@ from coil_rl.report import draw_learning_curves, markdown_table, write_csv
 from coil_rl.report.curve import TRAINING, mean_curve
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.reproduce.result import OfRuns
-from coil_rl.reproduce.verdict import interval
+from coil_rl.reproduce.verdict import with_interval
 
 PARTS = {"quarter": (0.25, "a quarter"), "half": (0.5, "half"), "end": (1.0, "all")}
 
@@ -55,11 +55,10 @@ class Figure22(OfRuns):
             rows += [dict(zip(("label", "frames", "mean", "low", "high"), (label, *p), strict=True)) for p in points]
             line: dict[str, Any] = {"label": label, "runs": len(curve)}
             for part, (share, _) in PARTS.items():
-                line |= {part: None, f"{part}_interval": None}
+                line[part] = None
                 if len(frames):
                     at = int(np.abs(frames - share * frames[-1]).argmin())
-                    ends = interval(low[at], high[at]) if len(curve) > 1 else None
-                    line |= {part: mean[at], f"{part}_interval": ends}
+                    line[part] = with_interval(mean[at], *((low[at], high[at]) if len(curve) > 1 else (np.nan, np.nan)))
             passed = frames[mean >= guide] if guide is not None else frames[:0]
             table.append(line | {"passed": passed[0] if len(passed) else None})
         write_csv(rows, stem.with_suffix(".csv"))
@@ -69,7 +68,7 @@ class Figure22(OfRuns):
         )  # fmt: skip
         columns = {"label": ("method", ""), "runs": ("runs", "d")}
         for part, (_, text) in PARTS.items():
-            columns |= {part: (f"return after {text} of the frames", ".1f"), f"{part}_interval": ("95 %", "")}
+            columns |= {part: (f"return after {text} of the frames (95 %)", "")}
         columns |= {"passed": ("frames up to the guide", ",.0f")}
         notes = NOTES.strip().format(guide="an unknown return" if guide is None else f"{guide:.1f}")
         return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from coil_rl.report.runs import Run
-from coil_rl.reproduce.verdict import verdicts
+from coil_rl.reproduce.verdict import END, divide
 
 
 def page(text: str, name: str, note: str | None, origin: str) -> str:
@@ -21,7 +21,7 @@ def page(text: str, name: str, note: str | None, origin: str) -> str:
     """
     heading, _, rest = text.partition("\n")
     warning = [f"> **{note}**"] if note else []
-    parts = [heading, *warning, f"![{heading.lstrip('# ')}]({name}.png)", rest.strip(), f"<sub>{origin}</sub>"]
+    parts = [heading, *warning, f"![{heading.lstrip('# ')}]({name}.png)", rest.strip(), f"{END}{origin}</sub>"]
     return "\n\n".join(parts) + "\n"
 
 
@@ -75,11 +75,10 @@ def results(
         "and the commits of the code. Numbers of the paper are beside ours; its tracks and its robot are not part of "
         "this project, so what can be compared is the order of the methods and how far they are apart."
     )
-    held = {name: verdicts(text) for name, text in made.items()}
-    lines = [f"**{_title(made[name])}**\n\n" + "\n".join(of_page) for name, of_page in held.items() if of_page]
-    if lines:
-        parts += ["## What held up, and what did not", _HOW, *lines]
-    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text in made.values()]
+    divided = {name: divide(text) for name, text in made.items()}
+    if held := [f"**{_title(made[name])}**\n\n{end}" for name, (_, end) in divided.items() if end]:
+        parts += ["## What held up, and what did not", _HOW, *held]
+    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in divided.values()]
     if lacking := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(lacking)]
     for heading, sentences in {
@@ -91,8 +90,8 @@ def results(
 
 
 _HOW = (
-    "What the paper says, and the 95 % interval of our number: held up where all of it is on the paper's side, did not "
-    "hold up where all of it is on the other, undecided in between."
+    "What the paper says, and our number with its 95 % interval: held up where all of it is on the paper's side, did "
+    "not hold up where all of it is on the other, undecided in between."
 )
 
 

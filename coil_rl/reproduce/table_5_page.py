@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from coil_rl.report import markdown_table
 from coil_rl.report.comparison import Group
-from coil_rl.report.paired import paired
+from coil_rl.report.paired import Paired, paired
 from coil_rl.report.runs import GUIDE
-from coil_rl.reproduce.verdict import interval, verdict
+from coil_rl.reproduce.verdict import FAILED, HEADING, HELD, verdict, with_interval
 
 # Lap time s, smoothness and reward, each a mean over three unseen tracks; nobody crashed.
 PAPER = {
@@ -71,23 +70,19 @@ def drivers(rows: Sequence[Mapping[str, Any]], against: str) -> str:
     """
     table = []
     for row in rows:
-        line = {**row, "reward_interval": interval(row["reward_low"], row["reward_high"])}
-        line |= {"iqm_interval": interval(row["iqm_low"], row["iqm_high"])}
-        for name in (against, GUIDE):
-            pairs = row.get(name)
-            line |= {f"{name}_difference": None, f"{name}_interval": None, f"{name}_better": None}
-            if pairs is not None:
-                difference, low, high = pairs.difference
-                line |= {f"{name}_difference": difference, f"{name}_interval": interval(low, high, "+.1f")}
-                line |= {f"{name}_better": pairs.better[0]}
-        table.append(line)
+        pairs: Paired | None = row.get(against)
+        over_guide: Paired | None = row.get(GUIDE)
+        cells = {key: with_interval(row[key], row[f"{key}_low"], row[f"{key}_high"]) for key in ("reward", "iqm")}
+        table.append({**row, **{f"{key} cell": cell for key, cell in cells.items()}} | {
+            "difference": with_interval(*pairs.difference, "+.1f") if pairs else None,
+            "better": pairs.better[0] if pairs else None, "over_guide": over_guide.better[0] if over_guide else None,
+        })  # fmt: skip
     return markdown_table(table, {
         "driver": ("driver", ""), "seeds": ("seeds", ""), "completed": ("completed", ".0%"),
         "crashed": ("crashed", ".0%"), "lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"),
-        "reward": ("reward (mean)", ".1f"), "reward_interval": ("95 %", ""), "iqm": ("IQM", ".1f"),
-        "iqm_interval": ("95 %", ""), f"{against}_difference": (f"reward - {against}'s", "+.1f"),
-        f"{against}_interval": ("95 %", ""), f"{against}_better": (f"better than {against}", ".0%"),
-        f"{GUIDE}_better": ("better than the guide", ".0%"), "needs_guide": ("guide at test time", ""),
+        "reward cell": ("reward: mean (95 %)", ""), "iqm cell": ("reward: IQM (95 %)", ""),
+        "difference": (f"reward - {against}'s (95 %)", ""), "better": (f"better than {against}", ".0%"),
+        "over_guide": ("better than the guide", ".0%"),
     })  # fmt: skip
 
 
@@ -113,37 +108,43 @@ def tracks(groups: Sequence[Group], name: str) -> str:
     return markdown_table(rows, {"driver": ("mean reward", "")} | {track: (track, "") for track in names})
 
 
-def verdicts(found: Mapping[str, Sequence[Group]], world: str, resamples: int, seed: int) -> list[str]:
-    """What held up of what the paper says, a line for each claim and way to act.
+def held_up(worlds: Mapping[str, Mapping[str, Sequence[Group]]], resamples: int, seed: int) -> str:
+    """A table of what the paper says, and whether it held up; in worlds besides the paper's only who earns more.
 
     Args:
-        found: the drivers, by how they acted.
-        world: its name; empty for the paper's.
+        worlds: by name, "" for the paper's, the drivers by how they acted.
         resamples: of the bootstrap.
         seed: of the bootstrap.
     """
-    lines = []
-    for claim, measure, label, other, sign in CLAIMS:
-        for actions, groups in found.items():
-            named = {group.name: group for group in groups}
-            pairs = label in named and other in named and paired(named[label], named[other], measure, resamples, seed)
-            if pairs:
-                difference, low, high = pairs.difference
-                spec = f"+{SPECS[measure]}"
-                said = f"{difference:{spec}} (95 % {interval(low, high, spec) or 'unknown'}); paper "
-                said += _paper(measure, label, other, spec)
-                where = ", ".join(filter(None, (f"{actions} actions", world)))
-                lines.append(verdict(f"{claim} ({where})", *((low, high) if sign > 0 else (-high, -low)), said))
-    if not world:
-        shares = {group.name: group.means()["crashed"] for groups in found.values() for group in reversed(groups)}
-        named_shares = ", ".join(f"{name} {shares[name]:.0%}" for name in PAPER if name in shares)
-        worst = max((shares[name] for name in PAPER if name in shares), default=math.nan)
-        lines.append(verdict("Nobody crashes", *((1, 1) if worst == 0 else (-1, -1)), f"{named_shares}; paper 0%"))
-    return lines
+    rows: list[dict[str, Any]] = []
+    for world, found in worlds.items():
+        for claim, measure, label, other, sign in CLAIMS:
+            cells = {}
+            for actions, groups in found.items():
+                named = {group.name: group for group in groups}
+                if label in named and other in named and (measure == "reward" or not world):
+                    pairs = paired(named[label], named[other], measure, resamples, seed)
+                    cells[actions] = verdict(*pairs.difference, f"+{SPECS[measure]}", sign) if pairs else None
+            if cells:
+                said = f"{claim}, {world}" if world else claim
+                rows.append({"claim": said, "paper": _difference(measure, label, other)} | cells)
+    crashed = {
+        actions: {group.name: group.means()["crashed"] for group in groups if group.name in PAPER}
+        for actions, groups in worlds[""].items()
+    }
+    rows.append({"claim": "Nobody crashes", "paper": "0%"} | {
+        actions: f"**{FAILED if any(shares.values()) else HELD}**: "
+        + ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
+        for actions, shares in crashed.items()
+    })  # fmt: skip
+    columns = {"claim": ("the paper says", ""), "paper": ("paper", "")}
+    columns |= {actions: (f"ours, {actions} actions (95 %)", "") for actions in worlds[""]}
+    return f"{HEADING}\n\n{markdown_table(rows, columns)}"
 
 
-def _paper(measure: str, label: str, other: str, spec: str) -> str:
+def _difference(measure: str, label: str, other: str) -> str | None:
+    """The paper's; None where it has not both."""
     if label not in PAPER or other not in PAPER:
-        return "has no such run"
+        return None
     place = SHOWN.index(measure)
-    return f"{PAPER[label][place] - PAPER[other][place]:{spec}}"
+    return f"{PAPER[label][place] - PAPER[other][place]:+{SPECS[measure]}}"

@@ -3,7 +3,7 @@ import json
 from reproduced_runs import make_runs
 
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.verdict import interval, verdict, verdicts
+from coil_rl.reproduce.verdict import verdict, with_interval
 
 
 def test_a_page_says_what_to_know_shows_its_picture_and_where_it_comes_from():
@@ -28,29 +28,32 @@ def test_the_origin_has_command_commits_seeds_and_frames(tmp_path):
 
 
 def test_all_results_are_in_one_file_what_held_up_first_and_what_is_missing_named():
-    lines = [verdict("More", 1.0, 2.0, "+1.5"), verdict("Less", -2.0, -1.0, "-1.5")]
-    made = pages.page("## Table 9: something\n\n" + "\n".join(lines), "table_9", "A note.", "Made.")
+    body = "## Table 9: something\n\ntable\n\n### What held up\n\n| more |"
+    made = pages.page(body, "table_9", "A note.", "Made.")
     text = pages.results(
         {"table_9": made, "figure_3": None}, {"table_9": "make table=9", "figure_3": "make figure=3"},
         "make all=true", "A note.", ["One\n  problem."], ["One limit."],
     )  # fmt: skip
     order = [
-        "# Results", "> **A note.**", "`make all=true` writes this file", "## What held up", "**Table 9: something**",
-        "- **held up**: More: +1.5", "- **did not hold up**: Less: -1.5", "## Table 9: something",
+        "# Results", "> **A note.**", "`make all=true` writes this file", "## What held up",
+        "**Table 9: something**\n\n| more |",
+        "## Table 9: something\n\n![Table 9: something](table_9.png)\n\ntable\n\n<sub>Made.</sub>",
         "## Not made yet\n\n- `make figure=3`", "## What is known", "- One problem.", "## What cannot", "- One limit.",
     ]  # fmt: skip
     places = [text.index(part) for part in order]
     assert places == sorted(places)
-    assert text.count("A note.") == 1
+    assert text.count("A note.") == text.count("| more |") == 1
 
 
 def test_a_claim_is_undecided_where_its_interval_has_both_signs_or_is_not_known():
-    words = [verdict("a", *ends, "b").split("**")[1] for ends in [(-1, 1), (0, 1), (float("nan"), float("nan"))]]
+    assert verdict(1.5, 1.0, 2.0) == "**held up**: 1.5 (1.0 to 2.0)"
+    assert verdict(-1.5, -2.0, -1.0) == "**did not hold up**: -1.5 (-2.0 to -1.0)"
+    assert verdict(-1.5, -2.0, -1.0, "+.2f", -1) == "**held up**: -1.50 (-2.00 to -1.00)"
+    nan = float("nan")
+    words = [verdict(0.5, *ends).split("**")[1] for ends in [(-1, 1), (0, 1), (nan, nan)]]
     assert words == ["undecided"] * 3
-    page = "text\n- **held up**: a: b\n- **bold**: c\n- **undecided**: d: e"
-    assert verdicts(page) == ["- **held up**: a: b", "- **undecided**: d: e"]
+    assert verdict(nan, nan, nan) is None
 
 
-def test_intervals_in_words():
-    assert interval(-1.0, 2.0, "+.1f") == "-1.0 to +2.0"
-    assert interval(float("nan"), float("nan")) is None
+def test_a_number_stands_without_an_interval_where_there_is_none():
+    assert with_interval(2.0, float("nan"), float("nan"), "+.1f") == "+2.0"

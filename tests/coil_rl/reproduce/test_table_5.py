@@ -36,22 +36,23 @@ def test_the_guide_comes_first_then_the_agents_by_their_reward_what_was_complete
     assert list(deterministic) == ["guide", "ppo", "coil", "coil_shuffled", "oil"]
     assert list(deterministic["coil"])[:4] == ["driver", "seeds", "completed", "crashed"]
     assert (deterministic["oil"]["completed"], deterministic["oil"]["crashed"]) == ("50%", "50%")
-    assert deterministic["coil"]["reward (mean)"] == "581.0"
+    assert deterministic["coil"]["reward: mean (95 %)"].startswith("581.0 (580.0 to 58")
 
 
 def test_drivers_that_act_in_one_way_stand_in_both_tables(made):
     page, _, _ = made
     sampled = rows(page, "Sampled actions")
     assert list(sampled) == ["guide", "ppo", "oil", "coil", "coil_shuffled"]
-    assert sampled["oil"]["reward (mean)"] == "556.0"
-    assert sampled["coil"]["reward (mean)"] == "531.0"
+    assert sampled["oil"]["reward: mean (95 %)"].startswith("556.0 (")
+    assert sampled["coil"]["reward: mean (95 %)"].startswith("531.0 (")
 
 
 def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
     page, _, _ = made
     coil = rows(page, "Deterministic actions")["coil"]
-    assert (coil["reward - ppo's"], coil["better than ppo"], coil["better than the guide"]) == ("-30.0", "0%", "100%")
-    assert rows(page, "Deterministic actions", world=1)["coil"]["reward - ppo's"] == "+20.0"
+    assert coil["reward - ppo's (95 %)"] == "-30.0 (-30.0 to -30.0)"
+    assert (coil["better than ppo"], coil["better than the guide"]) == ("0%", "100%")
+    assert rows(page, "Deterministic actions", world=1)["coil"]["reward - ppo's (95 %)"] == "+20.0 (+20.0 to +20.0)"
 
 
 def test_four_drivers_stand_beside_the_paper(made):
@@ -73,12 +74,19 @@ def test_tracks_have_rows_and_say_what_was_not_completed(made):
 
 def test_what_the_paper_says_is_judged_for_both_ways_to_act_and_in_each_world(made):
     page, _, _ = made
-    assert "- **held up**: COIL earns more than its guide (deterministic actions): +31.0 (95 % " in page
-    assert "- **did not hold up**: COIL earns more than its guide (sampled actions): -19.0" in page
-    assert "COIL earns more than PPO (sampled actions): -30.0 (95 % -30.0 to -30.0); paper +18.4" in page
-    assert "- **held up**: COIL earns more than PPO (sampled actions, another world): +20.0" in page
-    assert "- **undecided**: COIL's laps take less time than PPO's (sampled actions): +0.00" in page
-    assert "- **did not hold up**: Nobody crashes: guide 0%, oil 50%, ppo 0%, coil 0%; paper 0%" in page
+    table = page.split("### What held up\n\n")[1].splitlines()[2:]
+    found = {cells[0]: cells[1:] for cells in ([c.strip() for c in line.split("|")[1:-1]] for line in table)}
+    paper, sampled, deterministic = found["COIL earns more than its guide"]
+    assert paper == "+23.5"
+    assert sampled.startswith("**did not hold up**: -19.0 (-20.0 to")
+    assert deterministic.startswith("**held up**: +31.0 (+30.0 to")
+    assert found["COIL earns more than PPO"][1] == "**did not hold up**: -30.0 (-30.0 to -30.0)"
+    assert found["COIL earns more than PPO, another world"][1] == "**held up**: +20.0 (+20.0 to +20.0)"
+    assert found["COIL's laps take less time than PPO's"][:2] == ["-0.10", "**undecided**: +0.00 (+0.00 to +0.00)"]
+    assert found["COIL earns more with its guide's advice than with another car's"][0] == "-"
+    crashes = "**did not hold up**: guide 0%, ppo 0%, oil 50%, coil 0%"
+    assert found["Nobody crashes"][:2] == ["0%", crashes]
+    assert len(found) == 7 + 3 + 1
 
 
 def test_every_drive_is_kept_and_drawn(made):
