@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ def command(config: DictConfig, asked: str) -> str:
     """The command that makes a result again, with the choices of this one."""
     given = HydraConfig.get().overrides.task
     others = [word for word in given if not word.startswith(tuple(f"{key}=" for key in (*KINDS, "all", "budget")))]
-    return " ".join(["coil-reproduce", asked, f"budget={config.budget.name}", *others])
+    return shlex.join(["coil-reproduce", asked, f"budget={config.budget.name}", *others])
 
 
 def _asked(name: Any) -> str:

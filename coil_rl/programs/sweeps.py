@@ -6,6 +6,7 @@ What is missing is run as a person would, in a process of its own, so that every
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -105,7 +106,7 @@ def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
     for words in commands:
         command = [*words, *launcher]
         count = f"{len(sweep.missing)} of {len(sweep.all_folders)} runs are missing"
-        print(f"{sweep.experiment}: {count}\ncoil-train {' '.join(map(_quoted, command))}", file=sys.stderr)
+        print(f"{sweep.experiment}: {count}\n{shlex.join(['coil-train', *command])}", file=sys.stderr)
         if code := start(command):
             raise UserError(
                 f"a sweep of {sweep.experiment} ended with code {code}, and says above why; "
@@ -139,7 +140,3 @@ def _products(choices: Sequence[Choice]) -> list[list[str]]:
         return [list(choice) for choice in choices]
     split = [[word.partition("=") for word in column] for column in values]
     return [[f"{words[0][0]}={','.join(value for *_, value in words)}" for words in split]]
-
-
-def _quoted(word: str) -> str:
-    return f"'{word}'" if set(word) & set("[]{}$ ") else word

@@ -20,7 +20,8 @@ TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.lap
 
 def first(experiment, run_dir):
     """The configuration of the first run of the sweep, as small as can be."""
-    params = OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml").hydra.sweeper.params
+    # One that sweeps as the file that it begins with has none of its own; what is set without it will do.
+    params = OmegaConf.select(OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml"), "hydra.sweeper.params") or {}
     values = {key: str(value).split(",") for key, value in params.items()}
     chosen = [f"{key}={value[0].strip()}" for key, value in values.items() if not key.startswith("budget.")]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):

@@ -1,10 +1,13 @@
+import shutil
 from pathlib import Path
 
 import pytest
-from hydra import initialize_config_module
-from programs import called
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from programs import ROOT, TRACK, called, program
 from run_folders import driven, make_run
 
+from coil_rl import config as _schema  # noqa: F401
 from coil_rl.programs import sweeps
 
 
@@ -108,3 +111,38 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words):
     assert len(error.splitlines()) == 1
     assert words in error
     assert not list(Path().iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", ["smoke", "full"])
+def test_what_a_budget_gives_fits_every_experiment_that_results_name(budget):
+    given = OmegaConf.load(ROOT / "conf" / "budget" / f"{budget}.yaml").budget
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        results = compose("reproduce", ["table=1", f"budget={budget}"]).results
+        experiments = {name for result in results.values() for name in result.get("experiments", [])}
+        experiments |= {name for result in results.values() for name in result.get("worlds", {}).values()}
+        plans = [
+            sweeps.planned(name, [*given.every, *given.only.get(name, [])], range(given.seeds)) for name in experiments
+        ]
+    folders = [folder for plan in plans for folder in plan.all_folders]
+    assert len(experiments) == 7
+    assert set(given.only) <= experiments
+    assert len(folders) == len(set(folders)) == 15 * given.seeds
+
+
+@pytest.mark.slow
+def test_a_figure_from_nothing_and_again_after_one_run_was_lost():
+    choices = ["experiments=[paper]", "labels=[coil,ppo]"]
+    tiny = [*TRACK, "budget.frames=512", "budget.cars=8"]
+    asked = ["figure=22", "budget=smoke", *(f"results.figure_22.{choice}" for choice in choices), f"train={tiny}"]
+    program("reproduce", *asked, cwd=Path())
+    pages = [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")]
+    judged = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
+    assert len(judged) == 4
+    assert "> **This is a smoke test" in pages[0]
+    lost = sorted(judged)[0]
+    shutil.rmtree(lost.parent)
+    program("reproduce", *asked, cwd=Path())
+    again = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
+    assert {path for path in judged if judged[path] != again[path]} == {lost}
+    assert [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")] == pages
