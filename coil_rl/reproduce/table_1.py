@@ -11,6 +11,7 @@ from matplotlib.patches import Patch
 
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import Result, lighten, picture
+from coil_rl.reproduce.verdict import FAILED, HEADING, HELD
 from coil_rl.tabular import toymaker, value_iteration
 
 PAPER = np.array([[41.37, 42.21], [31.42, 32.26]])
@@ -59,7 +60,16 @@ class Table1(Result):
             f"{np.abs(off).max():.4f}. Value iteration that stops early is short of the optimum by nearly the same "
             f"amount everywhere; no such shortfall rounds to more than {most_explained(off)} of the printed values."
         )
-        return f"## Table 1: the toymaker's Q\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
+        gain = Q[:, 1] - Q[:, 0]
+        held = [
+            {"claim": "Advertising is worth more in both states",
+             "ours": f"**{HELD if (gain > 0).all() else FAILED}**: by " + " and ".join(f"{more:.4f}" for more in gain)},
+            {"claim": "Q to two decimals",
+             "ours": f"**{HELD if equal == len(off) else FAILED}**: {equal} of {len(off)} values, off by "
+                     f"{np.abs(off).max():.4f} at most"},
+        ]  # fmt: skip
+        end = markdown_table(held, {"claim": ("the paper says", ""), "ours": ("ours", "")})
+        return f"## Table 1: the toymaker's Q\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}\n\n{HEADING}\n\n{end}"
 
 
 def most_explained(off: np.ndarray) -> int:

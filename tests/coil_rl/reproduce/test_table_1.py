@@ -20,6 +20,8 @@ def test_table_1_is_the_solution_of_the_bellman_equation_beside_what_the_paper_p
     np.testing.assert_allclose(exact, printed, rtol=0, atol=0.011)
     assert "| unsuccessful toy | advertising    | 32.2652 |   32.27 | 32.26 |    +0.0052 |" in page
     assert "1 of 4 values round to what is printed; the largest difference is 0.0109." in page
+    assert "| Advertising is worth more in both states | **held up**: by 0.8" in page
+    assert "**did not hold up**: 1 of 4 values, off by 0.0109 at most" in page
     with Image.open(tmp_path / "t.png") as image:
         assert image.size == (1600, 480)
 

@@ -61,6 +61,9 @@ def test_the_page_counts_the_worlds_where_coil_is_at_least_its_guide(made):
     assert [f"{share:.0%}" for share in reached[[0, 2]]] == [cell.strip() for cell in line.split("|")[6:8]]
     assert "≥ guide, 50 steps | ≥ guide, 5,000 steps" in page
     assert "means over 3 random worlds" in page
+    pairs = [(column(rows, "coil_score"), column(rows, "guide_score")) for rows in groups.values()]
+    reached = sum((coil[:, -1] >= own[:, -1] - 1e-9).sum() for coil, own in pairs)
+    assert f"**: in {reached} of 24 worlds, guides and views |" in page
     with Image.open(stem.with_suffix(".png")) as image:
         assert image.size == (1600, 1120)
 
