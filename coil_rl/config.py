@@ -180,7 +180,6 @@ class Replay:
 class RunsBudget:
     """How many runs results are made from, and what they are given."""
 
-    name: str = MISSING
     seeds: int = MISSING
     note: str | None = None
     every: list[str] = field(default_factory=list)
@@ -207,7 +206,8 @@ class Reproduce:
     figure: Any = None
     claim: Any = None
     all: bool = False
-    budget: RunsBudget = field(default_factory=RunsBudget)
+    budget: str = MISSING
+    budgets: dict[str, RunsBudget] = MISSING
     train: list[str] = field(default_factory=list)
     known_problems: list[str] = field(default_factory=list)
     cannot: list[str] = field(default_factory=list)

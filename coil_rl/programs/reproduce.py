@@ -34,7 +34,7 @@ def reproduce(config: DictConfig) -> None:
     # All are built before the first run begins: a mistake shall cost seconds.
     results = {name: _built(config, name) for name in chosen(config)}
     runs = done(config, [result for result in results.values() if isinstance(result, OfRuns)])
-    commit = versions()["commit"]
+    commit, note = versions()["commit"], config.budgets[config.budget].note
     for name, result in results.items():
         used: Sequence[Run] = ()
         if isinstance(result, OfRuns):
@@ -42,16 +42,16 @@ def reproduce(config: DictConfig) -> None:
             text = result.make(folder / name, runs)
         else:
             text = result.make(folder / name)
-        text = pages.page(text, name, config.budget.note, pages.origin(command(config, _asked(name)), commit, used))
+        text = pages.page(text, name, note, pages.origin(command(config, _asked(name), name), commit, used))
         _write(folder / f"{name}.md", text)
         print(text)
     kept = {str(name): folder / f"{name}.md" for name in config.results}
-    commands = {name: command(config, _asked(name)) for name in kept}
+    commands = {name: command(config, _asked(name), name) for name in kept}
     texts = {name: path.read_text(encoding="utf-8") if path.exists() else None for name, path in kept.items()}
     everything = command(config, "all=true")
     _write(
         folder / ALL,
-        pages.results(texts, commands, everything, config.budget.note, config.known_problems, config.cannot),
+        pages.results(texts, commands, everything, note, config.known_problems, config.cannot),
     )
     print(f"reproduce: {', '.join(results)} made; see {folder / ALL}")
 
@@ -59,10 +59,11 @@ def reproduce(config: DictConfig) -> None:
 def done(config: DictConfig, results: Sequence[OfRuns]) -> Mapping[str, Sequence[Run]]:
     """The runs of all experiments that some results are made from, by experiment, after those missing were done."""
     wanted = list(dict.fromkeys(experiment for result in results for experiment in result.experiments))
-    budget, seeds = config.budget, range(config.budget.seeds)
+    budget = config.budgets[config.budget]
     with tqdm(wanted, unit="experiment", desc="which runs", leave=False, delay=1) as bar:
         found = [
-            sweeps.planned(name, [*budget.every, *budget.only.get(name, []), *config.train], seeds) for name in bar
+            sweeps.planned(name, [*budget.every, *budget.only.get(name, []), *config.train], range(budget.seeds))
+            for name in bar
         ]
     launcher = [word for word in HydraConfig.get().overrides.hydra if word.startswith(LAUNCHER)]
     for sweep in found:
@@ -99,11 +100,13 @@ def chosen(config: DictConfig) -> list[str]:
     return list(dict.fromkeys(wanted))
 
 
-def command(config: DictConfig, asked: str) -> str:
-    """The command that makes a result again, with the choices of this one."""
-    given = HydraConfig.get().overrides.task
-    others = [word for word in given if not word.startswith(tuple(f"{key}=" for key in (*KINDS, "all", "budget")))]
-    return shlex.join(["coil-reproduce", asked, f"budget={config.budget.name}", *others])
+def command(config: DictConfig, asked: str, name: str = "") -> str:
+    """The command that makes a result again, or all without a name, with the choices of this one that matter to it."""
+    asking = tuple(f"{key}=" for key in (*KINDS, "all", "budget"))
+    given = [word for word in HydraConfig.get().overrides.task if not word.startswith(asking)]
+    own = ("results." if not name else f"results.{name}.", f"results.{name}=")
+    others = [word for word in given if not word.startswith("results.") or word.startswith(own)]
+    return shlex.join(["coil-reproduce", asked, f"budget={config.budget}", *others])
 
 
 def _asked(name: Any) -> str:
@@ -126,8 +129,11 @@ def check(config: DictConfig) -> None:
     app.check_keys(config, Reproduce)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and ask for several as in table=[1,4]")
-    if config.budget.seeds < 1:
-        raise UserError(f"budget.seeds={config.budget.seeds} must be at least 1")
+    if config.budget not in config.budgets:
+        known = list(config.budgets)
+        raise UserError(f"budget={config.budget} must be one of {', '.join(known)}{near(config.budget, known)}")
+    if (seeds := config.budgets[config.budget].seeds) < 1:
+        raise UserError(f"budgets.{config.budget}.seeds={seeds} must be at least 1")
     chosen(config)
 
 

@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
-from programs import ROOT, TRACK, called, program
+from programs import TRACK, called, program
 from run_folders import driven, make_run
 
 from coil_rl import config as _schema  # noqa: F401
@@ -38,6 +37,9 @@ def test_a_choice_of_a_result_reaches_it_and_its_page():
     assert outcome("figure=6", "results.figure_6.iterations=7", "hydra.run.dir=run")[0] == 0
     assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
     assert "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`" in Path("run/figure_6.md").read_text()
+    text = Path("run/RESULTS.md").read_text()
+    assert "`coil-reproduce all=true budget=paper results.figure_6.iterations=7` writes this file" in text
+    assert "- `coil-reproduce table=1 budget=paper`" in text
 
 
 def test_all_results_that_were_made_come_together_whatever_asked_for_them():
@@ -74,7 +76,7 @@ def two_runs(monkeypatch):
 def test_runs_that_are_there_are_used_and_one_that_is_gone_is_done_again_alone(two_runs):
     sweep, started = two_runs
     choices = ["experiments=[paper]", "labels=[coil,ppo]"]
-    asked = ["figure=22", "budget.seeds=1", *(f"results.figure_22.{choice}" for choice in choices)]
+    asked = ["figure=22", "budgets.paper.seeds=1", *(f"results.figure_22.{choice}" for choice in choices)]
     code, out, _ = outcome(*asked)
     assert (code, started) == (0, [])
     assert "2 runs with the seeds 0, done at commit `unknown`. Frames of training: 20,000 (coil, ppo)." in out
@@ -100,8 +102,8 @@ def test_runs_that_are_there_are_used_and_one_that_is_gone_is_done_again_alone(t
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
         ("table=1 +results.table_1.x=0", "results.table_1: Table1 takes no x; it takes tolerance"),
         ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "Result or OfRuns is wanted"),
-        ("table=1 budget=small", "there is no budget=small; budget can be full, paper, smoke"),
-        ("table=1 budget.seeds=0", "budget.seeds=0 must be at least 1"),
+        ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
+        ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be at least 1"),
         ("-m table=1,4", "leave out -m, and ask for several as in table=[1,4]"),
     ],
 )
@@ -116,9 +118,9 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words):
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", ["smoke", "full"])
 def test_what_a_budget_gives_fits_every_experiment_that_results_name(budget):
-    given = OmegaConf.load(ROOT / "conf" / "budget" / f"{budget}.yaml").budget
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        results = compose("reproduce", ["table=1", f"budget={budget}"]).results
+        config = compose("reproduce", ["table=1"])
+        results, given = config.results, config.budgets[budget]
         experiments = {name for result in results.values() for name in result.get("experiments", [])}
         experiments |= {name for result in results.values() for name in result.get("worlds", {}).values()}
         plans = [
