@@ -90,7 +90,7 @@ class Figure25(Result):
             with tqdm(total=2 * self.pairs + self.tests, desc="record", unit="drive", leave=False) as bar:
                 made = record_labelling_drives(stem.with_name("labelling"), self.pairs, self.tests, bar.update)
             self._read(made["left"], made["right"], made["both"])
-        simulated = any("simulated" in recording.metadata for recording in (*self.left, *self.right, *self.both))
+        simulated = any("simulated" in recording.notes for recording in (*self.left, *self.right, *self.both))
         where = " (simulated)" if simulated else ""
         training = train_on_drives(_scans(self.left), _scans(self.right))
         save_classifier(training.pipeline, stem.with_name("cones.skops"))

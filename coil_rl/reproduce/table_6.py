@@ -91,7 +91,7 @@ class Table6(Result):
         named = recordings if isinstance(recordings, Mapping) else {"": recordings}
         self.car_length, self.max_steering = car_length, np.radians(max_steering)
         self.recordings = [
-            (name or recording.metadata.get("simulated", {}).get("policy", path.stem), recording)
+            (name or recording.notes.get("simulated", {}).get("policy", path.stem), recording)
             for name, paths in named.items()
             for path in _files(paths)
             for recording in [read_recording(path, scan, odometry, command)]
@@ -107,7 +107,7 @@ class Table6(Result):
         by_method = {row["method"]: [other for other in rows if other["method"] == row["method"]] for row in rows}
         methods = [_mean(of_method) for of_method in by_method.values()]
         write_csv(rows, stem.with_suffix(".csv"))
-        simulated = any("simulated" in recording.metadata for _, recording in self.recordings)
+        simulated = any("simulated" in recording.notes for _, recording in self.recordings)
         where = " (simulated)" if simulated else ""
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{where}")
         return "\n\n".join(
@@ -187,7 +187,7 @@ def _drive(method: str, recording: Recording) -> Drive:
     row: dict[str, Any] = {"method": method, "recording": recording.path.name, "laps": len(rounds.seconds)}
     row["lap_time"] = float(rounds.seconds.mean()) if len(rounds.seconds) else float("nan")
     row |= {"crashed": None, "off_centre": float("nan"), "clearance": float("nan"), "corner_cut": float("nan")}
-    track = track_of(recording) if "track" in recording.metadata else None
+    track = track_of(recording) if "track" in recording.notes else None
     if track is not None:
         course, to_middle = RobotCourse([track]), cKDTree(middle_line(track, MIDDLE_STEP))
         at = torch.from_numpy(poses).float().t()
