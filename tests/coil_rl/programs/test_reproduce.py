@@ -3,11 +3,13 @@ from pathlib import Path
 
 import pytest
 from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
 from programs import TRACK, called, program
 from run_folders import driven, make_run
 
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.programs import sweeps
+from coil_rl.reproduce import OfRuns
 
 
 @pytest.fixture(autouse=True)
@@ -120,9 +122,8 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words):
 def test_what_a_budget_gives_fits_every_experiment_that_results_name(budget):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("reproduce", ["table=1"])
-        results, given = config.results, config.budgets[budget]
-        experiments = {name for result in results.values() for name in result.get("experiments", [])}
-        experiments |= {name for result in results.values() for name in result.get("worlds", {}).values()}
+        results, given = instantiate(config.results, _convert_="all").values(), config.budgets[budget]
+        experiments = {name for result in results if isinstance(result, OfRuns) for name in result.experiments}
         plans = [
             sweeps.planned(name, [*given.every, *given.only.get(name, [])], range(given.seeds)) for name in experiments
         ]
