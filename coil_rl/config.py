@@ -75,9 +75,9 @@ class Common:
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
     degrade: dict[str, Any] = field(default_factory=dict)
-    action: dict[str, Any] = field(default_factory=dict)
     method: Method = field(default_factory=Method)
     also_observes: list[str] = field(default_factory=list)
+    action: dict[str, Any] = field(default_factory=dict)
     budget: Budget = field(default_factory=Budget)
     evaluation: Evaluation = field(default_factory=Evaluation)
     seed: int = 0

@@ -123,21 +123,6 @@ def test_steering_is_chosen_with_and_without_advice():
         assert dqn.network.module[0].module.layers[0].in_features == 15 + 5 * len(keys)
 
 
-@pytest.mark.slow
-def test_solves_cartpole():
-    torch.manual_seed(0)
-    env = GymEnv("CartPole-v1", categorical_action_encoding=True)
-    env.set_seed(0)
-    dqn = DQN(
-        env, epsilon=Linear(1.0, 0.04, until=0.2), learning_rate=Linear(2e-3, 2e-4), tau=0.05, batch_size=64, ratio=24
-    )
-    rollout = Rollout(env, dqn.policy, 64, dqn.keys)
-    for k in range(470):
-        dqn.update(rollout.collect(), k / 470)
-    with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        assert min(float(env.rollout(500, dqn.policy)["next", "reward"].sum()) for _ in range(5)) > 475
-
-
 @pytest.mark.parametrize(
     ("options", "words"),
     [

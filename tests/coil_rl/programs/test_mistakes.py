@@ -151,9 +151,10 @@ def test_mistake_of_training_is_one_sentence(started, arguments, words):
             "method=rfc ~method.transforms.advice",
             "but there is no advice; put GuideActions with",
         ),
+        ("method=kickstart learner=linear", "learner=ppo, but Imitation is one that imitates a guide"),
         (
-            "method=oil ~method.transforms.advice ~method.transforms.takeover",
-            "no entry guide_action to imitate; it has",
+            "method=oil learner=dqn",
+            "method=oil needs a learner that imitates a guide, such as learner=forest, but",
         ),
         ("label=guide", "label=guide cannot name an agent"),
         ("existing=maybe", "existing=maybe must be one of refuse, resume"),
