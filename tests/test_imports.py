@@ -69,6 +69,12 @@ def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
     assert not wrong, f"{folder}/ may import only {sorted(ALLOWED[folder])}, the standard library and itself"
 
 
+def test_envs_do_without_gymnasium_but_for_one_module() -> None:
+    found = {path.stem: list(imported_modules(path.read_text(), package_of(path))) for path in source_files("envs")}
+    assert [stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)] == ["gym"]
+    assert not [stem for stem, names in found.items() if any(is_inside(name, "coil_rl.envs.gym") for name in names)]
+
+
 @pytest.mark.parametrize("folder", ["coil_rl", "tests", *LINKED])
 def test_nobody_imports_the_folders_by_their_bare_names(folder: str) -> None:
     # `import envs` would load a second copy of the package, with classes that are not the first one's.

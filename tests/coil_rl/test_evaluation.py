@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, random_tracks
+from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track, random_tracks
 from coil_rl.evaluation import drive, summarise
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.networks import actor
@@ -10,10 +10,11 @@ from coil_rl.networks import actor
 TRACKS = random_tracks(2, seed=5)
 
 
-def test_guide_completes_its_laps_and_the_measures_agree_with_one_another():
-    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", laps=1, rate=8)
-    driven = drive(env, SplineGuide(), names=[track.name for track in TRACKS])
-    for track, row, line in zip(TRACKS, driven.episodes, driven.lines, strict=True):
+def test_guide_completes_its_laps_and_the_measures_agree_with_one_another(ring):
+    tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
+    env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=8)
+    driven = drive(env, SplineGuide(), names=[track.name for track in tracks])
+    for track, row, line in zip(tracks, driven.episodes, driven.lines, strict=True):
         assert row["track"] == track.name
         assert row["completed"]
         assert not row["crashed"]
@@ -22,7 +23,7 @@ def test_guide_completes_its_laps_and_the_measures_agree_with_one_another():
         # The middle line at 2 m/s, less what is cut at corners.
         assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
         assert len(line) == row["steps"] >= row["lap_time"] * 8
-    again = drive(env, SplineGuide(), names=[track.name for track in TRACKS])
+    again = drive(env, SplineGuide(), names=[track.name for track in tracks])
     assert again.episodes == driven.episodes
 
 
