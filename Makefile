@@ -37,10 +37,10 @@ reproduce: $(INSTALLED) ## make every result of the paper again, as small as can
 	$(BIN)/coil-reproduce all=true budget=$(BUDGET) $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m '' $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m '' $(ARGS)
 
 kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
 	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)

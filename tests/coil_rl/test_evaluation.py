@@ -39,7 +39,7 @@ def test_crash_ends_the_measuring():
 
 
 def test_sampled_actions_differ_from_the_deterministic_ones():
-    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic")
+    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", rate=8)
     policy = actor(env, ["observation"])
     plain, drawn = (drive(env, policy, sampled=sampled).episodes[0]["smoothness"] for sampled in (False, True))
     assert drawn > 10 * plain

@@ -13,7 +13,7 @@ from coil_rl.programs import evaluate
 from coil_rl.programs.distill import distill
 from coil_rl.programs.train import train
 
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=2",
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
         "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
         "budget.frames=128", "proxy.budget.frames=256", "proxy.budget.cars=4", "proxy.budget.steps=16",
         "proxy.learner.regressor.epochs=20"]  # fmt: skip

@@ -102,11 +102,11 @@ def test_a_crash_costs_its_price_and_nothing_else(ring: Track) -> None:
 
 
 def test_with_the_weights_of_the_cone_world_it_is_the_cone_world(rings: list[Track]) -> None:
-    shared: dict[str, Any] = {"num_cars": 6, "assignment": "cyclic", "laps": 1, "rate": 12}
+    shared: dict[str, Any] = {"num_cars": 6, "assignment": "cyclic", "laps": 1, "rate": 8}
     envs = [ConeTrackEnv(rings, **shared), DrivingTasksEnv(rings, **shared, tasks=EQUAL, duration=1.0)]
     states = [env.reset() for env in envs]
     guide, finished, crashed = SplineGuide(), 0, 0
-    for _ in range(230):
+    for _ in range(155):
         emitted = []
         for place, env in enumerate(envs):
             action = guide(states[place].copy())["action"]
