@@ -18,7 +18,15 @@ def steering(*actions):
 def made(cut_off=False, **steerings):
     times, ones = np.arange(4) * 10**9, np.ones(4)
     recording = Recording(
-        Path("drive.mcap"), cut_off, times, times, np.ones((4, 9), np.float32), ones, ones, ones, simulated=True
+        Path("drive.mcap"),
+        cut_off,
+        times,
+        times,
+        np.ones((4, 9), np.float32),
+        ones,
+        ones,
+        ones,
+        notes={"simulated": {}},
     )
     valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
     return OpenLoop(
