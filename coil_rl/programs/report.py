@@ -42,7 +42,7 @@ def report(config: DictConfig) -> None:
     against = _against(config.against, found)
     tables = {actions: of_kind.table(against, config.resamples, config.seed) for actions, of_kind in found.items()}
     parts = [page.section(f"{kind.capitalize()} actions", found[kind], tables[kind], against) for kind in found]
-    parts += page.guides_that_learned(finished)
+    parts += [*page.learning(finished), *page.guides_that_learned(finished)]
     text = "\n\n".join([*parts, page.notes(config.resamples, against), page.progress(len(finished), len(runs))])
 
     folder = folders[0]

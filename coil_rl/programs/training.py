@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -78,7 +79,10 @@ def learn(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     )
     if resumed:
         experiment.resume()
+    began = time.monotonic()
     rows = experiment.run(max(guides.values()))
+    if not resumed:  # else nobody knows how long the part before took
+        _write_json({"seconds": time.monotonic() - began}, folder / "training_time.json")
     if improved:
         draw_phases(rows, list(learner.guides), folder / "learning_curve.png", title=config.label)
     else:
@@ -94,9 +98,13 @@ def guides_on_training_tracks(config: DictConfig, file: Path) -> dict[str, float
     if file.exists():
         return {name: float(value) for name, value in json.loads(file.read_text()).items()}
     means = _on_training_tracks(config)
-    with whole_file(file) as unfinished:
-        unfinished.write_text(json.dumps(means, indent=2) + "\n")
+    _write_json(means, file)
     return means
+
+
+def _write_json(numbers: Mapping[str, float], file: Path) -> None:
+    with whole_file(file) as unfinished:
+        unfinished.write_text(json.dumps(numbers, indent=2) + "\n")
 
 
 def distil(config: DictConfig, folder: Path) -> None:

@@ -13,6 +13,7 @@ from coil_rl.report.table import markdown_table
 
 IN_ONE_TABLE = 8  # tracks
 OWN_RETURN = "guide/"  # as the columns of metrics.csv begin
+RETURN = "train/return"
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -67,6 +68,29 @@ def guides_that_learned(runs: Sequence[Run]) -> list[str]:
     names = dict.fromkeys(key for row in rows for key in row if key.startswith(OWN_RETURN))
     columns |= {name: (name.removeprefix(OWN_RETURN), "") for name in names}
     return [markdown_table(rows, columns)]
+
+
+def learning(runs: Sequence[Run]) -> list[str]:
+    """Means over the seeds of what their learning curves say, and of how long they took, if anything was learned."""
+    rows: list[dict[str, Any]] = []
+    for label in dict.fromkeys(run.label for run in runs):
+        learned = [run for run in runs if run.label == label and run.curve]
+        curves = [[value for row in run.curve if not math.isnan(value := row.get(RETURN, math.nan))] for run in learned]
+        known = [curve for curve in curves if curve]
+        took = [run.seconds for run in learned if run.seconds is not None]
+        if known:
+            rows.append({
+                "label": label, "seeds": len(known), "highest": mean(map(max, known)), "area": mean(map(mean, known)),
+                "final": mean(curve[-1] for curve in known), "frames": max(run.curve[-1]["frames"] for run in learned),
+                "seconds": mean(took) if took else None,
+            })  # fmt: skip
+    columns = {
+        "label": ("return in training", ""), "seeds": ("seeds", ""), "frames": ("frames", ",.0f"),
+        "area": ("area under the curve / frames", ".1f"), "final": ("final", ".1f"), "highest": ("highest", ".1f"),
+        "seconds": ("training (s)", ".0f"),
+    }  # fmt: skip
+    rows.sort(key=lambda row: -float(row["area"]))
+    return [markdown_table(rows, columns)] if rows else []
 
 
 def notes(resamples: int, against: str | None) -> str:

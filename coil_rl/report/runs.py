@@ -61,6 +61,7 @@ class Run:
         drives: its guide's and its agent's; none until the run is finished.
         curve: the rows of its metrics.csv; none if nothing was learned.
         guide_returns: each guide's mean return on the training tracks by its driver's name, if it was measured.
+        seconds: that the training took; None where that is not known, as of a run that was stopped in between.
     """
 
     folder: Path
@@ -70,6 +71,7 @@ class Run:
     drives: tuple[Drive, ...] = ()
     curve: Sequence[dict[str, float]] = field(default=(), repr=False)
     guide_returns: Mapping[str, float] = field(default_factory=dict)
+    seconds: float | None = None
 
     @property
     def finished(self) -> bool:
@@ -121,6 +123,7 @@ def _read(folder: Path) -> Run:
     return Run(
         folder, label, seed, needs_guide,
         _drives(folder / "evaluation.csv"), _curve(folder / "metrics.csv"), _numbers(folder / "guide_return.json"),
+        _numbers(folder / "training_time.json").get("seconds"),
     )  # fmt: skip
 
 
