@@ -1,6 +1,7 @@
 """Replays: a recorded drive is seen as it was, whatever is steered, and any guide or policy runs on it."""
 
 import math
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -14,7 +15,17 @@ from torchrl.envs import TransformedEnv
 
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.build import build, build_env
-from coil_rl.envs import ConeTrackEnv, McapReplayEnv, Recording, read_recording, shipped_tracks
+from coil_rl.envs import (
+    ConeTrackEnv,
+    McapReplayEnv,
+    Perception,
+    Recording,
+    read_recording,
+    shipped_tracks,
+    simulated_cone_classifier,
+    simulated_drive,
+)
+from coil_rl.envs.simulated_recordings import save_drive
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env, check_transform
@@ -104,6 +115,22 @@ def test_held_boundary_keeps_its_numbers():
     invalid = ~again["info", "valid"][:, 1:]
     assert invalid.sum() > 5
     assert torch.equal(sides[:, 1:][invalid], sides[:, :-1][invalid])
+
+
+@torch.no_grad()
+def test_ten_scans_in_which_nothing_can_be_read_keep_what_was_last_seen(tmp_path):
+    save_drive(simulated_drive("both", seed=0), tmp_path / "a.mcap")
+    recording, perception = read_recording(tmp_path / "a.mcap"), Perception(simulated_cone_classifier())
+    sighted = McapReplayEnv(recording, perception).rollout(80, SplineGuide())["info", "valid"][0].all(-1)
+    last = 20 + int(sighted[20:].nonzero()[0])
+    gap = slice(last + 1, last + 11)
+    unreadable = recording.ranges.copy()
+    unreadable[gap] = np.nan
+    steps = McapReplayEnv(replace(recording, ranges=unreadable), perception).rollout(80, SplineGuide())[0]
+    assert not steps["info", "valid"][gap].any()
+    for key in ("observation", "action"):
+        assert torch.equal(steps[key][gap], steps[key][last].expand(10, -1))
+        assert not torch.equal(steps[key][-1], steps[key][last])
 
 
 @torch.no_grad()
