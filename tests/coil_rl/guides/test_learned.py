@@ -1,5 +1,7 @@
 import pytest
+import torch
 from hydra import compose, initialize_config_module
+from run_folders import make_untrained_run
 
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.build import build_env, build_guides
@@ -7,10 +9,9 @@ from coil_rl.errors import UserError
 from coil_rl.evaluation import drive
 from coil_rl.guides.learned import LearnedGuide
 from coil_rl.programs.evaluate import restore
-from coil_rl.programs.train import train
 from coil_rl.testing import check_guide
 
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=2",
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
         "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
         "budget.frames=128"]  # fmt: skip
 
@@ -22,9 +23,7 @@ def composed(*overrides, name="train"):
 
 @pytest.fixture(scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"])
 def run(request, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("run")
-    train(composed(*TINY, *f"method={request.param}".split(), f"run_dir={folder}"))
-    return folder
+    return make_untrained_run(tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split())
 
 
 def test_it_drives_as_the_policy_does_in_the_env_it_was_trained_in(run):
@@ -44,16 +43,15 @@ def test_it_is_a_guide_even_while_others_explore(run):
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
 
 
-def test_it_may_guide_another_agent(run, tmp_path):
-    (tmp_path / "next").mkdir()
-    config = composed(*TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", f"run_dir={tmp_path / 'next'}")
-    train(config)
-    assert (tmp_path / "next" / "evaluation.csv").exists()
+def test_it_may_guide_another_agent(run):
+    config = composed(*TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
+    step = build_env(config).rollout(5, break_when_any_done=False)[:, -1]
+    assert torch.equal(step["guide_action"][:, 0], build_guides(config)["learned"](step.clone())["action"])
 
 
 def test_a_folder_without_an_agent_is_refused(tmp_path):
     with pytest.raises(UserError, match=r"run=.* is not the folder of a run: it has no config.yaml"):
         LearnedGuide(str(tmp_path))
-    train(composed(*TINY, "method=guide", f"run_dir={tmp_path}"))
+    run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
     with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):
-        LearnedGuide(str(tmp_path))
+        LearnedGuide(str(run))
