@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -69,8 +69,19 @@ def tanh_layers(
     return layers
 
 
+def relu_layers(
+    inputs: int, outputs: int, hidden: Sequence[int], gain: float, device: torch.device | None = None
+) -> MLP:
+    """A rectified network with PyTorch's own start, the last layer scaled by `gain`; arguments as for `tanh_layers`."""
+    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=nn.ReLU, device=device)
+    with torch.no_grad():
+        for parameter in layers[-1].parameters():
+            parameter.mul_(gain)
+    return layers
+
+
 class Network(nn.Module):
-    """`tanh_layers` over some of an env's entries, joined.
+    """A network over some of an env's entries, joined.
 
     Args:
         env: for its specs.
@@ -79,6 +90,7 @@ class Network(nn.Module):
         outputs: width of the last layer.
         gain: size of the last layer's weights.
         shapes: as for `Joined`.
+        layers: makes them, as `tanh_layers` does.
     """
 
     def __init__(
@@ -89,10 +101,11 @@ class Network(nn.Module):
         outputs: int,
         gain: float,
         shapes: Mapping[str, torch.Size] | None = None,
+        layers: Callable[..., MLP] = tanh_layers,
     ) -> None:
         super().__init__()
         self.joined = Joined(env, in_keys, shapes)
-        self.layers = tanh_layers(self.joined.width, outputs, hidden, gain, env.device)
+        self.layers = layers(self.joined.width, outputs, hidden, gain, env.device)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """[*batch, ...] each to [*batch, outputs]."""

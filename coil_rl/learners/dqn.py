@@ -99,13 +99,12 @@ class DQN:
         )
         self.keys = self.replay.keys
         one = env.action_spec_unbatched  # the network is asked about batches of any size
-        network = networks.Network(env, in_keys, hidden, spec.space.n, action_gain)
+        network = networks.Network(env, in_keys, hidden, spec.space.n, action_gain, layers=networks.relu_layers)
         self.network = TensorDictSequential(networks.Keyed(network, in_keys, ["action_value"]), QValueModule(spec=one))
         self.explorer = EGreedyModule(one, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
         self.policy = TensorDictSequential(*self.network.module, self.explorer)
-        self.loss = DQNLoss(
-            self.network, action_space=one, double_dqn=double, delay_value=True, loss_function="smooth_l1"
-        )
+        # Huber's loss would fit medians, which do not see the rare step that ends an episode, unless rewards were tiny.
+        self.loss = DQNLoss(self.network, action_space=one, double_dqn=double, delay_value=True, loss_function="l2")
         self.loss.make_value_estimator(gamma=gamma)
         self.target = SoftUpdate(self.loss, tau=tau)
         self.max_grad_norm = max_grad_norm
@@ -120,7 +119,7 @@ class DQN:
             progress: share of the run that is over, for the schedules.
 
         Returns:
-            The `loss` (Huber's), mean over the minibatches, and the mean `value` of the best choice in the last of
+            The `loss`, mean over the minibatches, and the mean `value` of the best choice in the last of
             them, both 0 before it begins to learn; how many `minibatches` there were; the steps that are `kept`; what
             the schedules say.
         """

@@ -34,7 +34,7 @@ def best(dqn, states):
 
 
 @pytest.mark.parametrize("double", [True, False])
-def test_one_step_moves_the_network_down_hubers_loss_to_the_target(double):
+def test_one_step_moves_the_network_down_the_squared_distance_to_the_target(double):
     """y = r + gamma Q'(s', b) with b the best choice of Q (double) or of Q', and y = r where an episode terminated."""
     dqn, rollout = learner(double=double, gamma=0.9, tau=0.0, learning_rate=0.1)
     minibatch = rollout.collect().select(*dqn.keys).reshape(-1)
@@ -50,7 +50,7 @@ def test_one_step_moves_the_network_down_hubers_loss_to_the_target(double):
         later = judged.gather(-1, chosen.argmax(-1, keepdim=True))
         target = minibatch["next", "reward"] + 0.9 * ~minibatch["next", "terminated"] * later
     value = network(seen).gather(-1, minibatch["action"].unsqueeze(-1))
-    wanted = F.smooth_l1_loss(value, target)
+    wanted = F.mse_loss(value, target)
     torch.testing.assert_close(dqn.loss(minibatch)["loss"], wanted)
     gradients = torch.autograd.grad(wanted, list(network.parameters()))
     dqn.loss(minibatch)["loss"].backward()
