@@ -11,13 +11,16 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tensordict.nn import TensorDictModule
+from tqdm import tqdm
 
 from coil_rl.envs.mcap_replay import McapReplayEnv
 from coil_rl.envs.recordings import Recording, read_recording
 from coil_rl.envs.robot_course import RobotCourse, middle_line
 from coil_rl.envs.robot_laps import laps
-from coil_rl.envs.simulated_recordings import track_of
+from coil_rl.envs.simulated_recordings import record_drives, track_of
+from coil_rl.envs.simulated_robot import SimulatedRobotEnv
 from coil_rl.errors import UserError
+from coil_rl.guides import SplineGuide
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.result import Result
 from coil_rl.reproduce.table_6_picture import Drive, draw_drives
@@ -62,7 +65,8 @@ compare among themselves only. Each drive is a row of the CSV."""
 class Table6(Result):
     """Smoothness, laps, crashes and lines of several drivers, each from one or several recordings.
 
-    A recording goes by the `policy` that is noted in it, or else by its file's name.
+    A recording goes by the `policy` that is noted in it, or else by its file's name. Without any recording the spline
+    guide drives the simulated robot, and the table is of that alone.
 
     Args:
         recordings: MCAP files, rosbag2 directories or folders of MCAP files; or, by the name of the driver, lists of
@@ -74,13 +78,13 @@ class Table6(Result):
         max_steering: degrees of an action of 1.
 
     Raises:
-        UserError: if there is no recording.
+        UserError: if there is no recording where some should be.
         RecordingError: for one that cannot be used.
     """
 
     def __init__(
         self,
-        recordings: Sequence[str] | Mapping[str, Sequence[str]],
+        recordings: Sequence[str] | Mapping[str, Sequence[str]] = (),
         *,
         scan: str = "/scan",
         odometry: str | None = "/odom",
@@ -88,20 +92,31 @@ class Table6(Result):
         car_length: float = 2 / 7,
         max_steering: float = 80.0,
     ) -> None:
-        named = recordings if isinstance(recordings, Mapping) else {"": recordings}
+        self.scan, self.odometry, self.command = scan, odometry, command
         self.car_length, self.max_steering = car_length, np.radians(max_steering)
+        self._read(recordings)
+        if recordings and not self.recordings:
+            raise UserError(
+                f"recordings={recordings} holds no MCAP file; give some, or let coil-robot drive and record"
+            )
+
+    def _read(self, recordings: Sequence[str] | Mapping[str, Sequence[str]]) -> None:
+        named = recordings if isinstance(recordings, Mapping) else {"": recordings}
         self.recordings = [
             (name or recording.notes.get("simulated", {}).get("policy", path.stem), recording)
             for name, paths in named.items()
             for path in _files(paths)
-            for recording in [read_recording(path, scan, odometry, command)]
+            for recording in [read_recording(path, self.scan, self.odometry, self.command)]
         ]
-        if not self.recordings:
-            raise UserError("recordings is empty; give MCAP files, or let coil-robot drive and record")
         self.drives = [_drive(*of) for of in self.recordings]
 
     def make(self, stem: Path) -> str:
         """Make it: see `Result`."""
+        if not self.recordings:
+            paths = [stem.with_name("drives") / f"guide_{drive}.mcap" for drive in range(3)]
+            with tqdm(desc="drive", unit="step", leave=False, mininterval=0.5) as bar:
+                record_drives(SimulatedRobotEnv(num_cars=3), SplineGuide(), paths, {"policy": "guide"}, bar.update)
+            self._read([str(path) for path in paths])
         smoothness = self._smoothness()
         rows = [{**drive.row, "smoothness": value} for drive, value in zip(self.drives, smoothness, strict=True)]
         by_method = {row["method"]: [other for other in rows if other["method"] == row["method"]] for row in rows}

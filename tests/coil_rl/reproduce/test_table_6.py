@@ -83,9 +83,17 @@ def test_the_last_place_is_in_the_recording(crash):
     torch.testing.assert_close(torch.from_numpy(poses[-1]).float(), state["next", "info", "pose"][0, -1])
 
 
-def test_nothing_and_what_is_no_recording_are_refused(tmp_path):
-    with pytest.raises(UserError, match="recordings is empty"):
-        Table6([])
+@pytest.mark.slow
+def test_without_recordings_the_guide_drives(tmp_path):
+    page = Table6().make(tmp_path / "table_6")
+    assert [(row["method"], row["laps"]) for row in rows_of(tmp_path / "table_6.csv")] == [("guide", "3")] * 3
+    assert "(simulated)" in page
+    assert len(list((tmp_path / "drives").glob("*.mcap"))) == 3
+
+
+def test_a_folder_of_nothing_and_what_is_no_recording_are_refused(tmp_path):
+    with pytest.raises(UserError, match="holds no MCAP file"):
+        Table6([str(tmp_path)])
     (tmp_path / "none.mcap").write_bytes(b"none")
     with pytest.raises(RecordingError, match="is not an MCAP file"):
         Table6([str(tmp_path / "none.mcap")])
