@@ -7,7 +7,6 @@ network that follows it slowly. The agent takes the best choice and, in some of 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,14 +16,15 @@ from tensordict.nn import TensorDictSequential
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
-from torchrl.objectives import DQNLoss, SoftUpdate
+from torchrl.objectives import DQNLoss
 
 from coil_rl import networks
-from coil_rl.learners.replay import Replay
+from coil_rl.learners.limits import check_numbers
+from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Schedule, schedule
 
 
-class DQN:
+class DQN(OffPolicy):
     """The DQN learner: networks, replay, loss and optimiser.
 
     Args:
@@ -58,6 +58,8 @@ class DQN:
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
+    minimised = reported = ("loss",)
+
     def __init__(
         self,
         env: EnvBase,
@@ -77,87 +79,55 @@ class DQN:
         starts: int = 1_000,
         seed: int = 0,
     ) -> None:
-        self.learning_rate, self.epsilon = schedule(learning_rate), schedule(epsilon)
-        for name, number, highest in (
-            ("gamma", gamma, 1), ("tau", tau, 1), ("epsilon", self.epsilon(0), 1), ("epsilon", self.epsilon(1), 1),
-            ("action_gain", action_gain, math.inf), ("learning_rate", self.learning_rate(0), math.inf),
-        ):  # fmt: skip
-            if not 0 <= number <= highest:
-                raise ValueError(f"{name}={number} must be at least 0 and at most {highest}")
-        if min(hidden, default=1) < 1:
-            raise ValueError(f"hidden={min(hidden)} must be at least 1")
-        if not 0 < max_grad_norm < math.inf:
-            raise ValueError(f"max_grad_norm={max_grad_norm} must be a finite number of more than 0")
+        self.epsilon = schedule(epsilon)
+        check_numbers(1, hidden=min(hidden, default=1))
+        check_numbers(0, action_gain=action_gain)
+        for progress in (0, 1):
+            check_numbers(0, 1, epsilon=self.epsilon(progress))
         spec = env.action_spec
         if not isinstance(spec, (Categorical, OneHot)):
             raise ValueError(
                 "DQN takes one of a few choices, but this env takes numbers; "
                 "put the transform DiscreteActions around it: action=choices"
             )
-        self.replay = Replay(
-            env, in_keys, capacity=capacity, batch_size=batch_size, ratio=ratio, starts=starts, seed=seed
-        )
-        self.keys = self.replay.keys
         one = env.action_spec_unbatched  # the network is asked about batches of any size
         network = networks.Network(env, in_keys, hidden, spec.space.n, action_gain, layers=networks.relu_layers)
         self.network = TensorDictSequential(networks.Keyed(network, in_keys, ["action_value"]), QValueModule(spec=one))
         self.explorer = EGreedyModule(one, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
         self.policy = TensorDictSequential(*self.network.module, self.explorer)
         # Huber's loss would fit medians, which do not see the rare step that ends an episode, unless rewards were tiny.
-        self.loss = DQNLoss(self.network, action_space=one, double_dqn=double, delay_value=True, loss_function="l2")
-        self.loss.make_value_estimator(gamma=gamma)
-        self.target = SoftUpdate(self.loss, tau=tau)
-        self.max_grad_norm = max_grad_norm
-        self.parameters = list(self.network.parameters())
-        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), fused=True)
+        loss = DQNLoss(self.network, action_space=one, double_dqn=double, delay_value=True, loss_function="l2")
+        super().__init__(
+            env, in_keys, loss, learning_rate=learning_rate, gamma=gamma, tau=tau, max_grad_norm=max_grad_norm,
+            capacity=capacity, batch_size=batch_size, ratio=ratio, starts=starts, seed=seed,
+        )  # fmt: skip
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Keep the steps of a batch, and learn from steps of the past.
+        """As `OffPolicy` does.
 
         Args:
-            batch: [*B, T] with `keys`. A truncated episode counts as going on.
+            batch: [*B, T] with `keys`.
             progress: share of the run that is over, for the schedules.
 
         Returns:
-            The `loss`, mean over the minibatches, and the mean `value` of the best choice in the last of
-            them, both 0 before it begins to learn; how many `minibatches` there were; the steps that are `kept`; what
-            the schedules say.
+            What `OffPolicy` returns; the mean `value` of the best choice in the last minibatch, 0 before it begins to
+            learn; and `epsilon`.
         """
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
-        self.replay.add(batch)
-        losses = []
-        for minibatch in self.replay.draws():
-            losses.append(self.loss(minibatch)["loss"])
-            self.optimiser.zero_grad()
-            losses[-1].backward()
-            torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-            self.optimiser.step()
-            self.target.step()
+        metrics = super().update(batch, progress)
         self.explorer.eps.fill_(self.epsilon(progress))
-        with torch.no_grad():
-            value = float(self.network(minibatch)["chosen_action_value"].mean()) if losses else 0.0
-        return {
-            "loss": float(torch.stack(losses).detach().mean()) if losses else 0.0,
-            "value": value,
-            "minibatches": float(len(losses)),
-            "kept": float(len(self.replay)),
-            "epsilon": self.epsilon(progress),
-            "learning_rate": self.learning_rate(progress),
-        }
+        return metrics | {"epsilon": self.epsilon(progress)}
+
+    @torch.no_grad()
+    def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
+        """The mean value of the best choice, 0 before it begins to learn."""
+        value = 0.0 if minibatch is None else float(self.network(minibatch)["chosen_action_value"].mean())
+        return {"value": value}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything an update depends on besides the batch."""
-        return {
-            "policy": self.policy.state_dict(),
-            "loss": self.loss.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
-            "replay": self.replay.state_dict(),
-        }
+        return {"policy": self.policy.state_dict()} | super().state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Take over a state of `state_dict`."""
         self.policy.load_state_dict(state["policy"])
-        self.loss.load_state_dict(state["loss"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.replay.load_state_dict(state["replay"])
+        super().load_state_dict(state)

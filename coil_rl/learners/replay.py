@@ -11,6 +11,7 @@ from tensordict.utils import NestedKey
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 
+from coil_rl.learners.limits import check_numbers
 from coil_rl.transforms.guided import Guided
 
 AFTER = ("reward", "done", "terminated")
@@ -59,17 +60,12 @@ class Replay:
         starts: int = 1_000,
         seed: int = 0,
     ) -> None:
-        if batch_size < 1:
-            raise ValueError(f"batch_size={batch_size} must be at least 1")
+        check_numbers(1, batch_size=batch_size)
         if not max(starts, 1) <= capacity:
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")
-        for name, number, highest in (
-            ("ratio", ratio, 10_000),
-            ("starts", starts, capacity),
-            ("seed", seed, 2**63 - 1),
-        ):
-            if not 0 <= number <= highest:
-                raise ValueError(f"{name}={number} must be at least 0 and at most {highest}")
+        check_numbers(0, 10_000, ratio=ratio)
+        check_numbers(0, capacity, starts=starts)
+        check_numbers(0, 2**63 - 1, seed=seed)
         for transform in env.modules():
             if isinstance(transform, Guided) and callable(getattr(transform, transform.alters, None)):
                 raise ValueError(
