@@ -122,7 +122,7 @@ def unit_of_frames(reached: float) -> tuple[float, str]:
 
 def mean_curve(runs: Sequence[Run], key: str) -> tuple[Array, Array, Array, Array]:
     """Frames, mean over the runs, and the ends of the mean's 95 % interval, each [P]; P is 0 if no run has the key."""
-    curves = [curve for curve in (_curve(run, key) for run in runs) if len(curve)]
+    curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     none = np.empty(0)
     if not curves:
         return none, none, none, none
@@ -140,14 +140,14 @@ def mean_curve(runs: Sequence[Run], key: str) -> tuple[Array, Array, Array, Arra
     return frames, mean, low, high
 
 
-def _curve(run: Run, key: str) -> Array:
+def points(run: Run, key: str) -> Array:
     """[P, 2]: frames and value of the rows that have one, by frames."""
-    points = []
+    found = []
     for row in run:
         if "frames" not in row:
             raise ValueError(f"A row of a learning curve has no 'frames'; it has: {', '.join(row) or 'nothing'}.")
-        points.append((_number(row["frames"]), _number(row.get(key))))
-    curve = np.array(points, dtype=np.float64).reshape(-1, 2)
+        found.append((_number(row["frames"]), _number(row.get(key))))
+    curve = np.array(found, dtype=np.float64).reshape(-1, 2)
     curve = curve[np.isfinite(curve).all(axis=1)]
     ordered: Array = curve[np.argsort(curve[:, 0], kind="stable")]
     return ordered

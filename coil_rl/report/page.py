@@ -8,12 +8,12 @@ from statistics import mean
 from typing import Any
 
 from coil_rl.report.comparison import Comparison
+from coil_rl.report.curve import TRAINING, points
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.table import markdown_table
 
 IN_ONE_TABLE = 8  # tracks
 OWN_RETURN = "guide/"  # as the columns of metrics.csv begin
-RETURN = "train/return"
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -75,7 +75,7 @@ def learning(runs: Sequence[Run]) -> list[str]:
     rows: list[dict[str, Any]] = []
     for label in dict.fromkeys(run.label for run in runs):
         learned = [run for run in runs if run.label == label and run.curve]
-        curves = [[value for row in run.curve if not math.isnan(value := row.get(RETURN, math.nan))] for run in learned]
+        curves = [points(run.curve, TRAINING)[:, 1].tolist() for run in learned]
         known = [curve for curve in curves if curve]
         took = [run.seconds for run in learned if run.seconds is not None]
         if known:

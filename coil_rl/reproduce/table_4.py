@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
-from coil_rl.report.curve import TRAINING
+from coil_rl.report.curve import TRAINING, points
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
-from coil_rl.reproduce.result import OfRuns
 from coil_rl.reproduce.verdict import HEADING, verdict, with_interval
+from coil_rl.reproduce.worlds import OfWorlds, heading
 
 PAPER = {"coil": 477.6, "ppo": 414.2}  # average over 5 runs of the highest mean reward seen in training
 
@@ -38,30 +38,8 @@ higher best. Intervals: percentile bootstrap of whole seeds, {resamples} resampl
 in about 85 of 100 cases. Its guide: the guide alone on the training tracks, made worse as the agent's was."""
 
 
-class Table4(OfRuns):
-    """The best and the final return of each method in training.
-
-    Args:
-        experiments: in one world.
-        worlds: from the name of another world to the experiment in it.
-        against: label that the others are compared with.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
-    """
-
-    def __init__(
-        self,
-        experiments: Sequence[str],
-        worlds: Mapping[str, str] | None = None,
-        against: str = "ppo",
-        resamples: int = 2000,
-        seed: int = 0,
-    ) -> None:
-        if resamples < 1:
-            raise ValueError(f"resamples={resamples} must be at least 1")
-        self.worlds = {"": list(experiments)} | {name: [of_world] for name, of_world in (worlds or {}).items()}
-        self.experiments = [experiment for of_world in self.worlds.values() for experiment in of_world]
-        self.against, self.resamples, self.seed = against, resamples, seed
+class Table4(OfWorlds):
+    """The best and the final return of each method in training."""
 
     def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
         """Make it: see `OfRuns`."""
@@ -77,7 +55,7 @@ class Table4(OfRuns):
         headings = {key: (text.format(against=self.against), spec) for key, (text, spec) in COLUMNS.items()}
         parts = ["## Table 4: the return in training", _beside(tables[""])]
         for world, table in tables.items():
-            parts += [f"### {world[:1].upper()}{world[1:]}"] * bool(world) + [markdown_table(table, headings)]
+            parts += [*heading(world), markdown_table(table, headings)]
         parts += [NOTES.strip().format(against=self.against, resamples=self.resamples), *self._held_up(tables)]
         return "\n\n".join(parts)
 
@@ -125,7 +103,7 @@ class Table4(OfRuns):
 
 def returns(run: Run) -> dict[str, Any]:
     """What a run earned in training: the best return, after how many frames, and the final one; NaN for none."""
-    known = [(row[TRAINING], row["frames"]) for row in run.curve if math.isfinite(row.get(TRAINING, math.nan))]
+    known = [(value, frames) for frames, value in points(run.curve, TRAINING).tolist()]
     best, at = max(known, key=lambda point: point[0], default=(math.nan, math.nan))
     return {
         "label": run.label, "seed": run.seed, "frames": run.curve[-1]["frames"], "best": best, "best_at": at,
@@ -155,10 +133,10 @@ def _draw(rows: Sequence[Mapping[str, Any]], table: Sequence[Mapping[str, Any]],
     guide = next((line["guide"] for line in table if line["label"] == against), math.nan)
 
     def line(of_label: Mapping[str, Any], key: str) -> Interval:
-        points = [row[key] for row in rows if row["label"] == of_label["label"]]
+        of_seeds = [row[key] for row in rows if row["label"] == of_label["label"]]
         return Interval(
             of_label["label"], of_label[key], of_label[f"{key}_low"], of_label[f"{key}_high"],
-            points=points if len(points) > 1 else [],
+            points=of_seeds if len(of_seeds) > 1 else [],
             guide=guide if math.isfinite(guide) else None,
         )  # fmt: skip
 

@@ -14,8 +14,8 @@ from coil_rl.report.comparison import Group, compare
 from coil_rl.report.paired import paired
 from coil_rl.report.runs import GUIDE, MEASURES, Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap
-from coil_rl.reproduce.result import OfRuns
 from coil_rl.reproduce.table_5_page import beside_the_paper, drivers, held_up, tracks
+from coil_rl.reproduce.worlds import OfWorlds, heading
 
 SAMPLED, DETERMINISTIC = "sampled", "deterministic"
 STATISTICS: dict[str, Callable[..., Any]] = {"reward": np.mean, "iqm": iqm}
@@ -29,30 +29,8 @@ track; deterministic ones are the mode. Drivers that act in one way only, as imi
 tables."""
 
 
-class Table5(OfRuns):
-    """Laps, smoothness, reward and crashes of each driver on unseen tracks.
-
-    Args:
-        experiments: in one world.
-        worlds: from the name of another world to the experiment in it.
-        against: label that the others are compared with.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
-    """
-
-    def __init__(
-        self,
-        experiments: Sequence[str],
-        worlds: Mapping[str, str] | None = None,
-        against: str = "ppo",
-        resamples: int = 2000,
-        seed: int = 0,
-    ) -> None:
-        if resamples < 1:
-            raise ValueError(f"resamples={resamples} must be at least 1")
-        self.worlds = {"": list(experiments)} | {name: [of_world] for name, of_world in (worlds or {}).items()}
-        self.experiments = [experiment for of_world in self.worlds.values() for experiment in of_world]
-        self.against, self.resamples, self.seed = against, resamples, seed
+class Table5(OfWorlds):
+    """Laps, smoothness, reward and crashes of each driver on unseen tracks."""
 
     def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
         """Make it: see `OfRuns`."""
@@ -62,9 +40,8 @@ class Table5(OfRuns):
             numbers += [{"world": world} | row for row in _numbers(there)]
             found = {actions: self._drivers(there, actions) for actions in (SAMPLED, DETERMINISTIC)}
             rows = {actions: [self._row(group, groups) for group in groups] for actions, groups in found.items()}
-            if world:
-                parts.append(f"### {world[:1].upper()}{world[1:]}")
-            else:
+            parts += heading(world)
+            if not world:
                 parts.append(beside_the_paper(rows))
                 panels = {f"{kind} actions": _intervals(found[kind], rows[kind]) for kind in found}
                 draw_intervals(

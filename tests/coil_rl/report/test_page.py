@@ -80,7 +80,7 @@ def test_learning_is_told_by_the_area_under_the_curve_its_end_and_its_height(tmp
     rows = driven("any", {"a": 500.0})
     for label, returns in {"late": ["nan", 100.0, 300.0], "early": [200.0, 400.0, 300.0]}.items():
         folder = make_run(tmp_path / label, label, 0, rows)
-        write_csv([{"frames": 1000 * n, page.RETURN: x} for n, x in enumerate(returns, 1)], folder / "metrics.csv")
+        write_csv([{"frames": 1000 * n, page.TRAINING: x} for n, x in enumerate(returns, 1)], folder / "metrics.csv")
     (tmp_path / "late" / "training_time.json").write_text('{"seconds": 12.4}')
     (table,) = page.learning(read_runs([tmp_path]))
     cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
