@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
@@ -42,8 +43,11 @@ class Drive:
     def split(self, parts: int) -> list[Drive]:
         """As many drives, of equally many cars each, in their order."""
         size = len(self.episodes) // parts
-        ends = range(size, len(self.episodes) + 1, size)
-        return [Drive(self.episodes[end - size : end], self.lines[end - size : end]) for end in ends]
+        return [self[end - size : end] for end in range(size, len(self.episodes) + 1, size)]
+
+    def __getitem__(self, cars: slice) -> Drive:
+        """The drive of some cars."""
+        return Drive(self.episodes[cars], self.lines[cars])
 
 
 @torch.no_grad()
@@ -51,7 +55,7 @@ def drive(
     env: EnvBase,
     policy: TensorDictModuleBase,
     *,
-    sampled: bool = False,
+    sampled: bool | Tensor = False,
     names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> Drive:
@@ -60,27 +64,34 @@ def drive(
     Args:
         env: batched env, [B]; its transforms go into evaluation mode.
         policy: writes the action.
-        sampled: draw actions instead of taking the deterministic one.
+        sampled: draw actions instead of taking the deterministic one; bool [B] for which rows.
         names: of the tracks.
         tick: called every step.
     """
     history: list[dict[str, Tensor]] = []
     carrier = env.eval().reset()
     running = torch.ones_like(env.full_done_spec["done"].zero())
-    mode = ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC
-    with set_exploration_type(mode):
-        while True:
-            step = env.step(policy(carrier))
-            history.append(_notes(step["next"]) | {"running": running})
-            running = running & ~step["next", "done"]
-            # To ask costs a wait for the device.
-            if len(history) % 8 == 0 and not running.any():
-                break
-            carrier = step_mdp(step)
-            if tick is not None:
-                tick()
+    while True:
+        step = env.step(_act(policy, carrier, sampled))
+        history.append(_notes(step["next"]) | {"running": running})
+        running = running & ~step["next", "done"]
+        # To ask costs a wait for the device.
+        if len(history) % 8 == 0 and not running.any():
+            break
+        carrier = step_mdp(step)
+        if tick is not None:
+            tick()
     notes = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
     return _measure(notes, names)
+
+
+def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor) -> TensorDictBase:
+    if isinstance(sampled, Tensor):
+        drawn = _act(policy, carrier, True)["action"]
+        taken = _act(policy, carrier, False)
+        return taken.set("action", torch.where(expand_as_right(sampled, drawn), drawn, taken["action"]))
+    with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
+        return policy(carrier)
 
 
 def _notes(after: TensorDictBase) -> dict[str, Tensor]:

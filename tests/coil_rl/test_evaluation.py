@@ -1,6 +1,7 @@
 import math
 
 import pytest
+import torch
 
 from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track, random_tracks
 from coil_rl.evaluation import drive, summarise
@@ -43,6 +44,9 @@ def test_sampled_actions_differ_from_the_deterministic_ones():
     policy = actor(env, ["observation"])
     plain, drawn = (drive(env, policy, sampled=sampled).episodes[0]["smoothness"] for sampled in (False, True))
     assert drawn > 10 * plain
+    mixed = drive(env, policy, sampled=torch.tensor([False, True])).episodes
+    assert mixed[0]["smoothness"] == pytest.approx(plain, rel=0.01)
+    assert mixed[1]["smoothness"] > 10 * plain
 
 
 def test_summary_is_the_mean_over_tracks_of_means_over_episodes():
