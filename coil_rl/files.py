@@ -32,6 +32,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         unfinished.unlink(missing_ok=True)
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """A file of text, which ends with its last line, written as by `whole_file`."""
+    with whole_file(path) as unfinished:
+        unfinished.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
+
+
 @contextmanager
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """A folder to write files into; it becomes `path` when the block ends, or vanishes if the block raises.

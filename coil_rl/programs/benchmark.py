@@ -21,7 +21,7 @@ from coil_rl.benchmark.training import measure_shares, measure_training
 from coil_rl.benchmark.turns import Turns
 from coil_rl.benchmark.yardsticks import measure_oracle, measure_sb3
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.programs.versions import versions
 
@@ -79,8 +79,7 @@ def benchmark(config: DictConfig) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    with whole_file(path) as unfinished:
-        unfinished.write_text(text + "\n")
+    write_text(path, text)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from coil_rl.build import build, build_env, build_guided_env, env_node
 from coil_rl.evaluation import PER_STEP, Drive, drive, summarise
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 
 COLUMNS = {
@@ -77,11 +77,10 @@ def judge(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, 
     draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
     if config.evaluation.gif:
         animate_lines(tracks, lines, folder / "lines.gif", rate=config.env.rate, crashed=crashed)
-    with whole_file(folder / "evaluation.md") as unfinished:
-        columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
-        tasks = {key: key.removeprefix(PER_STEP) for key in table[0] if key.startswith(PER_STEP)}
-        columns |= {key: (f"{task} (a step)", ".3f") for key, task in tasks.items()}
-        unfinished.write_text(markdown_table(table, columns) + "\n")
+    columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
+    tasks = {key: key.removeprefix(PER_STEP) for key in table[0] if key.startswith(PER_STEP)}
+    columns |= {key: (f"{task} (a step)", ".3f") for key, task in tasks.items()}
+    write_text(folder / "evaluation.md", markdown_table(table, columns))
     write_csv(table, folder / "evaluation.csv")
 
 

@@ -12,7 +12,7 @@ from tqdm import tqdm
 from coil_rl.build import build, build_env
 from coil_rl.check import check as check_common
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.listening import Places, ablations, drive_ablated, split, survey
 from coil_rl.listening.tables import EVERYWHERE, along, along_lines, by_place
 from coil_rl.programs import app
@@ -70,8 +70,7 @@ def listen(config: DictConfig) -> None:
         episodes = drive_ablated(env, agent, places, removed, silence, names=names, tick=bar.update)
     ablated = dict(zip(removed, episodes, strict=True))
     table = by_place(found, places, ablated)
-    with whole_file(folder / "listening.md") as unfinished:
-        unfinished.write_text(markdown_table(table, COLUMNS) + "\n" + NOTES + "\n", encoding="utf-8")
+    write_text(folder / "listening.md", f"{markdown_table(table, COLUMNS)}\n{NOTES}")
     write_csv(table, folder / "listening_places.csv")
     for measure, (name, title, label) in MAPS.items():
         lines, values = along_lines(found, places, measure, asked.bin)

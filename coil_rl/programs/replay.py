@@ -17,7 +17,7 @@ from coil_rl.build import build, build_guides
 from coil_rl.check import check_guide, check_values, make_folder
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.replay import (
     RECORDED,
@@ -56,8 +56,7 @@ def replay(config: DictConfig) -> None:
         write(config, found, runs, place)
     who = [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
     text = "\n\n".join([*map(describe, everything), *who, notes(env.max_steering).strip()])
-    with whole_file(folder / "replay.md") as unfinished:
-        unfinished.write_text(text + "\n", encoding="utf-8")
+    write_text(folder / "replay.md", text)
     print(f"{text}\n")
     for place, found in zip(places, everything, strict=True):
         print(f"{outcome(found)}; see {place}")
@@ -119,8 +118,7 @@ def write(config: DictConfig, found: OpenLoop, runs: Runs, folder: Path) -> None
         about=about,
         attached=attached,
     )
-    with whole_file(folder / "foxglove_layout.json") as unfinished:
-        unfinished.write_text(foxglove_layout(found, scan=robot.scan, command=robot.command), encoding="utf-8")
+    write_text(folder / "foxglove_layout.json", foxglove_layout(found, scan=robot.scan, command=robot.command))
     write_csv(over_time(found), folder / "steering.csv")
     simulated = " (simulated)" if found.recording.simulated else ""
     draw_steering(found, folder / "steering.png", title=f"{found.recording.path.name}{simulated}")

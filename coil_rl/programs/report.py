@@ -14,7 +14,7 @@ from omegaconf import DictConfig, ListConfig
 
 from coil_rl.config import Report
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.report import Interval, draw_curve_grid, draw_intervals, draw_learning_curves, page, write_csv
 from coil_rl.report.comparison import Comparison, compare
@@ -46,8 +46,7 @@ def report(config: DictConfig) -> None:
     text = "\n\n".join([*parts, page.notes(config.resamples, against), page.progress(len(finished), len(runs))])
 
     folder = folders[0]
-    with whole_file(folder / "report.md") as unfinished:
-        unfinished.write_text(text + "\n", encoding="utf-8")
+    write_text(folder / "report.md", text)
     tracks = {actions: of_kind.track_table() for actions, of_kind in found.items()}
     for name, by_actions in {"report.csv": tables, "report_tracks.csv": tracks}.items():
         rows = [{"actions": actions} | row for actions, of_kind in by_actions.items() for row in of_kind]

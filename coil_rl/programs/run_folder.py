@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.errors import UserError
-from coil_rl.files import remove_unfinished, whole_file
+from coil_rl.files import remove_unfinished, whole_file, write_text
 from coil_rl.fingerprint import UNLIKE
 from coil_rl.programs.versions import versions
 from coil_rl.trained import configuration
@@ -49,8 +49,7 @@ def begin(config: DictConfig, folder: Path) -> None:
             f"{folder} already holds a run; go on with it by coil-train resume={folder}, "
             "or choose another folder with hydra.run.dir=FOLDER"
         )
-    with whole_file(folder / "versions.json") as unfinished:
-        unfinished.write_text(json.dumps(versions(), indent=2) + "\n")
+    write_text(folder / "versions.json", json.dumps(versions(), indent=2))
     kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     # A logger writes into `run_dir`, wherever that is when the run goes on.
     kept.logger = OmegaConf.to_container(config.logger) if config.logger else None

@@ -15,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from coil_rl import checkpoint, proxies, trained
 from coil_rl.build import build, build_env, build_guides, build_learner, trains_guides
 from coil_rl.experiment import Experiment, watched_keys
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import run_folder
 from coil_rl.programs.judge import drive_guides, is_judged, judge, outcome
 from coil_rl.report import draw_learning_curves, draw_phases
@@ -103,8 +103,7 @@ def guides_on_training_tracks(config: DictConfig, file: Path) -> dict[str, float
 
 
 def _write_json(numbers: Mapping[str, float], file: Path) -> None:
-    with whole_file(file) as unfinished:
-        unfinished.write_text(json.dumps(numbers, indent=2) + "\n")
+    write_text(file, json.dumps(numbers, indent=2))
 
 
 def distil(config: DictConfig, folder: Path) -> None:

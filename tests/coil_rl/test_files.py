@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from coil_rl.files import remove_unfinished, whole_file, whole_folder
+from coil_rl.files import remove_unfinished, whole_file, whole_folder, write_text
 
 
 def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
@@ -28,6 +28,12 @@ def test_an_error_leaves_the_older_file_and_nothing_else(tmp_path: Path) -> None
         write()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
+def test_a_text_ends_with_its_last_line(tmp_path: Path, end: str) -> None:
+    write_text(tmp_path / "page.md", f"één\ntwo{end}")
+    assert (tmp_path / "page.md").read_bytes() == "één\ntwo\n".encode()
 
 
 def test_a_folder_appears_when_it_is_whole(tmp_path: Path) -> None:
