@@ -104,12 +104,8 @@ def check_values(config: DictConfig) -> None:
     """
     for name in ("", "budget", "evaluation", "method"):
         node = OmegaConf.select(config, name) if name else config
-        if node is None:  # not every program has all of these
-            continue
-        known = [field.name for field in fields(node._metadata.object_type) if field.name != "defaults"]
-        for key in sorted(set(node).difference(known)):
-            inside = name or "the configuration"
-            raise UserError(f"there is no key {key} in {inside}, which has {', '.join(known)}{near(str(key), known)}")
+        if node is not None:  # not every program has all of these
+            check_keys(node, name or "the configuration")
     for name, (low, high) in LIMITS.items():
         value = OmegaConf.select(config, name)
         if value is not None and not low <= value <= high:
@@ -123,6 +119,17 @@ def check_values(config: DictConfig) -> None:
     for name in ("device", "env.device"):
         if isinstance(device := OmegaConf.select(config, name), str):
             _check_device(name, device)
+
+
+def check_keys(node: DictConfig, name: str = "the configuration") -> None:
+    """Refuse a key that a node made from a dataclass does not have.
+
+    Raises:
+        UserError: naming it, and those that there are.
+    """
+    known = [field.name for field in fields(node._metadata.object_type) if field.name != "defaults"]
+    for key in sorted(set(node).difference(known)):
+        raise UserError(f"there is no key {key}; {name} has {', '.join(known)}{near(str(key), known)}")
 
 
 def _check_device(key: str, name: str) -> None:

@@ -9,7 +9,6 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import fields
 from typing import Any
 
 import hydra
@@ -23,7 +22,6 @@ from coil_rl import config as _schema  # noqa: F401  registers the typed roots
 from coil_rl.check import check
 from coil_rl.errors import UserError
 from coil_rl.programs.refusal import refuse
-from coil_rl.signature import near
 
 
 def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check) -> None:
@@ -50,17 +48,6 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
             if error in of_task:
                 raise
             refuse(config_name, error)
-
-
-def check_keys(config: DictConfig, root: type) -> None:
-    """Refuse a key that the root of a configuration, a dataclass, does not have.
-
-    Raises:
-        UserError: naming it, and those that there are.
-    """
-    known = [field.name for field in fields(root) if field.name != "defaults"]
-    for key in sorted(set(config).difference(known)):
-        raise UserError(f"there is no key {key}; the configuration has {', '.join(known)}{near(str(key), known)}")
 
 
 @contextmanager

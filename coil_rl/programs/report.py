@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.config import Report
+from coil_rl.check import check_keys
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app
@@ -113,7 +113,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    app.check_keys(config, Report)
+    check_keys(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("a report is made once; leave out -m, and give several folders as folder=[ONE,OTHER]")
     if config.actions not in ACTIONS:

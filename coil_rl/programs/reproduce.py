@@ -13,7 +13,7 @@ from omegaconf import DictConfig, ListConfig
 from tqdm import tqdm
 
 from coil_rl.build import build
-from coil_rl.config import Reproduce
+from coil_rl.check import check_keys
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.programs import app, sweeps
@@ -126,7 +126,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    app.check_keys(config, Reproduce)
+    check_keys(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and ask for several as in table=[1,4]")
     if config.budget not in config.budgets:

@@ -68,7 +68,7 @@ def refusal(name, *arguments):
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_cars"),
         ("+evaluation.env.lap=3", "env: ConeTrackEnv takes no lap"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
-        ("+foo=1", "no key foo in the configuration, which has preset"),
+        ("+foo=1", "there is no key foo; the configuration has preset"),
         ("+watch.epsode.a=[reward]", "no key watch.epsode; watch has episode, step; did you mean episode?"),
         ("+learner.env=1", "learner: env of PPO is set by the program; leave it out"),
         ("~learner", "learner must be given: write learner=VALUE"),
