@@ -79,7 +79,7 @@ def _built(config: DictConfig, name: str) -> Result | OfRuns:
 
 
 def chosen(config: DictConfig) -> list[str]:
-    """The names in `results` of what was asked for: table=1 is table_1, and a claim has its own name.
+    """The names in `results` of what was asked for: table=1 is table_1, figure=world figure_world; others are claims.
 
     Raises:
         UserError: for one that does not exist, and if nothing was asked for.
@@ -111,8 +111,8 @@ def command(config: DictConfig, asked: str, name: str = "") -> str:
 
 def _asked(name: Any) -> str:
     """How a person asks for a result."""
-    kind, _, number = str(name).partition("_")
-    return f"{kind}={number}" if kind in KINDS and number.isdecimal() else f"claim={name}"
+    kind, _, which = str(name).partition("_")
+    return f"{kind}={which}" if kind in KINDS and which else f"claim={name}"
 
 
 def _write(path: Path, text: str) -> None:

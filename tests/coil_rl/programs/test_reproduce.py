@@ -44,6 +44,14 @@ def test_a_choice_of_a_result_reaches_it_and_its_page():
     assert "- `coil-reproduce table=1 budget=paper`" in text
 
 
+def test_a_result_with_a_word_for_a_number_is_asked_for_by_its_kind():
+    mine = "+results.figure_of_mine={_target_: coil_rl.reproduce.Figure6}"
+    code, out, _ = outcome("figure=of_mine", mine, "hydra.run.dir=run")
+    assert code == 0
+    assert "Made by `coil-reproduce figure=of_mine" in out
+    assert "claim=figure_of_mine cannot be made" in outcome("claim=figure_of_mine", mine)[2]
+
+
 def test_all_results_that_were_made_come_together_whatever_asked_for_them():
     assert outcome("table=1", "budget=smoke")[0] == 0
     first = Path("outputs/reproduce/smoke/table_1.md").read_text()
