@@ -80,11 +80,11 @@ class RacingGuide(SplineGuide):
 
     def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
         """Advise a steering; arguments and result are those of `SplineGuide`."""
-        targets, square, wanted = self._targets(*self._midpoints(cones, cone_count))
-        square = square.clamp(min=TARGET_REACHED**2)
+        plan = self.plan(cones, cone_count)
+        wanted, square = plan.wanted, plan.square.clamp(min=TARGET_REACHED**2)
         # What the car does at full steering is the sharpest arc.
         full = math.radians(self.max_steering)
-        sine = (targets[1] / square * (2 * self.turn * self.car_length)).clamp(-math.sin(full), math.sin(full))
+        sine = (plan.targets[1] / square * (2 * self.turn * self.car_length)).clamp(-math.sin(full), math.sin(full))
         clear = wanted * self._clear(sine / self.car_length, square.sqrt(), cones, cone_count)
         some = clear.amax(0)
         # Farthest first of those that are clear, else nearest first.

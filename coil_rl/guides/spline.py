@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -15,11 +15,31 @@ from torch import Tensor
 
 from coil_rl.envs.sight import ahead, flat_index, polar
 from coil_rl.envs.sorting import smallest
-from coil_rl.envs.splines import least_squares_parabola, slots_in_use, smoothing_spline
+from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
 
 PAIR_DISTANCE = 4.0
 TARGET_REACHED = 0.625
 FAR = 1e3  # m
+
+
+class Plan(NamedTuple):
+    """What the guide makes of the cones in sight; all places in m in the car's frame.
+
+    Attributes:
+        midpoints: of close left-right pairs, nearest first, [2, M, B].
+        pairs: how many of them are real, [B].
+        path: the spline through them.
+        targets: along the path, [2, T, B].
+        square: of their distances, [T, B] m^2.
+        wanted: 1 for those ahead and not reached, else 0, [T, B].
+    """
+
+    midpoints: Tensor
+    pairs: Tensor
+    path: Spline
+    targets: Tensor
+    square: Tensor
+    wanted: Tensor
 
 
 class SplineGuide(TensorDictModuleBase):
@@ -94,9 +114,21 @@ class SplineGuide(TensorDictModuleBase):
         Returns:
             [B, 1], fraction of `max_steering`.
         """
-        targets, square, wanted = self._targets(*self._midpoints(cones, cone_count))
-        advice = self._pursuit(pick(targets, square, wanted))
-        return torch.where(wanted.amax(0) > 0, advice, steering.squeeze(-1)).unsqueeze(-1)
+        plan = self.plan(cones, cone_count)
+        advice = self._pursuit(pick(plan.targets, plan.square, plan.wanted))
+        return torch.where(plan.wanted.amax(0) > 0, advice, steering.squeeze(-1)).unsqueeze(-1)
+
+    def plan(self, cones: Tensor, cone_count: Tensor) -> Plan:
+        """The path and the targets on it; arguments are those of `steer`."""
+        midpoints, count = self._midpoints(cones, cone_count)
+        path = self.fit(midpoints, count)
+        steps = (path.polyline_length / self.spacing).round().clamp(1, self.targets - 1)
+        targets = slots_in_use(steps + 1, self.targets)
+        number = torch.arange(targets, device=steps.device, dtype=steps.dtype).unsqueeze(-1)
+        x, y = found = path.sample(path.length * (number / steps).clamp(max=1))
+        square = torch.addcmul(x * x, y, y)
+        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead(x, square)).mul_((count - 1).clamp(0, 1))
+        return Plan(midpoints, count, path, found, square, wanted)
 
     def _pursuit(self, target: Tensor) -> Tensor:
         """Equation 103 for targets [2, B] m: [B], fraction of `max_steering`."""
@@ -123,17 +155,6 @@ class SplineGuide(TensorDictModuleBase):
         nearest = flat_index(smallest(torch.addcmul(x * x, y, y), close, kept))
         points = torch.stack([axis.flatten().index_select(0, nearest).view(kept, -1) for axis in (x, y)])
         return points * 0.5, total
-
-    def _targets(self, points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Targets along the path [2, T, B] m, their squared distances and 1 if ahead and not reached [T, B]."""
-        path = self.fit(points, count)
-        steps = (path.polyline_length / self.spacing).round().clamp(1, self.targets - 1)
-        targets = slots_in_use(steps + 1, self.targets)
-        number = torch.arange(targets, device=points.device, dtype=points.dtype).unsqueeze(-1)
-        x, y = found = path.sample(path.length * (number / steps).clamp(max=1))
-        square = torch.addcmul(x * x, y, y)
-        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead(x, square)).mul_((count - 1).clamp(0, 1))
-        return found, square, wanted
 
 
 def pick(targets: Tensor, order: Tensor, wanted: Tensor) -> Tensor:

@@ -54,6 +54,17 @@ def equation_103(x: float, y: float, sharpness: float = 1.8) -> float:
 TWO_MIDPOINTS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])
 
 
+def test_a_plan_has_midpoints_nearest_first_and_targets_a_metre_apart() -> None:
+    cones, count, _ = sight(*TWO_MIDPOINTS)
+    plan = SplineGuide().plan(cones, count)
+    places = torch.tensor([[2, 3], [0.5, 0.5]], dtype=torch.float64)
+    assert plan.pairs.tolist() == [2]
+    assert torch.allclose(plan.midpoints[..., 0], places)
+    assert torch.allclose(plan.targets[..., 0], places)
+    assert plan.square[:, 0].tolist() == pytest.approx([4.25, 9.25])
+    assert plan.wanted[:, 0].tolist() == [1, 1]
+
+
 @every_spline
 def test_advice_is_equation_103_of_the_nearest_target(spline: str) -> None:
     assert equation_103(2, 0.5) == pytest.approx(0.83687, abs=1e-5)
