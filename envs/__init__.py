@@ -3,7 +3,7 @@
 from coil_rl.envs.cone_classifier import ConeClassifier, simulated_cone_classifier
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv
-from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_tracks
+from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_track, shipped_tracks
 from coil_rl.envs.mcap_replay import McapReplayEnv
 from coil_rl.envs.perception import Perception
 from coil_rl.envs.recording_writer import RecordingWriter
@@ -43,6 +43,7 @@ __all__ = [
     "robot_tracks",
     "save_drive",
     "save_track",
+    "shipped_track",
     "shipped_tracks",
     "simulated_cone_classifier",
     "simulated_drive",

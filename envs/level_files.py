@@ -88,6 +88,14 @@ def shipped_tracks(split: Split) -> list[Track]:
     return list(_shipped(split))
 
 
+def shipped_track(name: str) -> Track:
+    """The one of the project's own tracks that is called so, such as test_1."""
+    tracks = {track.name: track for track in shipped_tracks("all")}
+    if name not in tracks:
+        raise ValueError(f"There is no shipped track {name!r}; there are {', '.join(tracks)}.")
+    return tracks[name]
+
+
 # Tracks cannot be changed, so everybody may have the same ones.
 @cache
 def _shipped(split: Split) -> tuple[Track, ...]:

@@ -3,6 +3,7 @@
 from coil_rl.reproduce.figure_6 import Figure6
 from coil_rl.reproduce.figure_22 import Figure22
 from coil_rl.reproduce.figure_25 import Figure25
+from coil_rl.reproduce.figure_world import FigureWorld
 from coil_rl.reproduce.result import OfRuns, Result
 from coil_rl.reproduce.table_1 import Table1
 from coil_rl.reproduce.table_4 import Table4
@@ -14,6 +15,7 @@ __all__ = [
     "Figure6",
     "Figure22",
     "Figure25",
+    "FigureWorld",
     "OfRuns",
     "Result",
     "Table1",

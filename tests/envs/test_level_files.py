@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_tracks
+from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_track, shipped_tracks
 from coil_rl.envs.track import Track, TrackError
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
@@ -135,6 +135,12 @@ def test_seven_tracks_are_shipped_to_train_and_three_to_test():
     assert [track.name for track in every] == [track.name for track in train + test]
     with pytest.raises(ValueError, match=re.escape("'train', 'test' or 'all'")):
         shipped_tracks("tset")
+
+
+def test_a_shipped_track_goes_by_its_name():
+    assert np.array_equal(shipped_track("test_2").left, shipped_tracks("test")[1].left)
+    with pytest.raises(ValueError, match=r"no shipped track 'test_4'; there are train_1, .*test_3"):
+        shipped_track("test_4")
 
 
 @levels_needed
