@@ -3,6 +3,7 @@
 from coil_rl.reproduce.figure_6 import Figure6
 from coil_rl.reproduce.figure_22 import Figure22
 from coil_rl.reproduce.figure_25 import Figure25
+from coil_rl.reproduce.figure_spline import FigureSpline
 from coil_rl.reproduce.figure_world import FigureWorld
 from coil_rl.reproduce.result import OfRuns, Result
 from coil_rl.reproduce.table_1 import Table1
@@ -15,6 +16,7 @@ __all__ = [
     "Figure6",
     "Figure22",
     "Figure25",
+    "FigureSpline",
     "FigureWorld",
     "OfRuns",
     "Result",
