@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, open_dict
-from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.build import build, build_bare_env, build_guided_env, build_guides
 from coil_rl.check import check as check_common
-from coil_rl.envs import SimulatedRobotEnv, record_drives
+from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.simulated_recordings import record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.programs import app
 from coil_rl.reproduce import Result
-from coil_rl.trained import configuration, in_env
+from coil_rl.robot_drives import Driver, agent_of, record
+from coil_rl.trained import configuration
 
 # From each step, in the order in which they build on each other, to what it leaves.
 STEPS = {"record": "labelling", "train": "figure_25.md", "drive": "drives", "table": "table_6.md"}
@@ -59,29 +59,27 @@ def _see_with(config: DictConfig, classifier: Path) -> None:
 
 def _drive(config: DictConfig, folder: Path) -> None:
     """Let every guide and the agent of every run drive, and record it."""
-    with tqdm(desc="drive", unit="step", leave=False, mininterval=0.5) as bar:
-        for number, (about, env, policy) in enumerate(_drivers(config)):
-            seed = f"_seed{about['seed']}" if "seed" in about else ""
-            name = f"{number:02d}_{about['policy']}{seed}".replace(" ", "_")
-            bar.set_postfix_str(name)
-            paths = [folder / f"{name}_{robot}.mcap" for robot in range(env.batch_size[0])]
-            record_drives(env, policy, paths, about, bar.update)
+    robots = config.evaluation.repeats * _tracks(config)
+    record(_drivers(config, robots), folder, robots)
 
 
-def _drivers(
-    config: DictConfig, repeats: int | None = None
-) -> Iterator[tuple[dict[str, str], EnvBase, TensorDictModuleBase]]:
-    """What is to be noted about each driver, the robots it drives, and its policy."""
-    robots = (repeats or config.evaluation.repeats) * len(build(config.track.test, "track.test"))
+def _tracks(config: DictConfig) -> int:
+    return len(build(config.track.test, "track.test"))
+
+
+def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
+    """Every guide and the agent of every run, each for so many robots, with names in their order."""
     overrides = {**config.evaluation.env, "num_cars": robots}
     guides = build_guides(config)
-    for name, guide in guides.items():
+    for number, (name, guide) in enumerate(guides.items()):
         called = "guide" if len(guides) == 1 else f"guide {name}"
-        yield {"policy": called}, *build_guided_env(config, overrides, {name: guide})
-    for run in map(Path, config.runs):
+        seated = partial(build_guided_env, config, overrides, {name: guide})
+        yield Driver(f"{number:02d}_{called}".replace(" ", "_"), {"policy": called}, seated)
+    for number, run in enumerate(map(Path, config.runs), start=len(guides)):
         of_run = configuration(run, "runs", {"device": config.device})
-        env, policy = in_env(run, of_run, build_bare_env(config, overrides), config.evaluation.policy)
-        yield {"policy": of_run.label, "seed": str(of_run.seed), "run": run.name}, env, policy
+        name = f"{number:02d}_{of_run.label}_seed{of_run.seed}".replace(" ", "_")
+        bare = partial(build_bare_env, config, overrides)
+        yield agent_of(run, of_run, bare, config.evaluation.policy, name)
 
 
 def _make(config: DictConfig, name: str, folder: Path) -> None:
@@ -121,9 +119,11 @@ def _check_recordings(config: DictConfig, folder: Path) -> None:
 
 
 def _check_drivers(config: DictConfig) -> None:
-    for about, env, _ in _drivers(config, repeats=1):
+    for driver in _drivers(config, _tracks(config)):
+        env, _ = driver.seated()
         if not isinstance(env.base_env, SimulatedRobotEnv):
-            raise UserError(f"{about['policy']} drives a {type(env.base_env).__name__}; give env=simulated_robot")
+            kind = type(env.base_env).__name__
+            raise UserError(f"{driver.about['policy']} drives a {kind}; give env=simulated_robot")
 
 
 def main() -> None:
