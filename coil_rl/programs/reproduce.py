@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
@@ -29,6 +30,7 @@ ALL = "RESULTS.md"
 
 def reproduce(config: DictConfig) -> None:
     """Do the runs that are missing, make what was asked for, print it and leave it in the folder with RESULTS.md."""
+    torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     # All are built before the first run begins: a mistake shall cost seconds.
@@ -84,9 +86,10 @@ def chosen(config: DictConfig) -> list[str]:
     Raises:
         UserError: for one that does not exist, and if nothing was asked for.
     """
-    known = {_asked(name): str(name) for name in config.results}
     if config.all:
-        return list(known.values())
+        return [str(name) for name in config.results]
+    known = {_asked(name): str(name) for name in config.results}
+    known |= {_asked(name): page for name, page in config.also.items()}
     wanted: list[str] = []
     for kind in KINDS:
         given = config[kind]
@@ -129,6 +132,8 @@ def check(config: DictConfig) -> None:
     check_keys(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and ask for several as in table=[1,4]")
+    if config.threads < 1:
+        raise UserError(f"threads={config.threads} must be at least 1")
     if config.budget not in config.budgets:
         known = list(config.budgets)
         raise UserError(f"budget={config.budget} must be one of {', '.join(known)}{near(config.budget, known)}")

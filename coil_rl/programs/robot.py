@@ -17,7 +17,7 @@ from coil_rl.envs.simulated_recordings import record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.programs import app
-from coil_rl.reproduce import Result
+from coil_rl.reproduce import OfRuns, Result
 from coil_rl.robot_drives import Driver, agent_of, record
 from coil_rl.trained import configuration
 
@@ -83,7 +83,9 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
 
 
 def _make(config: DictConfig, name: str, folder: Path) -> None:
-    text = build(config[name], name, Result).make(folder / name)
+    result = build(config[name], name)
+    # Of recordings, which need no runs.
+    text = result.make(folder / name, {}) if isinstance(result, OfRuns) else result.make(folder / name)
     with whole_file(folder / f"{name}.md") as unfinished:
         unfinished.write_text(text + "\n", encoding="utf-8")
     print(f"{text}\n")
@@ -113,7 +115,7 @@ def check(config: DictConfig) -> None:
 
 def _check_recordings(config: DictConfig, folder: Path) -> None:
     if config.recordings:
-        build(config.table_6, "table_6", Result)
+        build(config.table_6, "table_6", OfRuns)
     elif "drive" not in config.steps and not (folder / STEPS["drive"]).is_dir():
         raise UserError("recordings is empty and nothing is driven; give recordings=[FILE,...] or add the step drive")
 

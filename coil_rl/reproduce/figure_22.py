@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from coil_rl.errors import UserError
 from coil_rl.report import draw_learning_curves, markdown_table, write_csv
 from coil_rl.report.curve import TRAINING, mean_curve
 from coil_rl.report.runs import GUIDE, Run
-from coil_rl.reproduce.result import OfRuns
+from coil_rl.reproduce.result import OfRuns, called
 from coil_rl.reproduce.verdict import with_interval
 
 PARTS = {"quarter": (0.25, "a quarter"), "half": (0.5, "half"), "end": (1.0, "all")}
@@ -39,12 +38,8 @@ class Figure22(OfRuns):
 
     def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
         """Make it: see `OfRuns`."""
-        there = [run for experiment in self.experiments for run in runs[experiment]]
-        of_label = {label: [run for run in there if run.label == label and run.curve] for label in self.labels}
-        for label, found in of_label.items():
-            if not found:
-                known = ", ".join(dict.fromkeys(run.label for run in there))
-                raise UserError(f"no run of {', '.join(self.experiments)} is called {label}; there are {known}")
+        learned = {experiment: [run for run in runs[experiment] if run.curve] for experiment in self.experiments}
+        of_label = called(self.labels, learned)
         curves = {label: [run.curve for run in found] for label, found in of_label.items()}
         own = [max(run.guide_returns.values()) for run in of_label[self.labels[0]] if run.guide_returns]
         guide = float(np.mean(own)) if own else None

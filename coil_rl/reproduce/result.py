@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.report import style
 from coil_rl.report.runs import Run
@@ -37,7 +38,7 @@ class OfRuns(ABC):
     """A table or figure of the paper that is made from training runs.
 
     Attributes:
-        experiments: the files of `conf/experiment` whose runs it takes.
+        experiments: the files of `conf/experiment` whose runs it takes; none if its choices leave it nothing to take.
     """
 
     experiments: Sequence[str]
@@ -45,6 +46,25 @@ class OfRuns(ABC):
     @abstractmethod
     def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
         """Make it: as that of a `Result`, from the finished runs of each experiment by its name."""
+
+
+def called(labels: Sequence[str], runs: Mapping[str, Sequence[Run]]) -> dict[str, list[Run]]:
+    """The runs of each of some labels.
+
+    Args:
+        labels: that are wanted.
+        runs: by experiment.
+
+    Raises:
+        UserError: if a label has none.
+    """
+    there = [run for of_experiment in runs.values() for run in of_experiment]
+    found = {label: [run for run in there if run.label == label] for label in labels}
+    for label, of_label in found.items():
+        if not of_label:
+            known = ", ".join(dict.fromkeys(run.label for run in there))
+            raise UserError(f"no run of {', '.join(runs)} is called {label}; there are {known or 'none'}")
+    return found
 
 
 @contextmanager

@@ -2,44 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 
 from coil_rl.envs.robot_course import THICK, THIN
-from coil_rl.envs.track import Track
 from coil_rl.report import style
 from coil_rl.reproduce.result import picture
+from coil_rl.reproduce.table_6_measures import Drive
 
 COLUMNS = 2
 PANEL = 2.5  # inches
 HEADER = 0.7
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """A recorded drive.
-
-    Attributes:
-        method: who drove.
-        row: what was measured.
-        line: [M, 2] m, where the robot was.
-        track: on which, if that is known.
-    """
-
-    method: str
-    row: Mapping[str, Any]
-    line: NDArray[np.float64]
-    track: Track | None
 
 
 def draw_drives(drives: Sequence[Drive], path: Path, title: str) -> None:

@@ -2,6 +2,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from drives import drive as circle
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 from programs import TRACK, called, program
@@ -9,6 +10,7 @@ from run_folders import driven, make_run
 
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.programs import sweeps
+from coil_rl.programs.reproduce import ALL
 from coil_rl.reproduce import OfRuns
 
 
@@ -64,6 +66,21 @@ def test_all_results_that_were_made_come_together_whatever_asked_for_them():
     assert "## Figure 6" in text
     assert "- `coil-reproduce table=4 budget=smoke`" in text.split("## Not made yet")[1]
     assert "The guide's row of table 5" in text
+
+
+def test_table_7_is_on_the_page_of_table_6_and_recordings_need_no_runs():
+    circle(Path("mine.mcap"), scans=250, odometry=True, commands=True)
+    asked = ["table=[6,7]", "results.table_6.recordings=[mine.mcap]"]
+    code, out, _ = outcome(*asked, "hydra.run.dir=run")
+    assert code == 0
+    assert "reproduce: table_6 made" in out
+    assert {path.name for path in Path("run").iterdir()} == {f"table_6.{end}" for end in ("md", "csv", "png")} | {ALL}
+    text = Path("run", ALL).read_text()
+    assert text.count("## Table 6: the robot") == text.count("### Table 7, measured") == 1
+    assert "`coil-reproduce table=6 budget=paper 'results.table_6.recordings=[mine.mcap]'`" in text
+    again, *_ = outcome("table=7", *asked[1:], "hydra.run.dir=again")
+    assert again == 0
+    assert Path("again/table_6.csv").read_bytes() == Path("run/table_6.csv").read_bytes()
 
 
 @pytest.fixture
