@@ -16,7 +16,7 @@ from tqdm import tqdm
 from coil_rl.build import build
 from coil_rl.check import check_keys
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import app, sweeps
 from coil_rl.programs.versions import versions
 from coil_rl.report.runs import Run, read_runs
@@ -45,13 +45,13 @@ def reproduce(config: DictConfig) -> None:
         else:
             text = result.make(folder / name)
         text = pages.page(text, name, note, pages.origin(command(config, _asked(name), name), commit, used))
-        _write(folder / f"{name}.md", text)
+        write_text(folder / f"{name}.md", text)
         print(text)
     kept = {str(name): folder / f"{name}.md" for name in config.results}
     commands = {name: command(config, _asked(name), name) for name in kept}
     texts = {name: path.read_text(encoding="utf-8") if path.exists() else None for name, path in kept.items()}
     everything = command(config, "all=true")
-    _write(
+    write_text(
         folder / ALL,
         pages.results(texts, commands, everything, note, config.known_problems, config.cannot),
     )
@@ -116,11 +116,6 @@ def _asked(name: Any) -> str:
     """How a person asks for a result."""
     kind, _, which = str(name).partition("_")
     return f"{kind}={which}" if kind in KINDS and which else f"claim={name}"
-
-
-def _write(path: Path, text: str) -> None:
-    with whole_file(path) as unfinished:
-        unfinished.write_text(text, encoding="utf-8")
 
 
 def check(config: DictConfig) -> None:

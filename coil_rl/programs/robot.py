@@ -15,7 +15,7 @@ from coil_rl.check import check as check_common
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.simulated_recordings import record_labelling_drives
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
+from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.reproduce import OfRuns, Result
 from coil_rl.robot_drives import Driver, agent_of, record
@@ -86,8 +86,7 @@ def _make(config: DictConfig, name: str, folder: Path) -> None:
     result = build(config[name], name)
     # Of recordings, which need no runs.
     text = result.make(folder / name, {}) if isinstance(result, OfRuns) else result.make(folder / name)
-    with whole_file(folder / f"{name}.md") as unfinished:
-        unfinished.write_text(text + "\n", encoding="utf-8")
+    write_text(folder / f"{name}.md", text)
     print(f"{text}\n")
 
 
