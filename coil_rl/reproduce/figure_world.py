@@ -6,10 +6,8 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-import torch
-
 from coil_rl.envs.level_files import shipped_track
-from coil_rl.envs.sight import SAMPLES, polar
+from coil_rl.envs.sight import SAMPLES
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.figure_world_look import Look, looks
 from coil_rl.reproduce.figure_world_picture import draw
@@ -65,8 +63,7 @@ def _rows(look: Look) -> Iterator[dict[str, object]]:
     """Every place that the picture shows, in order, and what the observation says of the samples."""
     places = {f"cone {side}": cones for side, cones in zip(SIDES, look.seen, strict=True)}
     places |= {f"boundary {side}": curve for side, curve in zip(SIDES, look.estimate, strict=True)}
-    places |= {"midpoint": look.midpoints, "path": look.path, "target": look.targets}
-    places |= {} if look.target is None else {"steered for": look.target[None]}
+    places |= look.plan
     moment = {"moment": look.name, "seconds": look.seconds}
     yield moment | {"part": "advice", "degrees": look.advice}
     yield moment | {"part": "steering before", "degrees": look.steering}
@@ -84,10 +81,9 @@ def _page(found: Sequence[Look], track: str) -> str:
     for look in found:
         row: dict[str, object] = {"name": look.name, "seconds": look.seconds}
         row |= {side: len(cones) for side, cones in zip(SIDES, look.seen, strict=True)}
-        row |= {"midpoints": len(look.midpoints), "targets": len(look.targets)}
-        if look.target is not None:
-            distance, angle = polar(*torch.from_numpy(look.target))
-            row |= {"distance": distance.item(), "angle": math.degrees(angle)}
+        row |= {"midpoints": len(look.plan["midpoint"]), "targets": len(look.plan["target"])}
+        for x, y in look.plan["steered for"]:
+            row |= {"distance": math.hypot(x, y), "angle": math.degrees(math.atan2(y, x))}
         rows.append({"distance": None, "angle": None} | row | {"advice": look.advice, "steering": look.steering})
     numbers = [
         {"sample": f"{SIDES[number // SAMPLES]} {number + 1}"}

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.envs.utils import step_mdp
 from tqdm import trange
 
@@ -17,11 +16,10 @@ from coil_rl.envs import ConeTrackEnv, Track
 from coil_rl.envs.sight import to_car
 from coil_rl.envs.track import SIDES
 from coil_rl.errors import UserError
-from coil_rl.guides.spline import SplineGuide, pick
+from coil_rl.guides import SplineGuide
+from coil_rl.reproduce.facing_up import FINE, places_of, rows
 
 Array = NDArray[np.float64]
-
-FINE = 60  # points of a curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +36,7 @@ class Look:
         samples: the five of each side that the observation tells of, [2, 5, 2].
         known: whether a side was ever seen, [2].
         observation: [20].
-        midpoints: of the guide, [M, 2].
-        path: of the guide, [P, 2]; no point where it has none.
-        targets: along it, [T, 2].
-        target: the one it steers for, [2]; None where it keeps its steering.
+        plan: of the guide, see `places_of`.
         advice: degrees.
         steering: degrees, now in force.
     """
@@ -55,10 +50,7 @@ class Look:
     samples: Array
     known: NDArray[np.bool_]
     observation: Array
-    midpoints: Array
-    path: Array
-    targets: Array
-    target: Array | None
+    plan: Mapping[str, Array]
     advice: float
     steering: float
 
@@ -100,31 +92,21 @@ def _look(
     pose = env.pose[:, 0].double()
     cones, count = state["cones"], state["cone_count"]
     boundary = env.fit(cones.permute(3, 2, 1, 0), count.t()).equidistant(FINE)
-    plan = guide.plan(cones, count)
-    pairs = int(plan.pairs)
 
     def from_car(points: Array) -> Array:
-        return _rows(to_car(pose, torch.tensor(points.T)))
+        return rows(to_car(pose, torch.tensor(points.T)))
 
     return Look(
         name=name,
         seconds=seconds,
         cones=[from_car(ring) for ring in (track.left, track.right)],
         boundaries=[from_car(track.boundary(side, 0.1)) for side in SIDES],
-        seen=[_rows(cones[0, side, :n].t()) for side, n in enumerate(count[0].tolist())],
-        estimate=[_rows(boundary[:, : FINE if n > 1 else 0, side, 0]) for side, n in enumerate(count[0].tolist())],
+        seen=[rows(cones[0, side, :n].t()) for side, n in enumerate(count[0].tolist())],
+        estimate=[rows(boundary[:, : FINE if n > 1 else 0, side, 0]) for side, n in enumerate(count[0].tolist())],
         samples=to_car(pose, env.samples[..., 0]).permute(2, 1, 0).double().numpy(),
         known=(env.sampled[:, 0] > 0).numpy(),
         observation=state["observation"][0].double().numpy(),
-        midpoints=_rows(plan.midpoints[:, :pairs, 0]),
-        path=_rows(plan.path.equidistant(FINE if pairs > 1 else 0)[..., 0]),
-        targets=_rows(plan.targets[:, : None if pairs > 1 else 0, 0]),
-        target=_rows(pick(plan.targets, plan.square, plan.wanted))[0] if plan.wanted.any() else None,
+        plan=places_of(guide.plan(cones, count)),
         advice=float(state["action"]) * guide.max_steering,
         steering=float(state["steering"]) * guide.max_steering,
     )
-
-
-def _rows(points: Tensor) -> Array:
-    """Points [2, N] as [N, 2]."""
-    return points.t().double().numpy()
