@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.envs.clusters import GAP, Clusters, measure, points_of, single_linkage
+from coil_rl.envs.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
 from coil_rl.envs.cone_classifier import ConeClassifier
 
 Array = NDArray[np.float64]
@@ -90,9 +90,13 @@ class Perception:
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
         """All clusters of at least two points, in the car's frame but not scaled, whether they are cones or not."""
-        turned = np.asarray(angles, dtype=np.float64) + self.laser_yaw
-        points = points_of(ranges, turned, self.range_min, self.range_max + self.margin)
+        points = self.points(ranges, angles)
         return measure(points, single_linkage(points, self.gap))
+
+    def points(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Points:
+        """What is near enough to be looked at, in the car's frame but not scaled."""
+        turned = np.asarray(angles, dtype=np.float64) + self.laser_yaw
+        return points_of(ranges, turned, self.range_min, self.range_max + self.margin)
 
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
         """Which clusters [C] the car sees, by the mean of their points."""

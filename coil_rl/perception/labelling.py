@@ -113,7 +113,7 @@ def label_clusters(drives: Sequence[SimulatedDrive], farthest: float = RANGE) ->
         points = points_of(drive.ranges.numpy(), drive.angles.numpy(), LEAST, farthest + MARGIN)
         label = single_linkage(points)
         clusters = measure(points, label)
-        cone = _majority(label, drive.hit.numpy()[points.scan, points.beam], drive.cones.shape[1])[clusters.label]
+        cone = majority(label, drive.hit.numpy()[points.scan, points.beam], drive.cones.shape[1])[clusters.label]
         distance = np.hypot(*clusters.centroid.T)
         kept = (distance <= farthest) & (cone >= 0)
         cone, scan = cone[kept], clusters.scan[kept]
@@ -156,8 +156,17 @@ def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict
     }
 
 
-def _majority(label: NDArray[np.int64], cone: NDArray[np.int64], cones: int) -> NDArray[np.int64]:
-    """The cone [C] that most points of each cluster are of, -1 where all are of none."""
+def majority(label: NDArray[np.int64], cone: NDArray[np.int64], cones: int) -> NDArray[np.int64]:
+    """The cone that most points of each cluster are of.
+
+    Args:
+        label: the cluster of each point, [M].
+        cone: the cone of each point, -1 for none, [M].
+        cones: how many there are.
+
+    Returns:
+        For each cluster by its label the number of a cone, -1 where all its points are of none.
+    """
     votes = np.zeros((int(label.max(initial=-1)) + 1, cones + 1), dtype=np.int64)
     np.add.at(votes, (label, cone), 1)
     return np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)
