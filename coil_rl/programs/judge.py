@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
-from coil_rl.build import build, build_env, build_guided_env, env_node
+from coil_rl.build import build, build_env
 from coil_rl.evaluation import PER_STEP, Drive, drive, summarise
 from coil_rl.files import write_text
+from coil_rl.guide_drives import drive_guides
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 
 COLUMNS = {
@@ -90,47 +89,6 @@ def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, in
     if config.method.transforms:
         plan += [(advice, 0) for advice in config.evaluation.advice]
     return plan
-
-
-def drive_guides(
-    config: DictConfig,
-    overrides: Mapping[str, Any],
-    names: Sequence[str],
-    guides: Mapping[str, TensorDictModuleBase] | None = None,
-) -> dict[str, Drive]:
-    """Each guide of a run alone, on each track once, by what it goes as in tables: `guide`, or `guide NAME` of several.
-
-    Args:
-        config: of the run.
-        overrides: what to change in `env`; its tracks, one car each.
-        names: of the tracks.
-        guides: others than those of the configuration.
-    """
-    if guides:
-        return _drive_guides(config, overrides, names, guides)
-    known = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
-    return dict(_driven_before(OmegaConf.to_yaml({"env": env_node(config, overrides), **known}), tuple(names)))
-
-
-# The runs of a sweep share their guides, which drive the same lines again: as long as an agent takes to be judged.
-@lru_cache(maxsize=64)
-def _driven_before(known: str, names: tuple[str, ...]) -> dict[str, Drive]:
-    config: Any = OmegaConf.create(known)
-    return _drive_guides(config, {}, names)
-
-
-def _drive_guides(
-    config: DictConfig,
-    overrides: Mapping[str, Any],
-    names: Sequence[str],
-    guides: Mapping[str, TensorDictModuleBase] | None = None,
-) -> dict[str, Drive]:
-    env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
-    called = list(guides or config.guide)
-    drivers = ["guide"] if len(called) == 1 else [f"guide {name}" for name in called]
-    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
-        driven = drive(env, policy, names=names, tick=bar.update)
-    return dict(zip(drivers, driven.split(len(called)), strict=True))
 
 
 def is_judged(folder: Path) -> bool:

@@ -16,8 +16,9 @@ from coil_rl import checkpoint, proxies, trained
 from coil_rl.build import build, build_env, build_guides, build_learner, trains_guides
 from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.files import write_text
+from coil_rl.guide_drives import drive_guides
 from coil_rl.programs import run_folder
-from coil_rl.programs.judge import drive_guides, is_judged, judge, outcome
+from coil_rl.programs.judge import is_judged, judge, outcome
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.rollout import Rollout
 

@@ -5,7 +5,7 @@ from hydra import compose, initialize_config_module
 
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.build import build_guides
-from coil_rl.programs.judge import drive_guides
+from coil_rl.guide_drives import drive_guides
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
