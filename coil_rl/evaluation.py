@@ -30,10 +30,12 @@ class Drive:
             An env without `info` gives `reward` and `steps` only, one that says under `info` in which `task` a step was
             paid also `steps_TASK` and `reward_TASK`, the parts that fell to each.
         lines: the positions of each car, [steps, 2] m.
+        smoothness: |a - a_avg| of each car at each of these, [steps].
     """
 
     episodes: list[dict[str, Any]]
     lines: list[NDArray[np.float64]]
+    smoothness: list[NDArray[np.float64]]
 
     @property
     def mean_reward(self) -> float:
@@ -47,7 +49,7 @@ class Drive:
 
     def __getitem__(self, cars: slice) -> Drive:
         """The drive of some cars."""
-        return Drive(self.episodes[cars], self.lines[cars])
+        return Drive(self.episodes[cars], self.lines[cars], self.smoothness[cars])
 
 
 @torch.no_grad()
@@ -107,7 +109,7 @@ def _notes(after: TensorDictBase) -> dict[str, Tensor]:
 
 def _measure(notes: dict[str, NDArray[np.float64]], names: Sequence[str]) -> Drive:
     running = notes["running"].astype(bool)
-    episodes, lines = [], []
+    episodes, lines, smoothness = [], [], []
     for car, on in enumerate(running.T):
         row: dict[str, Any] = {"reward": notes["reward"][on, car].sum(), "steps": int(on.sum())}
         if "track" in notes:
@@ -124,12 +126,13 @@ def _measure(notes: dict[str, NDArray[np.float64]], names: Sequence[str]) -> Dri
                 "clearance": float(notes["clearance"][on, car].min()),
             }
             lines.append(notes["pose"][on, car, :2])
+            smoothness.append(notes["smoothness"][on, car])
             for key in notes:
                 if key.startswith("steps_"):
                     paid = notes[key][on, car]
                     row |= {key: int(paid.sum()), f"reward_{key[6:]}": (paid * notes["reward"][on, car]).sum()}
         episodes.append(row)
-    return Drive(episodes, lines)
+    return Drive(episodes, lines, smoothness)
 
 
 def summarise(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

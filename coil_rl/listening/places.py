@@ -20,12 +20,13 @@ STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(PLACES))
 SMOOTHING = 1.0  # m
 
 
-def middle_line(track: Track, spacing: float = 0.25) -> Array:
+def middle_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
     """The line half-way between a track's boundaries, without the jitter of single cones.
 
     Args:
         track: the track.
         spacing: distance of its points in m, but for what rounding to a whole number of them takes.
+        smoothing: standard deviation of the mean over neighbours in m; it takes s^2 / 2R off a turn of radius R.
 
     Returns:
         [P, 2] m, a closed line in driving order from the first cones; the first point is not repeated.
@@ -36,7 +37,7 @@ def middle_line(track: Track, spacing: float = 0.25) -> Array:
     along = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
     even = np.linspace(0, along[-1], max(8, round(along[-1] / spacing)), endpoint=False)
     points = np.stack([np.interp(even, along, axis) for axis in closed.T], axis=1)
-    return np.asarray(gaussian_filter1d(points, SMOOTHING / spacing, axis=0, mode="wrap"))
+    return np.asarray(gaussian_filter1d(points, smoothing / spacing, axis=0, mode="wrap"))
 
 
 def curvature(line: Array) -> Array:

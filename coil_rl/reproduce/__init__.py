@@ -3,6 +3,7 @@
 from coil_rl.reproduce.figure_6 import Figure6
 from coil_rl.reproduce.figure_22 import Figure22
 from coil_rl.reproduce.figure_25 import Figure25
+from coil_rl.reproduce.figure_lines import FigureLines
 from coil_rl.reproduce.figure_scan import FigureScan
 from coil_rl.reproduce.figure_spline import FigureSpline
 from coil_rl.reproduce.figure_world import FigureWorld
@@ -17,6 +18,7 @@ __all__ = [
     "Figure6",
     "Figure22",
     "Figure25",
+    "FigureLines",
     "FigureScan",
     "FigureSpline",
     "FigureWorld",

@@ -123,6 +123,7 @@ def test_runs_that_are_there_are_used_and_one_that_is_gone_is_done_again_alone(t
         ("table=3", "table=3 cannot be made; there are table=1, table=4"),
         ("table=[1,3]", "table=3 cannot be made; there are table=1, table=4"),
         ("claim=table_1", "claim=table_1 cannot be made"),
+        ("figure=line", "did you mean figure=lines?"),
         ("table=one", "table=one cannot be made; there are table=1"),
         ("tabel=1", "there is no key tabel"),
         ("+other=1", "there is no key other"),
