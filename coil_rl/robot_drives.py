@@ -25,6 +25,15 @@ class Driver:
         name: that its recordings begin with.
         about: what is noted in them: whose drive it is, as `policy`, and all that tells it from another's.
         seated: makes the robots with what the policy needs around them, and the policy.
+
+    Example:
+        >>> import tempfile
+        >>> from coil_rl.envs import SimulatedRobotEnv
+        >>> from coil_rl.guides import SplineGuide
+        >>> guide = Driver("guide", {"policy": "guide"}, lambda: (SimulatedRobotEnv(time_limit=1.0), SplineGuide()))
+        >>> (recording,) = record([guide], Path(tempfile.mkdtemp()), robots=1)
+        >>> recording.path.name, recording.notes["simulated"]["policy"]
+        ('guide_0.mcap', 'guide')
     """
 
     name: str
