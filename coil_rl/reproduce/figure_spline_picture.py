@@ -40,7 +40,7 @@ def draw(fits: Sequence[Fit], points: Array, truth: Array, path: Path, title: st
     ]
     handles += [
         Line2D([], [], ls="", marker=".", ms=4, color=style.INK, label="SciPy's, all λ"),
-        Line2D([], [], ls="", marker="o", ms=6, mfc=style.PAPER, mec=style.INK, mew=0.9, label="noisy cone"),
+        Line2D([], [], ls="", marker="o", ms=7, mfc="none", mec=style.INK, mew=0.9, label="noisy cone"),
         Line2D([], [], ls="", marker="+", ms=6, color=style.QUIET, label="true cone"),
     ]
     with picture(path, title, handles, HEIGHT) as figure:
@@ -49,7 +49,7 @@ def draw(fits: Sequence[Fit], points: Array, truth: Array, path: Path, title: st
         plane.set(xlabel="m", ylabel="m")
         lighten(plane)
         plane.plot(*truth.T, "+", ms=6, color=style.QUIET, zorder=2)
-        plane.plot(*points.T, "o", ms=6, mfc=style.PAPER, mec=style.INK, mew=0.9, zorder=2.5)
+        plane.plot(*points.T, "o", ms=7.5, mfc="none", mec=style.INK, mew=0.9, zorder=5)
         chords = np.hypot(*np.diff(points, axis=0).T)
         travelled = np.concatenate([[0], chords.cumsum()])
         for fit, stroke in zip(fits, strokes.values(), strict=True):
