@@ -133,6 +133,7 @@ class Benchmark(Common):
     compile: list[int] = field(default_factory=list)
     quick: bool = False
     when_quick: dict[str, Any] = field(default_factory=dict)
+    checkpoint_every: int = 1  # set by learners with replay for coil-train; nothing is written here
 
 
 @dataclass

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 import coil_rl
 from coil_rl.benchmark.driving import Driving, drive_env
-from coil_rl.benchmark.training import Training
+from coil_rl.benchmark.training import Training, has_yardstick
 from coil_rl.benchmark.turns import Turns, median_ratio
 from coil_rl.build import build
 
@@ -80,6 +80,8 @@ def measure_sb3(config: DictConfig, turns: Turns) -> dict[str, Any]:
     It runs on the CPU, with networks as large as ours; everything else is its own default but for the length of a
     rollout, which is shorter so that a turn is.
     """
+    if not has_yardstick(config):
+        return {"not_measured": "Stable-Baselines3 runs PPO that steers by numbers: learner=ppo action=continuous"}
     if importlib.util.find_spec("stable_baselines3") is None or importlib.util.find_spec("gymnasium") is None:
         return {"not_measured": "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"}
     batch = config.batches[0]

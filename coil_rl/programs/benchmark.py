@@ -20,6 +20,7 @@ from coil_rl.benchmark.summary import goals, summarise
 from coil_rl.benchmark.training import measure_shares, measure_training
 from coil_rl.benchmark.turns import Turns
 from coil_rl.benchmark.yardsticks import measure_oracle, measure_sb3
+from coil_rl.build import learner_kind
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app
@@ -45,6 +46,11 @@ def benchmark(config: DictConfig) -> None:
     unknown = [part for part in config.parts if part not in PARTS]
     if unknown:
         raise UserError(f"parts: there is no {', '.join(unknown)}; there are {', '.join(PARTS)}")
+    if learner_kind(config) != "agent":
+        name = config.learner["_target_"].rpartition(".")[2]
+        raise UserError(
+            f"{name} does not learn from reward alone, as what is measured does; take another, as learner=ppo"
+        )
     if config.quick:
         config.merge_with(config.when_quick)
     torch.set_num_threads(config.threads)

@@ -3,7 +3,7 @@ import json
 
 import pytest
 from PIL import Image
-from programs import called, program
+from programs import TRACK, called, program
 
 PARTS = ["start", "memory", "env", "training", "shares", "robot", "oracle", "sb3", "profile"]
 
@@ -49,11 +49,34 @@ def test_quick_benchmark_measures_everything(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("PPO", ["learner.epochs=1", "learner.minibatches=2"]),
+        ("A2C", ["learner=a2c"]),
+        ("DQN", ["learner=dqn", "learner.starts=300", "learner.ratio=1"]),
+    ],
+)
+def test_learners_are_measured_with_the_guide_and_without_and_ppo_beside_its_yardsticks(name, arguments, tmp_path):
+    parts = "parts=[training]" if name == "PPO" else "parts=[training,sb3]"
+    done = called("benchmark", *TRACK, "quick=true", parts, *arguments, "hydra.run.dir=run", cwd=tmp_path)
+    found = json.loads((tmp_path / "run" / "benchmark.json").read_text())
+    (row,) = found["training"]
+    assert row["learner"] == name
+    assert f"| {name} " in done.stdout
+    plain = {"plain_ppo", "plain_coil"} if name == "PPO" else set()
+    assert set(row["rounds"]) == {"ppo", "coil"} | plain
+    assert all(row[f"{subject}_frames_per_s"] > 0 for subject in row["rounds"])
+    assert len(found["goals"]) == len(plain)
+    assert ("sb3: not measured: Stable-Baselines3 runs PPO" in done.stdout) == (name != "PPO")
+
+
+@pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["parts=[envy]"], "parts: there is no envy; there are start, memory, env, training"),
         (["device=cuda:77"], "device=cuda:77 cannot be used"),
         (["repeat=3"], "there is no key repeat"),
+        ([*TRACK, "learner=forest"], "Imitation does not learn from reward alone"),
     ],
 )
 def test_mistakes_are_one_sentence_and_exit_code_2(arguments, words, tmp_path):
