@@ -34,11 +34,11 @@ COLUMNS = {
 }
 
 NOTES = """
-The policies are those with seed {seed} as they were after their training, their actions deterministic; the guide is
-that of {first}. The picture shows the last lap of each on the track straightened along its middle, and below it
-|a - weighted mean of the last 20 actions|. way / centre line: metres driven for each metre of the centre line that was
-passed, in all laps; from the centre: the mean distance. Other seeds drive other lines; all of them are in table 5. The
-paper prints no numbers of this."""
+The policies are the {policy} ones of the runs with seed {seed}, their actions deterministic; the guide is that of
+{first}. The picture shows the last lap of each on the track straightened along its middle, and below it |a - weighted
+mean of the last 20 actions|. way / centre line: metres driven for each metre of the centre line that was passed, of who
+came around; from the centre: the mean distance. Other seeds drive other lines; all of them are in table 5. The paper
+prints no numbers of this."""
 
 
 class FigureLines(OfRuns):
@@ -85,14 +85,14 @@ class FigureLines(OfRuns):
                 drives[label] = self._driven(run.folder, configs[label], names, bar)
         straight = [Straightened(track) for track in tracks]
         rows = [
-            {"driver": driver} | episode | _way(place, track.length, line)
+            {"driver": driver} | episode | _way(place, track.length, line, episode["laps"])
             for driver, of_driver in drives.items()
             for episode, line, place, track in zip(of_driver.episodes, of_driver.lines, straight, tracks, strict=True)
         ]
         write_csv(rows, stem.with_suffix(".csv"))
         title = f"Driven lines on unseen tracks, seed {self.seed}"
         draw_straightened(tracks, straight, drives, stem.with_suffix(".png"), title)
-        notes = NOTES.strip().format(seed=self.seed, first=self.labels[0])
+        notes = NOTES.strip().format(policy=self.policy, seed=self.seed, first=self.labels[0])
         return f"## Driven lines on unseen tracks\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
 
     def _chosen(self, runs: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
@@ -113,9 +113,9 @@ class FigureLines(OfRuns):
         return drive(env, policy, names=names, tick=bar.update)
 
 
-def _way(straight: Straightened, length: float, line: Any) -> dict[str, float]:
+def _way(straight: Straightened, length: float, line: Any, laps: int) -> dict[str, float]:
     """How far the driver went for each metre of a centre line of this length, and how far from its middle it was."""
     along, aside = straight(line)
     passed = np.diff(np.unwrap(along, period=straight.length)).sum() / straight.length * length
     driven = np.linalg.norm(np.diff(line, axis=0), axis=1).sum()
-    return {"way": float(driven / passed), "off_centre": float(np.abs(aside).mean())}
+    return {"way": float(driven / passed) if laps else float("nan"), "off_centre": float(np.abs(aside).mean())}

@@ -60,9 +60,9 @@ follows need to know where the cones stood, which a recording notes as `track`: 
 a cone or its middle came to the line between two. The paper's robot drove on another track, so that its lap times
 compare among themselves only. Each drive is a row of the CSV."""
 OF_SEEDS = """
-Differences are of the same seed, each the mean over its drives, of clearance the least; seeds: how many have both
-numbers, for who never comes around has no lap time. Intervals: percentile bootstrap of seeds, {resamples} resamples;
-a single seed has none, and leaves open what others would do."""
+Differences are of the same seed, each the mean over its drives, of clearance the least; seeds: how many of them, for
+who crashed in the first lap of every drive is compared by clearance alone. Intervals: percentile bootstrap of seeds,
+{resamples} resamples; a single seed has none, and leaves open what others would do."""
 
 Row = Mapping[str, Any]
 
@@ -111,12 +111,15 @@ def _claim(
         return None
     # Who has no seed, as the guide, drives alike beside all of them.
     one = means[theirs].get(None)
-    pairs = [(row, means[theirs].get(number, one)) for number, row in means[ours].items()]
-    found = np.array([row[measure] - other[measure] for row, other in pairs if other is not None])
-    if not len(found):
+    beside = [(row, means[theirs].get(number, one)) for number, row in means[ours].items()]
+    pairs = [(row, other) for row, other in beside if other is not None]
+    if not pairs:
         return None
+    # Who has not come around has not steered through every turn.
+    around = [pair for pair in pairs if measure == "clearance" or all(row["laps"] for row in pair)]
+    found = np.array([row[measure] - other[measure] for row, other in around])
     known = found[np.isfinite(found)]
-    line: dict[str, Any] = {"claim": claim, "seeds": f"{len(known)} of {len(found)}", "paper": None, "ours": None}
+    line: dict[str, Any] = {"claim": claim, "seeds": f"{len(known)} of {len(pairs)}", "paper": None, "ours": None}
     if measure in PRINTED:
         place = PRINTED.index(measure)
         line["paper"] = f"{PAPER[ours][place] - PAPER[theirs][place]:+{SPECS[measure]}}"
