@@ -16,11 +16,12 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
+from coil_rl.envs.constants import constant
 from coil_rl.envs.seeded import SeededEnv
-from coil_rl.envs.sight import SAMPLES, View, boundary_samples, encode, flat_index, to_car, to_world, view
+from coil_rl.envs.sight import SAMPLES, Frame, View, boundary_samples, encode, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 from coil_rl.envs.track import Track
-from coil_rl.envs.track_map import TrackMap
+from coil_rl.envs.track_map import Place, TrackMap
 
 HISTORY = 20
 FINISH_RADIUS = 0.625  # m
@@ -212,9 +213,9 @@ class ConeTrackEnv(SeededEnv):
         tracks = torch.arange(len(self.map), device=self.device)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
         sampled = torch.zeros(2, len(tracks), dtype=self.dtype_, device=self.device)
-        cell = self.map.cell(tracks, self.map.starts[:2])
-        seen, _ = self._look(tracks, cell, self.map.starts)
-        observation, samples, sampled = self._observe(self.map.starts, seen, samples, sampled)
+        frame = Frame(self.map.starts)
+        seen, _ = self._look(self.map.locate(tracks, frame.position), self.map.starts, frame)
+        observation, samples, sampled = self._observe(frame, seen, samples, sampled)
         for name, value in {
             "start_cones": self._padded(seen.cones), "start_count": seen.count.long(),
             "start_observation": observation.t(), "start_samples": samples, "start_sampled": sampled,
@@ -290,34 +291,37 @@ class ConeTrackEnv(SeededEnv):
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
-        roughness = (action - recent_mean(self.history)).abs()
+        roughness = (action - recent_mean(self.history)).abs_()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.pose = self._move(action)
-        self.steps = self.steps + 1
+        self.steps = self.steps + constant(1, self.steps)
 
-        lap_time, finished = self._cross_the_line()
-        cell = self.map.cell(self.track, self.pose[:2])
-        seen, slot = self._look(self.track, cell, self.pose)
+        frame = Frame(self.pose)
+        place = self.map.locate(self.track, frame.position)
+        lap_time, finished = self._cross_the_line(place)
+        seen, slot = self._look(place, self.pose, frame)
         discovered = self._discover(seen, slot, finished)
-        observation, self.samples, self.sampled = self._observe(self.pose, seen, self.samples, self.sampled)
-        to_boundaries = self.map.to_boundaries(self.track, self.pose[:2])
-        clearance = self.map.clearance(self.track, cell, self.pose[:2], to_boundaries)
+        observation, self.samples, self.sampled = self._observe(frame, seen, self.samples, self.sampled)
+        to_boundaries = self.map.to_boundaries(place)
+        clearance = self.map.clearance(place, to_boundaries)
 
-        crashed = clearance <= 0
+        crashed = clearance <= constant(0, clearance)
         alive = (~crashed).to(action.dtype)
         terms = self._pay(Outcome(action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive))
-        terminated = crashed | (self.lap >= self.laps)
-        truncated = (self.steps >= self.max_steps) & ~terminated
-        out = self._tensordict(
+        terminated = crashed | (self.lap >= constant(self.laps, self.lap))
+        truncated = (self.steps >= constant(self.max_steps, self.steps)) & ~terminated
+        return self._tensordict(
             observation,
             self._padded(seen.cones),
             seen.count.long(),
-            self._info(lap_time, crashed, clearance, roughness, terms),
+            {
+                "reward": reduce(torch.add, terms.values()).to(action.dtype).unsqueeze(-1),
+                "terminated": terminated.unsqueeze(-1),
+                "truncated": truncated.unsqueeze(-1),
+                "done": (terminated | truncated).unsqueeze(-1),
+                **self._info(lap_time, crashed, clearance, roughness, terms),
+            },
         )
-        out["reward"] = reduce(torch.add, terms.values()).to(action.dtype).unsqueeze(-1)
-        out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
-        out["done"] = (terminated | truncated).unsqueeze(-1)
-        return out
 
     def _pay(self, outcome: Outcome) -> dict[str, Tensor]:
         """The terms of the reward, [B] each."""
@@ -325,32 +329,27 @@ class ConeTrackEnv(SeededEnv):
 
     def _move(self, action: Tensor) -> Tensor:
         """The bicycle model (equations 99-100): first along the heading, then the heading turns."""
-        x, y, heading = self.pose
+        heading = self.pose[2]
+        turn = (action * constant(self.max_steering, action)).sin_()
         step = self.speed / self.rate
-        turn = (action * self.max_steering).sin()
-        return torch.stack(
-            [
-                torch.add(x, heading.cos(), alpha=step),
-                torch.add(y, heading.sin(), alpha=step),
-                torch.add(heading, turn, alpha=step / self.car_length),
-            ]
-        )
+        strides = constant((step, step, step / self.car_length), self.pose)
+        return torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
 
-    def _cross_the_line(self) -> tuple[Tensor, Tensor]:
+    def _cross_the_line(self, place: Place) -> tuple[Tensor, Tensor]:
         """Count laps; returns the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
-        offset = self.pose[:2] - self.map.finish[:, self.track]
-        inside = offset[0].square() + offset[1].square() < FINISH_RADIUS**2
+        square = (place.position - place.finish).square_().sum(0)
+        inside = square < constant(FINISH_RADIUS**2, square)
         entered = inside & ~self.on_line
-        finished = entered & (self.clock >= 0)
-        lap_time = ((self.steps - self.clock) * finished).to(self.dtype_) / self.rate
+        finished = entered & (self.clock >= constant(0, self.clock))
+        lap_time = (self.steps - self.clock) * finished / constant(self.rate, square)
         self.on_line = inside
         self.clock = torch.where(entered, self.steps, self.clock)
         self.lap = self.lap + finished
         return lap_time, finished
 
-    def _look(self, track: Tensor, cell: Tensor, pose: Tensor) -> tuple[View, Tensor]:
-        slot, cones = self.map.candidates(track, cell, pose[2])
-        return view(to_car(pose, cones), self.kept_cones), slot
+    def _look(self, place: Place, pose: Tensor, frame: Frame) -> tuple[View, Tensor]:
+        slot, cones = self.map.candidates(place, pose[2])
+        return view(frame.to_car(cones), self.kept_cones), slot
 
     def _discover(self, seen: View, slot: Tensor, finished: Tensor) -> Tensor:
         """On how many sides a cone came into sight [B]; keeps book of the cones that are not to be paid again.
@@ -360,22 +359,22 @@ class ConeTrackEnv(SeededEnv):
         before = self.epoch
         self.epoch = before + (1 if self.every_sighting else finished)
         known_since = before if self.every_sighting else self.epoch
-        cars = torch.arange(self.batch_size[0], device=self.device)
-        slot = slot.flatten().index_select(0, flat_index(seen.place)).view_as(seen.place)
-        index = torch.add(cars, slot, alpha=len(cars)).flatten()
+        slot = slot.flatten().index_select(0, seen.index).view_as(seen.place)
+        cars = len(self.epoch)
+        index = torch.add(constant(range(cars), self.epoch, torch.int64), slot, alpha=cars).flatten()
         book = self.seen_in.view(-1)
         last = book.index_select(0, index).view_as(slot)
         new = seen.real * torch.ne(last, known_since)
-        book.scatter_(0, index, torch.where(seen.real > 0, self.epoch, last).flatten())
+        book.scatter_(0, index, torch.where(seen.real.bool(), self.epoch, last).flatten())
         return new.amax(0).sum(0)
 
-    def _observe(self, pose: Tensor, seen: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _observe(self, frame: Frame, seen: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The observation [B, 20], from the boundaries in view or, where there is none, from the last one that was."""
-        fresh = (seen.count - 1).clamp_(0, 1)
+        fresh = seen.real[1]
         local = boundary_samples(seen.cones, seen.count, self.fit)
-        samples = torch.lerp(samples, to_world(pose, local), fresh)
+        samples = torch.lerp(samples, frame.to_world(local), fresh)
         sampled = torch.maximum(sampled, fresh)
-        return encode(torch.lerp(to_car(pose, samples), local, fresh), sampled), samples, sampled
+        return encode(torch.lerp(frame.to_car(samples), local, fresh), sampled), samples, sampled
 
     # Output
 
@@ -397,14 +396,16 @@ class ConeTrackEnv(SeededEnv):
         entries |= {"pose": self.pose.t(), "reward": TensorDict(paid, self.batch_size, device=self.device)}
         return {"info": TensorDict(entries, self.batch_size, device=self.device)}
 
-    def _tensordict(self, observation: Tensor, cones: Tensor, count: Tensor, info: dict[str, TensorDict]) -> TensorDict:
+    def _tensordict(
+        self, observation: Tensor, cones: Tensor, count: Tensor, others: Mapping[str, Tensor | TensorDict]
+    ) -> TensorDict:
         return TensorDict(
             {
                 "observation": observation,
                 "cones": cones.permute(3, 2, 1, 0),
                 "cone_count": count.t(),
                 "steering": self.history[0].unsqueeze(-1),
-                **info,
+                **others,
             },
             self.batch_size,
             device=self.device,
@@ -444,10 +445,10 @@ def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str])
 
 def recent_mean(history: Tensor) -> Tensor:
     """Mean of the last actions [20, B], newest first, weighted exp(-0.1 k), in a fixed order of summation."""
-    decay = math.exp(-0.1) ** torch.arange(HISTORY, dtype=history.dtype, device=history.device)
-    fours = (history * (decay / decay.sum()).unsqueeze(-1)).view(4, HISTORY // 4, -1)
-    pairs = fours[:2] + fours[2:]
-    return reduce(torch.add, (pairs[0] + pairs[1]).unbind(0))
+    weights = [math.exp(-0.1 * k) for k in range(HISTORY)]
+    fours = (history * constant(tuple(weight / sum(weights) for weight in weights), history)).view(2, 2, 5, -1)
+    pairs = torch.add(*fours.unbind(0))
+    return reduce(torch.add, torch.add(*pairs.unbind(0)).unbind(0))
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.cone_track import HISTORY, recent_mean
 from coil_rl.envs.recordings import Recording, read_recording
-from coil_rl.envs.sight import SAMPLES, SIGHT, to_car, to_world
+from coil_rl.envs.sight import SAMPLES, SIGHT, Frame
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
 AnyPath = str | os.PathLike[str]
@@ -208,7 +208,8 @@ class McapReplayEnv(EnvBase):
         before = self._shown()
         self.steps = self.steps + 1
         if self.moves:
-            self.memory.samples = to_car(self._place(self._shown()), to_world(self._place(before), self.memory.samples))
+            then, now = Frame(self._place(before)), Frame(self._place(self._shown()))
+            self.memory.samples = now.to_car(then.to_world(self.memory.samples))
         out = self._tensordict(self._see(), roughness)
         out["reward"] = out["info", "reward", "smooth"]
         over = (self.steps >= self.length).unsqueeze(-1)

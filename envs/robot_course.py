@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from coil_rl.envs.sight import to_car
+from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES, Track, TrackError
 
 Array = NDArray[np.float64]
@@ -102,7 +102,7 @@ class RobotCourse:
             [B] m, zero or less is a crash; and how far their middles are from the left and the right boundary, [2, B].
         """
         stand, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
-        beyond = to_car(pose, stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
+        beyond = Frame(pose).to_car(stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
         to_cone = (beyond.clamp(min=0).norm(dim=0) - radius).amin(0)
         place = pose[:2].unsqueeze(-1)
         to_boundaries = torch.stack([(line[:, track] - place).norm(dim=0).amin(-1) for line in self.boundaries])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from coil_rl.envs.constants import constant, flat_index
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, slots_in_use
 
@@ -33,41 +34,51 @@ class View:
         count: [2, B], how many of the K are real.
         real: [K, 2, B], 1 for those, else 0.
         place: [K, 2, B] integers, which candidate each one is.
+        index: [K * 2 * B], the same in the candidates once they are flattened.
     """
 
     cones: Tensor
     count: Tensor
     real: Tensor
     place: Tensor
+    index: Tensor
 
 
-def to_car(pose: Tensor, points: Tensor) -> Tensor:
-    """World points [2, ..., B] m as the car at pose [3, B] sees them (x ahead, y left): [2, ..., B] m."""
-    x, y = points[0] - pose[0], points[1] - pose[1]
-    cos, sin = pose[2].cos(), pose[2].sin()
-    return torch.stack([torch.addcmul(cos * x, sin, y), torch.addcmul(cos * y, sin, x, value=-1)])
+class Frame:
+    """The coordinates in which cars see the world: x ahead, y to the left.
 
+    Args:
+        pose: of the cars, [3, B]: m, m, radians.
 
-def to_world(pose: Tensor, points: Tensor) -> Tensor:
-    """The inverse of `to_car`."""
-    x, y = points
-    cos, sin = pose[2].cos(), pose[2].sin()
-    return torch.stack([torch.addcmul(cos * x, sin, y, value=-1) + pose[0], torch.addcmul(cos * y, sin, x) + pose[1]])
-
-
-def polar(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Distance and angle from the x axis in rad, as `hypot` and `atan2` have them, but for 0 at the origin.
-
-    On a CPU those two round differently at the end of a tensor, and a car would depend on how many others there are.
+    Example:
+        >>> frame = Frame(torch.tensor([[1.0], [2.0], [0.0]]))
+        >>> frame.to_car(torch.tensor([[1.0], [5.0]])).flatten().tolist()
+        [0.0, 3.0]
     """
-    distance = torch.addcmul(x * x, y, y).sqrt_()
-    acute = (y / (distance + x.abs()).clamp_(min=torch.finfo(x.dtype).tiny)).atan_() * 2
-    obtuse = torch.full_like(y, math.pi).copysign_(y) - acute
-    return distance, torch.lerp(acute, obtuse, x.clone().lt_(0))
+
+    def __init__(self, pose: Tensor) -> None:
+        self.position, heading = pose[:2], pose[2]
+        self.cos = heading.cos()
+        self.turn = heading.sin() * constant((1, -1), self.position)
+
+    def to_car(self, points: Tensor) -> Tensor:
+        """World points [2, ..., B] m as the cars see them: [2, ..., B] m."""
+        position, turn = self._beside(points)
+        offset = points - position
+        return torch.addcmul(self.cos * offset, turn, offset.flip(0))
+
+    def to_world(self, points: Tensor) -> Tensor:
+        """The inverse of `to_car`."""
+        position, turn = self._beside(points)
+        return torch.addcmul(self.cos * points, turn, points.flip(0), value=-1) + position
+
+    def _beside(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        shape = (2, *[1] * (points.ndim - 2), -1)
+        return self.position.view(shape), self.turn.view(shape)
 
 
-def ahead(x: Tensor, square: Tensor, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> Tensor:
-    """1 where a point lies within the field of view, else 0.
+def room_ahead(x: Tensor, square: Tensor, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> Tensor:
+    """How far within the field of view a point lies, in m^2; less than 0 if it does not.
 
     Args:
         x: how far ahead of the car it is, m.
@@ -75,7 +86,7 @@ def ahead(x: Tensor, square: Tensor, half_field_of_view: float = HALF_FIELD_OF_V
         half_field_of_view: radians to either side, at most pi / 2.
     """
     # Not behind the car, so x |x| instead of the square of x.
-    return torch.addcmul(square * -(math.cos(half_field_of_view) ** 2), x, x.abs()).ge_(0)
+    return torch.add(x * x.abs(), square, alpha=-(math.cos(half_field_of_view) ** 2))
 
 
 def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: float = HALF_FIELD_OF_VIEW) -> View:
@@ -87,16 +98,17 @@ def view(local: Tensor, kept: int, sight: float = SIGHT, half_field_of_view: flo
         sight: m.
         half_field_of_view: radians, at most pi / 2.
     """
-    x, y = local
+    x, y = local.unbind(0)
     square = torch.addcmul(x * x, y, y)
-    visible = square.clone().le_(sight**2).mul_(ahead(x, square, half_field_of_view))
-    count = visible.sum(0).clamp_(max=kept)
+    room = torch.minimum(constant(sight**2, x) - square, room_ahead(x, square, half_field_of_view))
+    hidden = room.lt_(constant(0, x))
+    count = (constant(len(x), x) - hidden.sum(0)).clamp_(max=kept)
     kept = slots_in_use(count, min(kept, len(x)))
-    slots = torch.arange(kept, dtype=x.dtype, device=x.device).view(-1, 1, 1)
-    real = (count - slots).clamp_(0, 1)
-    place = smallest(square, visible, kept)
-    cones = local.flatten(1).index_select(1, flat_index(place)).view(2, *place.shape) * real
-    return View(cones, count, real, place)
+    real = (count - constant(range(kept), x)).clamp_(0, 1)
+    place = smallest(square, hidden, kept)
+    index = flat_index(place)
+    cones = local.flatten(1).index_select(1, index).view(2, *place.shape) * real
+    return View(cones, count, real, place, index)
 
 
 def boundary_samples(cones: Tensor, count: Tensor, fit: Fit) -> Tensor:
@@ -124,13 +136,12 @@ def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
     Returns:
         [B, 20]: r1, theta1, ..., r10, theta10, left side first.
     """
-    distance, angle = polar(*samples)
-    both = torch.stack([distance * (2 / sight) - 1, angle * (1 / WIDEST_ANGLE)]).clamp_(-1, 1) * known
-    return both.permute(2, 1, 0, 3).reshape(-1, known.shape[-1]).t()
-
-
-def flat_index(place: Tensor) -> Tensor:
-    """Rows [K, *batch] of a tensor [N, *batch] as places in it once it is flattened, [K * batch]."""
-    columns = place[0].numel()
-    column = torch.arange(columns, dtype=place.dtype, device=place.device).view(place.shape[1:])
-    return torch.add(column, place, alpha=columns).flatten()
+    x, y = samples.transpose(1, 2).unbind(0)
+    distance = torch.addcmul(x * x, y, y).sqrt_()
+    # Half the angle by its tangent, which is exact as far as the angle is not clipped. `atan2` would round differently
+    # at the end of a tensor. The term of 1e-30 keeps a sample straight behind the car behind it.
+    tangent = torch.add(y, distance - x, alpha=1e-30) / (distance + x).clamp_(min=torch.finfo(x.dtype).tiny)
+    both = torch.stack([distance, tangent.atan_()], 2)
+    low, scale = constant((-1, 0), known), constant((2 / sight, 2 / WIDEST_ANGLE), known)
+    both = torch.addcmul(low, both, scale).clamp_(-1, 1) * known.view(2, 1, 1, -1)
+    return both.view(-1, known.shape[-1]).t()

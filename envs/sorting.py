@@ -1,7 +1,7 @@
-"""The smallest few entries of each column, by a sorting network.
+"""The smallest few entries of each column.
 
-PyTorch's sort takes tens of microseconds a car here. A network of minima and maxima is the same few operations for all
-columns at once, whatever is in them.
+PyTorch picks them column by column, which takes it up to a microsecond each. A network of minima and maxima is the same
+operations for all columns at once, whatever is in them: dozens of them, which pays where columns are many.
 """
 
 from __future__ import annotations
@@ -9,11 +9,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from coil_rl.envs.constants import constant
+
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
 _BEHIND = 1e12
+_FEW = 16_384  # entries, up to which the network is the slower way
 
 
-def smallest(values: Tensor, wanted: Tensor, kept: int) -> Tensor:
+def smallest(values: Tensor, unwanted: Tensor, kept: int) -> Tensor:
     """Where the smallest wanted entries of each column are, smallest first.
 
     Non-negative floating-point numbers order like the integers that their bits spell, so each entry's row is put in
@@ -23,31 +26,37 @@ def smallest(values: Tensor, wanted: Tensor, kept: int) -> Tensor:
 
     Args:
         values: [N, *batch], from 0 to 1e12.
-        wanted: [N, *batch], 1 or 0.
+        unwanted: [N, *batch], 1 or 0.
         kept: how many to return, at most N.
 
     Returns:
         Rows, [kept, *batch] int32 (int64 for float64). Where fewer are wanted, the others follow in no order.
     """
     wires = 1 << max(1, (len(values) - 1).bit_length())
-    batch = values.shape[1:]
     integer = _BITS[values.dtype]
-    rows = torch.arange(len(values), dtype=integer, device=values.device).view(-1, *[1] * len(batch))
-    keys = torch.add(values, 1 - wanted, alpha=_BEHIND).view(integer).bitwise_and_(-wires).bitwise_or_(rows)
-    if wires > len(values):
-        keys = torch.cat([keys, keys.new_full((wires - len(values), *batch), torch.iinfo(integer).max)])
-    return _sorted(keys.view(wires, -1), kept)[:kept].view(kept, *batch).bitwise_and_(wires - 1)
+    rows = constant(range(len(values)), values, integer)
+    keys = torch.add(values, unwanted, alpha=_BEHIND).view(integer)
+    keys = keys.bitwise_and_(constant(-wires, rows)).bitwise_or_(rows)
+    if kept == 1:
+        first = keys.amin(0, keepdim=True)
+    elif keys.device.type == "cpu" and keys.numel() <= _FEW and not torch.compiler.is_compiling():
+        first = keys.topk(kept, 0, largest=False).values
+    else:
+        first = _sorted(keys, wires, kept)
+    return first.bitwise_and_(constant(wires - 1, rows))
 
 
-def _sorted(keys: Tensor, kept: int) -> Tensor:
-    """Sort each column of [wires, N] by Batcher's bitonic merges; rows beyond the first `kept` may be missing.
+def _sorted(keys: Tensor, wires: int, kept: int) -> Tensor:
+    """The first `kept` rows of [N, *batch] sorted by Batcher's bitonic merges of `wires` rows, a power of two.
 
     Two neighbouring sorted runs become one by comparing the first with the reversed second, which parts them into a
     smaller and a larger half, and by parting each half likewise down to single wires. A larger half that lies beyond
     `kept` is dropped.
     """
-    if kept == 1:
-        return keys.amin(0, keepdim=True)
+    batch = keys.shape[1:]
+    if wires > len(keys):
+        keys = torch.cat([keys, keys.new_full((wires - len(keys), *batch), torch.iinfo(keys.dtype).max)])
+    keys = keys.view(wires, -1)
     run = 1
     while run < len(keys):
         first, second = keys.view(-1, 2, run, keys.shape[1]).unbind(1)
@@ -60,7 +69,7 @@ def _sorted(keys: Tensor, kept: int) -> Tensor:
         while part:
             keys = _parted(*keys.view(-1, 2, part, keys.shape[1]).unbind(1))
             part //= 2
-    return keys
+    return keys[:kept].view(kept, *batch)
 
 
 def _parted(first: Tensor, second: Tensor) -> Tensor:

@@ -23,6 +23,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from coil_rl.envs.constants import constant, flat_index
+
 __all__ = [
     "SelfEvolvingSpline",
     "Spline",
@@ -70,36 +72,39 @@ class Spline:
         """Evaluate at parameters u: [S, *batch], m, clamped to [0, length]; returns [D, S, *batch], m."""
         return self._at(torch.minimum(u.clamp(min=0), self.length))
 
+    def along(self, share: Tensor) -> Tensor:
+        """Evaluate at shares of the length: [S, *batch], from 0 to 1; returns [D, S, *batch], m."""
+        return self._at(self.length * share)
+
     def equidistant(self, samples: int) -> Tensor:
         """Evaluate from first to last point in equal steps of the parameter: [D, samples, *batch], m."""
-        steps = torch.linspace(0, 1, samples, dtype=self.knots.dtype, device=self.knots.device)
-        return self._at(self.length * _column(steps, self.knots))
+        ends = self.values[:, :1], self.values[:, -1:]
+        if samples <= 2:
+            return torch.cat(ends[:samples], 1)
+        inner = constant(tuple(k / (samples - 1) for k in range(1, samples - 1)), self.knots)
+        return torch.cat([ends[0], self.along(inner), ends[1]], 1)
 
     def _at(self, u: Tensor) -> Tensor:
-        rows = self.knots[0].numel()
+        dim, rows = len(self.values), self.knots[0].numel()
         # Strictly below, so that the end of the spline falls into the last real interval, never into padding.
         inner = self.knots.detach()[1:-1].unsqueeze(1)
         below = torch.gt(u.detach(), inner, out=u.new_empty(len(inner), *u.shape))
-        row = torch.arange(rows, device=u.device, dtype=torch.int32).view(u.shape[1:])
-        start = torch.add(row, below.sum(0).int(), alpha=rows).flatten()
-        ends = (start, start + rows)
+        start = flat_index(below.sum(0).long())
+        ends = torch.add(start, constant((0, rows), start.unsqueeze(0))).flatten()
+        x0, x1 = self.knots.flatten().index_select(0, ends).view(2, *u.shape).unbind(0)
+        y0, y1 = self.values.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
+        g0, g1 = self.bends.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
 
-        dim = len(self.values)
-        x0, x1 = (self.knots.flatten().index_select(0, end).view(u.shape) for end in ends)
-        y0, y1 = (self.values.flatten(1).index_select(1, end).view(dim, *u.shape) for end in ends)
-        g0, g1 = (self.bends.flatten(1).index_select(1, end).view(dim, *u.shape) for end in ends)
-        width = x1 - x0
+        width, before, after = x1 - x0, u - x0, x1 - u
         # Real intervals are far wider than eps (see _chords); only a spline of one point or none has width 0.
-        t = (u - x0) / width.clamp(min=torch.finfo(u.dtype).eps)
-        s, area = 1 - t, width * width
-        chord = torch.addcmul(s * y0, t, y1)
-        return torch.addcmul(torch.addcmul(chord, area * self._sag(s), g0), area * self._sag(t), g1)
-
-    def _sag(self, t: Tensor) -> Tensor:
-        """Deviation from the chord at fraction t that a bend of 1 at the end t = 1 makes, unit interval."""
+        t = before / width.clamp(min=torch.finfo(u.dtype).eps)
+        chord = torch.lerp(y0, y1, t)
         if self.degree == 3:
-            return (t * t * t - t) / 6
-        return ((2 * t - 1).clamp(min=0).square() - t) / 8
+            return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
+        # Halfway the one end's bend gives way to the other's.
+        early, late = (after - before).clamp(min=0).square(), (before - after).clamp(min=0).square()
+        sag = torch.addcmul((early - width * after) * g0, late - width * before, g1)
+        return torch.add(chord, sag, alpha=1 / 8)
 
 
 def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
@@ -125,21 +130,21 @@ def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     real, knots, step, h = _chords(points, count)
     per_m = h.reciprocal()
     # With R = tridiag(h/6, (h+h)/3, h/6) and Q's columns (1/h, -1/h - 1/h', 1/h'), scaled by sqrt(smoothing):
-    side = per_m * math.sqrt(smoothing)
-    middle = side[:-1] + side[1:]
-    square = side * side
-    span = h[:-1] + h[1:]
-    diagonal = span / 3 + square[:-1] + square[1:] + middle * middle
-    near = h[1:-1] / 6 - side[1:-1] * (middle[:-1] + middle[1:])
-    far = side[1:-2] * side[2:-1]
-    bends = _solve(diagonal, near, far, _turns(step, per_m), real[2:], span / 4)
+    side = per_m * constant(math.sqrt(smoothing), h)
+    left, right = side[:-1], side[1:]
+    middle, far, span = left + right, left * right, h[:-1] + h[1:]
+    # The squares of the three add up to twice this, less its sign.
+    squares = torch.addcmul(far, middle, middle, value=-1)
+    diagonal = torch.add(span * constant(1 / 3, h), squares, alpha=-2)
+    near = torch.addcmul(h[1:-1] * constant(1 / 6, h), side[1:-1], middle[:-1] + middle[1:], value=-1)
+    bends = _solve(diagonal, near, far[1:-1], _turns(step, per_m), real[2:-1], span * constant(1 / 4, h))
 
     # The third derivative of each interval: its jumps at the knots are the pull of the points, Q g.
     jerk = (bends[:, 1:] - bends[:, :-1]) * per_m
     values = points.clone()
     values[:, :-1].sub_(jerk, alpha=smoothing)
     values[:, 1:].add_(jerk, alpha=smoothing)
-    return Spline(knots, _hold(values, count, real), bends, 3)
+    return Spline(knots, _hold(values, real), bends, 3)
 
 
 def quadratic_spline(points: Tensor, count: Tensor) -> Spline:
@@ -161,13 +166,12 @@ def quadratic_spline(points: Tensor, count: Tensor) -> Spline:
     real, knots, step, h = _chords(points, count)
     span = h[:-1] + h[1:]
     # No break in the first and last interval: the outer bend there equals its neighbour and joins its term.
-    outside = torch.zeros_like(real[:1])
-    first, last = torch.cat([h[:1], 0 * h[1:-1]]), h[1:] * (1 - torch.cat([real[3:], outside]))
+    first, last = torch.cat([h[:1], 0 * h[1:-1]]), h[1:] * (1 - real[3:])
     diagonal = (3 * span + first + last) / 8
     far, turns = torch.zeros_like(h[3:]), _turns(step, h.reciprocal())
-    bends = _solve(diagonal, h[1:-1] / 8, far, turns, real[2:], span / 4)
-    inner = _hold(bends, count - 1, torch.cat([real[1:], outside]))
-    return Spline(knots, _hold(points, count, real), torch.cat([inner[:, 1:2], inner[:, 1:]], 1), 2)
+    bends = _solve(diagonal, h[1:-1] / 8, far, turns, real[2:-1], span / 4)
+    inner = _hold(bends, torch.cat([real[1:], real[-1:]]))
+    return Spline(knots, _hold(points, real), torch.cat([inner[:, 1:2], inner[:, 1:]], 1), 2)
 
 
 def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
@@ -186,7 +190,8 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     Raises:
         ValueError: for shapes that do not fit.
     """
-    real, knots, _, h = _chords(points, count)
+    known, knots, _, h = _chords(points, count)
+    real = known[:-1]
     n = count.clamp(min=1).to(points.dtype)
     two, three = ((count - k).clamp(0, 1).to(points.dtype) for k in (1, 2))
     scale = torch.maximum(knots[-1], h[0])
@@ -205,7 +210,7 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     c1 = (_total(left * p1, 1) / n1).unsqueeze(1)
     c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
     fitted = origin + (c0 + c1 * p1 + c2 * p2)
-    return Spline(knots, _hold(fitted, count, real), (2 * c2 / scale.square()).expand_as(points), 2)
+    return Spline(knots, _hold(fitted, known), (2 * c2 / scale.square()).expand_as(points), 2)
 
 
 class SelfEvolvingSpline(nn.Module):
@@ -271,7 +276,7 @@ class SelfEvolvingSpline(nn.Module):
         if points.shape != (dim, len(mask), *batch) or mask.shape[1:] != self.count.shape:
             given = f"points {list(points.shape)} and mask {list(mask.shape)}"
             raise ValueError(f"{given} must be [{dim}, M, *{batch}] and [M, *{batch}]")
-        slots = _column(torch.arange(capacity, device=mask.device), mask)
+        slots = constant(range(capacity), mask, torch.int64)
         known = torch.cat([slots < self.count, mask.bool()])
         place = known.long().cumsum(0)
         surplus = (place[-1] - capacity).clamp(min=0)
@@ -302,33 +307,29 @@ def slots_in_use(count: Tensor, slots: int) -> int:
     return min(slots, max(2, int(count.max())))
 
 
-def _column(x: Tensor, like: Tensor) -> Tensor:
-    """View x: [K] so that it broadcasts against like: [any, *batch]."""
-    return x.view(-1, *[1] * (like.ndim - 1))
-
-
 def _total(x: Tensor, dim: int) -> Tensor:
     """Sum in order: `Tensor.sum` adds in an order that depends on the size of the batch."""
     return reduce(torch.add, x.unbind(dim))
 
 
 def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Which slots are real, 1 or 0 [K, *batch], knots [K, *batch], steps [D, K-1, *batch], their lengths, m.
+    """Which slots are real, 1 or 0 [K+1, *batch], knots [K, *batch], steps [D, K-1, *batch], their lengths, m.
 
-    Lengths have a floor, eps^(1/3) of 1 m and the longest step (1 cm in float32, 10 um in float64), so that
-    points on one another keep every quotient finite and Q'Q its digits. The floor also holds in the padding,
-    where the steps are 0.
+    The last of the K+1 is never real. Lengths have a floor, eps^(1/3) of 1 m and the longest step (1 cm in float32,
+    10 um in float64), so that points on one another keep every quotient finite and Q'Q its digits. The floor also
+    holds in the padding, where the steps are 0.
     """
     if points.ndim < 2 or points.shape[1] < 2 or points.shape[2:] != count.shape:
         given = f"points {list(points.shape)} and count {list(count.shape)}"
         raise ValueError(f"{given} must be [D, K, *batch] and [*batch], K >= 2")
-    slots = torch.arange(points.shape[1], dtype=points.dtype, device=points.device)
-    real = (count.to(points.dtype) - _column(slots, points[0])).clamp(0, 1)
-    step = (points[:, 1:] - points[:, :-1]) * real[1:]
+    real = (count - constant(range(points.shape[1] + 1), points[0])).clamp_(0, 1)
+    second = real[1:-1]
+    step = (points[:, 1:] - points[:, :-1]) * second
     square = _total(step * step, 0)
     longest = square.amax(0)
-    h = torch.maximum(square, (longest + 1) * torch.finfo(points.dtype).eps ** (2 / 3)).sqrt()
-    travelled = accumulate((h * real[1:]).unbind(0), torch.add, initial=torch.zeros_like(longest))
+    floor = torch.finfo(points.dtype).eps ** (2 / 3)
+    h = torch.maximum(square, torch.add(constant(floor, square), longest, alpha=floor)).sqrt()
+    travelled = accumulate((h * second).unbind(0), torch.add, initial=torch.zeros_like(longest))
     return real, torch.stack(list(travelled)), step, h
 
 
@@ -338,10 +339,10 @@ def _turns(step: Tensor, per_m: Tensor) -> Tensor:
     return slope[:, 1:] - slope[:, :-1]
 
 
-def _hold(x: Tensor, count: Tensor, real: Tensor) -> Tensor:
-    """Repeat the last real entry of x: [D, K, *batch] in the padding; zeros if there is none."""
-    last = (count.long() - 1).clamp(min=0).expand_as(x[:, :1])
-    return torch.addcmul((x.gather(1, last) * real[0]) * (1 - real), x, real)
+def _hold(x: Tensor, real: Tensor) -> Tensor:
+    """Repeat the last real entry of x: [D, K, *batch] in the padding; zeros if there is none. real is [K+1, *batch]."""
+    real, last = real[:-1], real[:-1] - real[1:]
+    return torch.lerp((x * last).sum(1, keepdim=True), x, real)
 
 
 def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Tensor, least: Tensor) -> Tensor:
@@ -359,24 +360,33 @@ def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Ten
     Returns:
         [D, K, *batch], with zeros in the first and the last slot.
     """
-    zero, none = torch.zeros_like(least.sum(0)), torch.zeros_like(turns.sum(1))
-    fars = [zero, zero, *far.unbind(0), zero, zero]
-    nears = [*near.unbind(0), zero]
-    # Entry -1 belongs to the slot before, -2 to the one before that. Zeros stand in for what is not there.
-    upper, lower, lowest, right, inverse = zero, [zero], [zero, zero], [none, none], []
-    for i, (pivot, turn) in enumerate(zip(diagonal.unbind(0), turns.unbind(1), strict=True)):
-        pivot = _less(_less(pivot, upper, lower[-1]), fars[i], lowest[-2])
-        turn = _less(_less(turn, lower[-1], right[-1]), lowest[-2], right[-2])
-        upper = _less(nears[i], lower[-1], fars[i + 1])
+    nears, fars = list(near.unbind(0)), far.unbind(0)
+    lower, lowest, right, inverse = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()
+    rows = zip(diagonal.unbind(0), turns.unbind(1), real.unbind(0), least.unbind(0), strict=True)
+    for i, (pivot, turn, takes_part, floor) in enumerate(rows):
+        if i > 0:
+            pivot, turn = _less(pivot, nears[i - 1], lower[i - 1]), _less(turn, lower[i - 1], right[i - 1])
+        if i > 1:
+            pivot, turn = _less(pivot, fars[i - 2], lowest[i - 2]), _less(turn, lowest[i - 2], right[i - 2])
         # An inverse of 0 takes the unknown out of its own row and, through L, out of all others.
-        inverse.append(real[i] / torch.maximum(pivot, least[i]))
-        lower.append(upper * inverse[-1])
-        lowest.append(fars[i + 2] * inverse[-1])
+        inverse.append(takes_part / torch.maximum(pivot, floor))
         right.append(turn)
-    bends = [none, none]
-    for turn, factor, one, two in zip(right[:1:-1], inverse[::-1], lower[:0:-1], lowest[:1:-1], strict=True):
-        bends.append(_less(_less(turn * factor, one, bends[-1]), two, bends[-2]))
-    return torch.stack([none, *bends[:0:-1]], 1)
+        if 0 < i < len(nears):
+            nears[i] = _less(nears[i], lower[i - 1], fars[i - 1])
+        if i < len(nears):
+            lower.append(nears[i] * inverse[i])
+        if i < len(fars):
+            lowest.append(fars[i] * inverse[i])
+    none = torch.zeros_like(turns.sum(1))
+    bends = [none]
+    for i in reversed(range(len(right))):
+        bend = right[i] * inverse[i]
+        if i < len(lower):
+            bend = _less(bend, lower[i], bends[-1])
+        if i < len(lowest):
+            bend = _less(bend, lowest[i], bends[-2])
+        bends.append(bend)
+    return torch.stack([none, *bends[:0:-1], none], 1)
 
 
 def _less(x: Tensor, a: Tensor, b: Tensor) -> Tensor:

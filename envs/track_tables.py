@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
-from torch import Tensor, nn
 
 from coil_rl.envs.track import Track
 
@@ -19,48 +18,35 @@ FAR = 3.0  # m: the distances stop here, wider than any track
 Corner = tuple[float, float]  # m
 
 
-class Grid(nn.Module):
-    """Square cells over each of several areas, numbered through, with one number looked up per cell.
+class Grid:
+    """Square cells over each of several areas, numbered through, each named by its lower left corner.
 
     Args:
         lows: lower left corner of each area, [T, 2] m.
         highs: upper right corner of each area, [T, 2] m.
         cell: edge of a cell in m.
+        dtype: the precision of the corners.
+
+    Attributes:
+        low: [2, T] m, the corners where the areas begin.
+        last: [2, T], the last column and row of an area in which a position can be.
+        columns: [T], of an area.
+        offset: [T], the number of an area's first cell.
     """
 
-    low: Tensor
-    last: Tensor
-    columns: Tensor
-    offset: Tensor
-
     def __init__(self, lows: NDArray[np.float64], highs: NDArray[np.float64], cell: float, dtype: torch.dtype) -> None:
-        super().__init__()
         self.cell = cell
         shape = np.ceil((highs - lows) / cell).astype(np.int64) + 1
         sizes = shape.prod(axis=1)
-        self.register_buffer("low", torch.as_tensor(lows.T.copy(), dtype=dtype), persistent=False)
-        self.register_buffer("last", torch.as_tensor(shape.T - 2, dtype=dtype), persistent=False)
-        self.register_buffer("columns", torch.as_tensor(shape[:, 0]), persistent=False)
-        self.register_buffer("offset", torch.as_tensor(np.cumsum(sizes) - sizes), persistent=False)
+        self.low = torch.as_tensor(lows.T, dtype=dtype).double().numpy()
+        self.last = shape.T - 2
+        self.columns, self.offset = shape[:, 0], np.cumsum(sizes) - sizes
 
     def nodes(self, track: int) -> NDArray[np.float64]:
         """The lower left corners of one area's cells, [cells, 2] m, in the order of their numbers."""
-        low = self.low[:, track].double().numpy()
-        columns, rows = (int(last) + 2 for last in self.last[:, track])
-        x, y = low[0] + self.cell * np.arange(columns), low[1] + self.cell * np.arange(rows)
+        (x, y), (columns, rows) = self.low[:, track], self.last[:, track] + 2
+        x, y = x + self.cell * np.arange(columns), y + self.cell * np.arange(rows)
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-
-    def locate(self, track: Tensor, position: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Number of the cell, its area's columns, and where in the cell ([2, B], 0 to 1) each position [2, B] lies.
-
-        A position outside its area counts as the nearest cell.
-        """
-        at = (position - self.low.index_select(1, track)) / self.cell
-        corner = torch.minimum(at.floor().clamp_(min=0), self.last.index_select(1, track))
-        column, row = corner.long().unbind(0)
-        columns = self.columns.index_select(0, track)
-        number = torch.addcmul(self.offset.index_select(0, track) + column, row, columns)
-        return number, columns, (at - corner).clamp_(0, 1)
 
 
 class Nearby(NamedTuple):

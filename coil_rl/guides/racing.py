@@ -81,20 +81,20 @@ class RacingGuide(SplineGuide):
     def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
         """Advise a steering; arguments and result are those of `SplineGuide`."""
         plan = self.plan(cones, cone_count)
-        wanted, square = plan.wanted, plan.square.clamp(min=TARGET_REACHED**2)
+        barred, square = plan.barred, plan.square.clamp(min=TARGET_REACHED**2)
         # What the car does at full steering is the sharpest arc.
         full = math.radians(self.max_steering)
         sine = (plan.targets[1] / square * (2 * self.turn * self.car_length)).clamp(-math.sin(full), math.sin(full))
-        clear = wanted * self._clear(sine / self.car_length, square.sqrt(), cones, cone_count)
-        some = clear.amax(0)
+        unclear = torch.maximum(barred, self._barred(sine / self.car_length, square.sqrt(), cones, cone_count))
+        none = unclear.amin(0)
         # Farthest first of those that are clear, else nearest first.
-        order = torch.lerp(square, square.reciprocal(), some)
-        best = pick(sine.unsqueeze(0), order, torch.lerp(wanted, clear, some)).squeeze(0)
+        order = torch.lerp(square.reciprocal(), square, none)
+        best = pick(sine.unsqueeze(0), order, torch.lerp(unclear, barred, none)).squeeze(0)
         advice = best.asin() / full
-        return torch.where(wanted.amax(0) > 0, advice, steering.squeeze(-1)).unsqueeze(-1)
+        return torch.where(barred.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
-    def _clear(self, curvature: Tensor, distance: Tensor, cones: Tensor, count: Tensor) -> Tensor:
-        """Whether arcs keep clear of the cones.
+    def _barred(self, curvature: Tensor, distance: Tensor, cones: Tensor, count: Tensor) -> Tensor:
+        """Which arcs do not keep clear of the cones.
 
         Args:
             curvature: [T, B] 1/m, positive to the left.
@@ -103,7 +103,7 @@ class RacingGuide(SplineGuide):
             count: [B, 2].
 
         Returns:
-            [T, B], 1 or 0; 0 as well for a target beyond the lookahead.
+            [T, B], 1 or 0; 1 as well for a target beyond the lookahead.
         """
         x, y = cones[:, :, : slots_in_use(count, cones.shape[2])].permute(3, 2, 1, 0)
         slot = torch.arange(len(x), dtype=x.dtype, device=x.device).view(-1, 1, 1)
@@ -114,4 +114,4 @@ class RacingGuide(SplineGuide):
         lever = (square - self.margin**2) * side
         bend, reach = (value.unsqueeze(1).unsqueeze(1) for value in (curvature, (distance + self.margin).square()))
         barred = torch.gt(bend * lever, room).logical_and_(square <= reach)
-        return ~barred.flatten(1, 2).any(1) * distance.le(self.lookahead).to(distance.dtype)
+        return barred.flatten(1, 2).any(1).logical_or_(distance > self.lookahead).to(distance.dtype)

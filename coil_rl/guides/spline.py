@@ -13,7 +13,8 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from coil_rl.envs.sight import ahead, flat_index, polar
+from coil_rl.envs.constants import constant, flat_index
+from coil_rl.envs.sight import room_ahead
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
 
@@ -29,9 +30,9 @@ class Plan(NamedTuple):
         midpoints: of close left-right pairs, nearest first, [2, M, B].
         pairs: how many of them are real, [B].
         path: the spline through them.
-        targets: along the path, [2, T, B].
+        targets: along the path, [2, T, B]; a shorter path repeats its last.
         square: of their distances, [T, B] m^2.
-        wanted: 1 for those ahead and not reached, else 0, [T, B].
+        barred: 0 for those ahead and not reached, else 1, [T, B].
     """
 
     midpoints: Tensor
@@ -39,7 +40,7 @@ class Plan(NamedTuple):
     path: Spline
     targets: Tensor
     square: Tensor
-    wanted: Tensor
+    barred: Tensor
 
 
 class SplineGuide(TensorDictModuleBase):
@@ -115,48 +116,48 @@ class SplineGuide(TensorDictModuleBase):
             [B, 1], fraction of `max_steering`.
         """
         plan = self.plan(cones, cone_count)
-        advice = self._pursuit(pick(plan.targets, plan.square, plan.wanted))
-        return torch.where(plan.wanted.amax(0) > 0, advice, steering.squeeze(-1)).unsqueeze(-1)
+        advice = self._pursuit(pick(plan.targets, plan.square, plan.barred))
+        return torch.where(plan.barred.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def plan(self, cones: Tensor, cone_count: Tensor) -> Plan:
         """The path and the targets on it; arguments are those of `steer`."""
-        midpoints, count = self._midpoints(cones, cone_count)
-        path = self.fit(midpoints, count)
-        steps = (path.polyline_length / self.spacing).round().clamp(1, self.targets - 1)
-        targets = slots_in_use(steps + 1, self.targets)
-        number = torch.arange(targets, device=steps.device, dtype=steps.dtype).unsqueeze(-1)
-        x, y = found = path.sample(path.length * (number / steps).clamp(max=1))
+        points, count = self._midpoints(cones, cone_count)
+        path = self.fit(points, count)
+        steps = (path.polyline_length / constant(self.spacing, points)).round_().clamp_(1, self.targets - 1)
+        targets = slots_in_use(steps, self.targets - 1) + 1
+        x, y = found = path.along((constant(range(targets), points[0]) / steps).clamp_(max=1))
         square = torch.addcmul(x * x, y, y)
-        wanted = square.clone().gt_(TARGET_REACHED**2).mul_(ahead(x, square)).mul_((count - 1).clamp(0, 1))
-        return Plan(midpoints, count, path, found, square, wanted)
+        room = torch.minimum(square - constant(TARGET_REACHED**2, square), room_ahead(x, square))
+        # One midpoint is no path.
+        room = torch.minimum(room, count - constant(2, count))
+        return Plan(points, count, path, found, square, room.lt_(constant(0, room)))
 
     def _pursuit(self, target: Tensor) -> Tensor:
-        """Equation 103 for targets [2, B] m: [B], fraction of `max_steering`."""
-        distance, angle = polar(*target)
-        # As exp and log, because a power rounds differently at the end of a tensor.
-        sharp = (distance.clamp(min=TARGET_REACHED).log() * -self.sharpness).exp()
-        advice = (angle * (180 / math.pi) * sharp).atan() * (2 * self.max_steering / math.pi)
-        return advice.clamp(-self.max_steering, self.max_steering) * (self.gain / self.max_steering)
+        """Equation 103 for targets [2, B] m that are ahead: [B], fraction of `max_steering`."""
+        x, y = target.unbind(0)
+        square = torch.addcmul(x * x, y, y).clamp_(min=TARGET_REACHED**2)
+        # As exp and log, because a power rounds differently at the end of a tensor, and so does `atan2`.
+        sharp = (square.log_() * constant(-self.sharpness / 2, square)).exp_()
+        alpha = (y / x.clamp(min=torch.finfo(x.dtype).tiny)).atan_() * constant(180 / math.pi, x)
+        beta = (alpha * sharp).atan_() * constant(self.gain * 2 / math.pi, x)
+        return beta.clamp_(-abs(self.gain), abs(self.gain))
 
     def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Midpoints of close left-right pairs, nearest first: [2, M, B] m, and how many there are [B]."""
         near = cones[:, :, : slots_in_use(count, self.cones)].permute(3, 2, 1, 0)
-        slot = torch.arange(near.shape[1], dtype=near.dtype, device=cones.device).view(-1, 1, 1)
-        real = (count.t() - slot).clamp_(0, 1)
+        real = (count.t() - constant(range(near.shape[1]), near[0])).clamp_(0, 1)
         # What is no cone lies apart from everything, so it makes no pair.
-        apart = torch.tensor([[-FAR], [FAR]], dtype=near.dtype, device=near.device)
-        (left_x, right_x), (left_y, right_y) = torch.lerp(apart, near[0], real).unbind(1), near[1].unbind(1)
-        left_x, left_y = left_x.unsqueeze(1), left_y.unsqueeze(1)
-        gap = torch.addcmul((left_x - right_x).square_(), left_y - right_y, left_y - right_y)
-        close = gap.lt_(PAIR_DISTANCE**2).flatten(0, 1)
-        x, y = (left_x + right_x).flatten(0, 1), (left_y + right_y).flatten(0, 1)
-        total = close.sum(0).clamp_(max=self.midpoints)
-        kept = slots_in_use(total, min(self.midpoints, len(x)))
-        nearest = flat_index(smallest(torch.addcmul(x * x, y, y), close, kept))
-        points = torch.stack([axis.flatten().index_select(0, nearest).view(kept, -1) for axis in (x, y)])
-        return points * 0.5, total
+        left, right = torch.lerp(constant((-FAR, FAR), near[0, 0]), near, real).unbind(2)
+        left, right = left.unsqueeze(2), right.unsqueeze(1)
+        apart = (left - right).square_().sum(0).ge_(constant(PAIR_DISTANCE**2, left)).flatten(0, 1)
+        middle = (left + right).flatten(1, 2)
+        total = (constant(len(apart), apart) - apart.sum(0)).clamp_(max=self.midpoints)
+        kept = slots_in_use(total, min(self.midpoints, len(apart)))
+        nearest = flat_index(smallest(middle.square().sum(0), apart, kept))
+        points = middle.flatten(1).index_select(1, nearest).view(2, kept, -1)
+        return points * constant(0.5, points), total
 
 
-def pick(targets: Tensor, order: Tensor, wanted: Tensor) -> Tensor:
-    """The first one wanted by order [T, B] of the targets [2, T, B]: [2, B]."""
-    return targets.flatten(1).index_select(1, flat_index(smallest(order, wanted, 1)))
+def pick(targets: Tensor, order: Tensor, barred: Tensor) -> Tensor:
+    """The first one by order [T, B] of the targets [2, T, B] that are not barred: [2, B]."""
+    return targets.flatten(1).index_select(1, flat_index(smallest(order, barred, 1)))

@@ -50,7 +50,7 @@ def places_of(plan: Plan, scale: float = 1.0) -> dict[str, Array]:
     """
     pairs = int(plan.pairs)
     some = None if pairs > 1 else 0
-    chosen = pick(plan.targets, plan.square, plan.wanted)[:, : int(plan.wanted.any())]
+    chosen = pick(plan.targets, plan.square, plan.barred)[:, : int(not plan.barred.all())]
     found = {
         "midpoint": plan.midpoints[:, :pairs, 0],
         "path": plan.path.equidistant(FINE)[:, :some, 0],

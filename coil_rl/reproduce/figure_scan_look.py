@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from coil_rl.envs import Perception, SimulatedDrive
 from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.clusters import Clusters, measure, points_of, single_linkage
-from coil_rl.envs.sight import to_car
+from coil_rl.envs.sight import Frame
 from coil_rl.envs.simulated_lidar import MOST
 from coil_rl.guides import SplineGuide
 from coil_rl.perception.labelling import majority
@@ -109,7 +109,7 @@ def look(drive: SimulatedDrive, scan: int, perception: Perception) -> Look:
         cone=cone,
         truly_thick=drive.thick.numpy()[cone] & (cone >= 0),
         visibility=np.where(cone >= 0, drive.visibility[scan].numpy()[cone], np.nan),
-        cones=rows(to_car(pose, drive.cones)),
+        cones=rows(Frame(pose.unsqueeze(-1)).to_car(drive.cones)),
         thick=drive.thick.numpy(),
         radius=drive.radius.double().numpy(),
         estimate=[rows(boundary[:, : FINE if valid[0, side] else 0, side, 0]) for side in (0, 1)],

@@ -13,7 +13,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import trange
 
 from coil_rl.envs import ConeTrackEnv, Track
-from coil_rl.envs.sight import to_car
+from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
@@ -89,12 +89,12 @@ def looks(track: Track, moments: Mapping[str, float]) -> list[Look]:
 def _look(
     name: str, seconds: float, track: Track, env: ConeTrackEnv, guide: SplineGuide, state: TensorDictBase
 ) -> Look:
-    pose = env.pose[:, 0].double()
+    frame = Frame(env.pose.double())
     cones, count = state["cones"], state["cone_count"]
     boundary = env.fit(cones.permute(3, 2, 1, 0), count.t()).equidistant(FINE)
 
     def from_car(points: Array) -> Array:
-        return rows(to_car(pose, torch.tensor(points.T)))
+        return rows(frame.to_car(torch.tensor(points.T)))
 
     return Look(
         name=name,
@@ -103,7 +103,7 @@ def _look(
         boundaries=[from_car(track.boundary(side, 0.1)) for side in SIDES],
         seen=[rows(cones[0, side, :n].t()) for side, n in enumerate(count[0].tolist())],
         estimate=[rows(boundary[:, : FINE if n > 1 else 0, side, 0]) for side, n in enumerate(count[0].tolist())],
-        samples=to_car(pose, env.samples[..., 0]).permute(2, 1, 0).double().numpy(),
+        samples=frame.to_car(env.samples)[..., 0].permute(2, 1, 0).double().numpy(),
         known=(env.sampled[:, 0] > 0).numpy(),
         observation=state["observation"][0].double().numpy(),
         plan=places_of(guide.plan(cones, count)),

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from coil_rl.envs.sight import View, boundary_samples, encode, polar, to_car, to_world, view
+from coil_rl.envs.sight import Frame, View, boundary_samples, encode, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 
 seeds = st.integers(0, 2**31)
@@ -117,7 +117,7 @@ def test_a_view_does_not_depend_on_the_other_cars() -> None:
 def test_left_of_the_car_is_positive() -> None:
     pose = torch.tensor([[1.0], [2.0], [math.pi / 2]], dtype=torch.float64)
     points = torch.tensor([[[1.0], [0.0]], [[5.0], [2.0]]], dtype=torch.float64)
-    assert to_car(pose, points).squeeze(-1).flatten().tolist() == pytest.approx([3, 0, 0, 1])
+    assert Frame(pose).to_car(points).squeeze(-1).flatten().tolist() == pytest.approx([3, 0, 0, 1])
 
 
 @given(seeds)
@@ -125,8 +125,9 @@ def test_to_world_undoes_to_car(seed: int) -> None:
     draw = torch.Generator().manual_seed(seed)
     pose = 20 * torch.randn(3, 7, dtype=torch.float64, generator=draw)
     points = 20 * torch.randn(2, 5, 2, 7, dtype=torch.float64, generator=draw)
-    assert torch.allclose(to_world(pose, to_car(pose, points)), points, rtol=0, atol=1e-12)
-    assert torch.allclose(to_car(pose, to_world(pose, points)), points, rtol=0, atol=1e-12)
+    frame = Frame(pose)
+    assert torch.allclose(frame.to_world(frame.to_car(points)), points, rtol=0, atol=1e-12)
+    assert torch.allclose(frame.to_car(frame.to_world(points)), points, rtol=0, atol=1e-12)
 
 
 def test_samples_become_distance_and_angle_from_left_to_right() -> None:
@@ -168,13 +169,15 @@ def test_boundary_samples_of_a_straight_row_lie_evenly_on_it(fit) -> None:
 
 
 @both_dtypes
-def test_polar_coordinates_are_those_of_hypot_and_atan2(dtype: torch.dtype) -> None:
+def test_observations_are_hypot_and_atan2_up_to_seven_metres_and_120_degrees(dtype: torch.dtype) -> None:
     line = torch.tensor([-7.0, -1.0, -1e-6, -0.0, 0.0, 1e-6, 0.5, 3.0], dtype=dtype)
     x, y = torch.meshgrid(line, line, indexing="ij")
-    distance, angle = polar(x, y)
-    assert torch.allclose(distance, torch.hypot(x, y))
-    assert torch.allclose(angle[distance > 0], torch.atan2(y, x)[distance > 0])
-    assert angle[distance == 0].eq(0).all()
+    samples = torch.stack([x, y]).view(2, 1, 1, -1).expand(2, 5, 2, -1)
+    distance, angle = encode(samples, torch.ones(2, 64, dtype=dtype)).view(64, 10, 2)[:, 7].unbind(-1)
+    known = torch.atan2(y, x).flatten() * (x != 0).logical_or(y != 0).flatten()
+    assert torch.allclose(distance, (torch.hypot(x, y).flatten() * 2 / 7 - 1).clamp(-1, 1))
+    # Straight behind the car is left of it.
+    assert torch.allclose(angle, (known.where(y.flatten() != 0, known.abs()) / math.radians(120)).clamp(-1, 1))
 
 
 @both_dtypes

@@ -43,11 +43,12 @@ def visible(pose: Array, ring: Array) -> Array:
 
 
 def candidates(world: TrackMap, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-    return world.candidates(track, world.cell(track, pose[:2]), pose[2])
+    return world.candidates(world.locate(track, pose[:2]), pose[2])
 
 
 def clearances(world: TrackMap, track: Tensor, position: Tensor) -> Tensor:
-    return world.clearance(track, world.cell(track, position), position)
+    place = world.locate(track, position)
+    return world.clearance(place, world.to_boundaries(place))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

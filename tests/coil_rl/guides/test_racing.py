@@ -72,7 +72,7 @@ def test_an_arc_is_clear_if_each_cone_is_on_its_side_and_no_nearer_than_the_marg
     some, count = seen["cones"][::10].double(), seen["cone_count"][::10]
     curvature = draw.uniform(-0.49, 0.49, (6, len(some)))
     curvature[0], distance = 0, draw.uniform(1, 8, curvature.shape)
-    ours = guide._clear(*(torch.from_numpy(x) for x in (curvature, distance)), some, count)
+    ours = 1 - guide._barred(*(torch.from_numpy(x) for x in (curvature, distance)), some, count)
     assert 0.05 < ours.mean() < 0.95
     for (target, row), clear in np.ndenumerate(ours.numpy()):
         k, reach = curvature[target, row], distance[target, row]

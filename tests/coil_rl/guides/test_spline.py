@@ -60,9 +60,10 @@ def test_a_plan_has_midpoints_nearest_first_and_targets_a_metre_apart() -> None:
     places = torch.tensor([[2, 3], [0.5, 0.5]], dtype=torch.float64)
     assert plan.pairs.tolist() == [2]
     assert torch.allclose(plan.midpoints[..., 0], places)
-    assert torch.allclose(plan.targets[..., 0], places)
-    assert plan.square[:, 0].tolist() == pytest.approx([4.25, 9.25])
-    assert plan.wanted[:, 0].tolist() == [1, 1]
+    assert torch.allclose(plan.targets[:, :2, 0], places)
+    assert torch.allclose(plan.targets[:, 2:, 0], places[:, 1:])
+    assert plan.square[:, 0].tolist() == pytest.approx([4.25, 9.25, 9.25])
+    assert plan.barred[:, 0].tolist() == [0, 0, 0]
 
 
 @every_spline
