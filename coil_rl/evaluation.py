@@ -14,7 +14,7 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
 PER_STEP = "per_step_"  # and the name of a task
@@ -80,7 +80,7 @@ def drive(
         # To ask costs a wait for the device.
         if len(history) % 8 == 0 and not running.any():
             break
-        carrier = step_mdp(step)
+        carrier = env.step_mdp(step)
         if tick is not None:
             tick()
     notes = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}

@@ -265,25 +265,29 @@ class ConeTrackEnv(SeededEnv):
         else:
             # All cars draw, reset or not: which numbers come next must not depend on the data.
             drawn = torch.randint(len(self.map), self.batch_size, generator=self.generator)
-            track = drawn.to(self.device)[cars]
+            track = drawn.to(self.device).index_select(0, cars)
 
         def put(state: Tensor, value: Tensor | float) -> Tensor:
             if isinstance(value, Tensor):
                 return state.index_copy(-1, cars, value)
             return state.index_fill(-1, cars, value)
 
+        def start(at: Tensor) -> Tensor:
+            return at.index_select(-1, track)
+
         self.track = put(self.track, track)
-        self.pose = put(self.pose, self.map.starts[:, track])
-        self.samples = put(self.samples, self.start_samples[..., track])
-        self.sampled = put(self.sampled, self.start_sampled[..., track])
+        self.pose = put(self.pose, start(self.map.starts))
+        self.samples = put(self.samples, start(self.start_samples))
+        self.sampled = put(self.sampled, start(self.start_sampled))
         self.history, self.on_line = put(self.history, 0), put(self.on_line, False)
         self.steps, self.lap, self.clock = put(self.steps, 0), put(self.lap, 0), put(self.clock, -1)
         # Two on: by neither rule of the cone bonus has a car seen anything in the epoch before.
-        self.epoch = put(self.epoch, self.epoch[cars] + 2)
+        self.epoch = self.epoch.index_add(0, cars, torch.full_like(track, 2, dtype=self.epoch.dtype))
         zero = torch.zeros_like(self.pose[0])
-        start = (self.start_observation, self.start_cones, self.start_count)
-        empty = (x.new_zeros(*x.shape[:-1], len(everyone)) for x in start)
-        observation, cones, count = (put(x, y[..., track]) for x, y in zip(empty, start, strict=True))
+        observation, cones, count = (
+            at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
+            for at in (self.start_observation, self.start_cones, self.start_count)
+        )
         terms = dict.fromkeys(self.reward_terms, zero)
         return self._tensordict(observation.t(), cones, count, self._info(zero, zero.bool(), zero, zero, terms))
 
