@@ -31,8 +31,10 @@ COLUMNS = {
 }
 NOTES = """
 Means over the states of deterministic drives on the test tracks, in action units. intervention: how far the action
-moves when the guide's advice is replaced by what it said elsewhere. gradient: |da/dg|. return lost and completed: with
-this guide silent there, saying always its mean."""
+moves when the guide's advice is replaced by what it said elsewhere. return lost and completed: with this guide silent
+there, saying always its mean. """
+OF_NUMBERS = "gradient: |da/dg|."
+OF_CHOICES = "The agent chooses: |a - g| and intervention are 0\nfor the same choice and 1.414 for any other."
 MAPS = {
     "intervention": ("listening.png", "Where the agent listens", "action moved by other advice"),
     "agreement": ("listening_agreement.png", "Where the agent does otherwise", "|action - advice|"),
@@ -70,9 +72,14 @@ def listen(config: DictConfig) -> None:
         episodes = drive_ablated(env, agent, places, removed, silence, names=names, tick=bar.update)
     ablated = dict(zip(removed, episodes, strict=True))
     table = by_place(found, places, ablated)
-    write_text(folder / "listening.md", f"{markdown_table(table, COLUMNS)}\n{NOTES}")
+    chooses = bool(found.measures["gradient"].isnan().all())
+    columns = {key: column for key, column in COLUMNS.items() if not (chooses and key == "gradient")}
+    notes = NOTES + (OF_CHOICES if chooses else OF_NUMBERS)
+    write_text(folder / "listening.md", f"{markdown_table(table, columns)}\n{notes}")
     write_csv(table, folder / "listening_places.csv")
     for measure, (name, title, label) in MAPS.items():
+        if measure not in columns:
+            continue
         lines, values = along_lines(found, places, measure, asked.bin)
         draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
     write_csv(along(found, places, asked.bin), folder / "listening.csv")

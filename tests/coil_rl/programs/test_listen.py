@@ -27,6 +27,7 @@ def make_run(folder, *overrides):
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
     make_run(folder / "coil", "method=coil", "guide=[spline,random]", "learner.action_gain=1.0")
+    make_run(folder / "dqn", "method=coil", "learner=dqn")
     make_run(folder / "ppo", "method=ppo")
     make_run(folder / "guide", "method=guide")
     return folder
@@ -74,6 +75,18 @@ def test_listen_prints_the_table_and_leaves_maps_and_numbers(runs, here):
         if name.endswith(".png"):
             with Image.open(Path("found") / name) as image:
                 assert image.width == 1600
+
+
+def test_an_agent_that_chooses_does_so_too_or_otherwise(runs, here):
+    code, out, _ = outcome(f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=found")
+    assert code == 0
+    assert out.splitlines()[-1].startswith("coil_dqn listens most to spline, which moves its action by")
+    assert "gradient" not in out
+    assert "The agent chooses: |a - g| and intervention are 0\nfor the same choice and 1.414 for any other." in out
+    assert {path.name for path in Path("found").iterdir() if path.is_file()} == FILES - {"listening_gradient.png"}
+    for row in rows_of(Path("found") / "listening.csv"):
+        differing = float(row["agreement"]) / 2**0.5 * int(row["states"])
+        assert differing == pytest.approx(round(differing), abs=1e-3)
 
 
 @pytest.mark.slow
