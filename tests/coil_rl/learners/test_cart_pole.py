@@ -6,7 +6,7 @@ from cart_poles import CartPoles
 from torchrl.envs import RewardSum, TransformedEnv
 
 from coil_rl.evaluation import drive
-from coil_rl.learners import A2C, DQN, TRPO, Reinforce
+from coil_rl.learners import A2C, DQN, PPO, TRPO, Reinforce
 from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
 
@@ -33,11 +33,16 @@ def frames_to_solve(learner, carts, steps, frames, seed=0, **options):
 @pytest.mark.parametrize(
     ("learner", "options"),
     [
+        (
+            PPO,
+            {"carts": 16, "steps": 64, "frames": 200_000, "learning_rate": Linear(1e-3, 0.0), "epochs": 5,
+             "minibatches": 8},
+        ),
         (TRPO, {"carts": 32, "steps": 64, "frames": 200_000, "learning_rate": 1e-3}),
         (A2C, {"carts": 16, "steps": 16, "frames": 300_000, "learning_rate": Linear(3e-3, 0.0), "gae_lambda": 0.8}),
         (Reinforce, {"carts": 32, "steps": 128, "frames": 500_000, "learning_rate": Linear(1e-2, 0.0)}),
     ],
-)
+)  # fmt: skip
 def test_a_learner_solves_it(learner, options):
     assert frames_to_solve(learner, **options) is not None
 
