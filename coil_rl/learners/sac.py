@@ -33,9 +33,9 @@ class SAC(OffPolicy):
         learning_rate: of Adam, a number or a schedule over the run.
         gamma: discount.
         temperature: alpha at the start, the price of being predictable.
-        target_entropy: of the policy, of actions in the env's unit; None is minus the length of the action.
+        target_entropy: of the policy, its actions in the env's unit; None is minus the length of the action.
         tau: share of the way to the critics that their slow copies go after each minibatch.
-        max_grad_norm: gradients of the policy, and those of the critics, are scaled down to this norm.
+        max_grad_norm: gradients are scaled down to this norm.
         capacity: steps that are kept.
         batch_size: steps of a minibatch.
         ratio: how often a step is learned from, on average.

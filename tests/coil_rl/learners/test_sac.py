@@ -135,8 +135,9 @@ def test_swings_the_pendulum_up():
     for _ in range(1_000):
         sac.update(rollout.collect())
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(10)]
-    assert sum(returns) / 10 > -300  # a random policy gets -1200, a good one -150
+        returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(20)]
+    # A random policy gets -1200, a good one -160; single starts differ by 100, so that the mean is known to 25.
+    assert sum(returns) / 20 > -250
 
 
 @pytest.mark.parametrize(
