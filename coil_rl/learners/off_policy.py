@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,8 +28,7 @@ class OffPolicy:
         learning_rate: of Adam, a number or a schedule over the run.
         gamma: discount.
         tau: share of the way to the networks that their slow copies go after each minibatch.
-        max_grad_norm: gradients of each network are scaled down to this norm. If they were scaled together, the steep
-            ones of a critic would make those of the policy small, and Adam's steps with them.
+        max_grad_norm: gradients are scaled down to this norm.
         replay: everything else as for `Replay`.
 
     Attributes:
@@ -66,9 +64,6 @@ class OffPolicy:
         self.target = SoftUpdate(self.loss, tau=tau)
         self.max_grad_norm = max_grad_norm
         self.parameters = list(self.loss.parameters())
-        self.networks: dict[str, list[torch.nn.Parameter]] = defaultdict(list)
-        for name, parameter in self.loss.named_parameters():
-            self.networks[name.split(".")[0]].append(parameter)
         self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), fused=True)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
@@ -104,8 +99,7 @@ class OffPolicy:
         losses = self.loss(minibatch)
         self.optimiser.zero_grad()
         sum(losses[name] for name in self.minimised).backward()
-        for parameters in self.networks.values():
-            torch.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.optimiser.step()
         self.target.step()
         learned: TensorDictBase = losses.detach()
