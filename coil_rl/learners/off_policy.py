@@ -28,7 +28,7 @@ class OffPolicy:
         learning_rate: of Adam, a number or a schedule over the run.
         gamma: discount.
         tau: share of the way to the networks that their slow copies go after each minibatch.
-        max_grad_norm: gradients are scaled down to this norm.
+        max_grad_norm: gradients are scaled down to this norm, those of all networks together.
         replay: everything else as for `Replay`.
 
     Attributes:

@@ -35,7 +35,8 @@ class SAC(OffPolicy):
         temperature: alpha at the start, the price of being predictable.
         target_entropy: of the policy, its actions in the env's unit; None is minus the length of the action.
         tau: share of the way to the critics that their slow copies go after each minibatch.
-        max_grad_norm: gradients are scaled down to this norm.
+        max_grad_norm: gradients are scaled down to this norm, those of all networks together. Where returns are in the
+            hundreds, as of a pendulum, the critics' then drown the policy's; give a large one.
         capacity: steps that are kept.
         batch_size: steps of a minibatch.
         ratio: how often a step is learned from, on average.

@@ -118,14 +118,15 @@ def test_swings_the_pendulum_up():
     torch.manual_seed(0)
     env = GymEnv("Pendulum-v1")
     env.set_seed(0)
-    sac = SAC(env, temperature=0.2, tau=0.02, ratio=128, starts=500)
+    # Critics of returns in the hundreds are steep: with them, the policy's gradients would be scaled down as well.
+    sac = SAC(env, temperature=0.2, tau=0.02, ratio=128, starts=500, max_grad_norm=1e9)
     rollout = Rollout(env, sac.policy, 8, sac.keys)
     for _ in range(1_000):
         sac.update(rollout.collect())
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(20)]
     # A random policy gets -1200, a good one -160; single starts differ by 100, so that the mean is known to 25.
-    assert sum(returns) / 20 > -250
+    assert sum(returns) / 20 > -230
 
 
 @pytest.mark.parametrize(
