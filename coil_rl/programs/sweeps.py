@@ -72,7 +72,8 @@ def planned(experiment: str, given: Sequence[str], seeds: Sequence[int]) -> Swee
     Raises:
         UserError: if the file sweeps over nothing, or a choice and what is given do not fit together.
     """
-    params: dict[str, Any] = dict(_composed(experiment).hydra.sweeper.params or {})
+    # Hydra, too, begins with what is given and no choice, and then it is late to find that they do not fit together.
+    params: dict[str, Any] = dict(_composed(experiment, *given).hydra.sweeper.params or {})
     if not params:
         raise UserError(f"experiment={experiment} has no hydra.sweeper.params: it is no sweep")
     parser = OverridesParser.create()
