@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -41,6 +41,12 @@ def _driven_before(known: str, names: tuple[str, ...]) -> dict[str, Drive]:
     return _drive_guides(config, {}, names)
 
 
+def driver_names(guides: Iterable[str]) -> list[str]:
+    """What guides of these names go as in tables: `guide`, or `guide NAME` of several."""
+    names = list(guides)
+    return ["guide"] if len(names) == 1 else [f"guide {name}" for name in names]
+
+
 def _drive_guides(
     config: DictConfig,
     overrides: Mapping[str, Any],
@@ -48,8 +54,7 @@ def _drive_guides(
     guides: Mapping[str, TensorDictModuleBase] | None = None,
 ) -> dict[str, Drive]:
     env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
-    called = list(guides or config.guide)
-    drivers = ["guide"] if len(called) == 1 else [f"guide {name}" for name in called]
+    drivers = driver_names(guides or config.guide)
     with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
         driven = drive(env, policy, names=names, tick=bar.update)
-    return dict(zip(drivers, driven.split(len(called)), strict=True))
+    return dict(zip(drivers, driven.split(len(drivers)), strict=True))

@@ -16,6 +16,7 @@ from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.simulated_recordings import record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
+from coil_rl.guide_drives import driver_names
 from coil_rl.programs import app
 from coil_rl.reproduce import OfRuns, Result
 from coil_rl.robot_drives import Driver, agent_of, record
@@ -71,8 +72,7 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
     """Every guide and the agent of every run, each for so many robots, with names in their order."""
     overrides = {**config.evaluation.env, "num_cars": robots}
     guides = build_guides(config)
-    for number, (name, guide) in enumerate(guides.items()):
-        called = "guide" if len(guides) == 1 else f"guide {name}"
+    for number, (called, (name, guide)) in enumerate(zip(driver_names(guides), guides.items(), strict=True)):
         seated = partial(build_guided_env, config, overrides, {name: guide})
         yield Driver(f"{number:02d}_{called}".replace(" ", "_"), {"policy": called}, seated)
     for number, run in enumerate(map(Path, config.runs), start=len(guides)):

@@ -15,8 +15,9 @@ from coil_rl.build import build_guides
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.recordings import SIMULATED, Recording, read_recording
 from coil_rl.errors import UserError
+from coil_rl.guide_drives import driver_names
 from coil_rl.report import write_csv
-from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.runs import Run
 from coil_rl.reproduce.result import OfRuns, called
 from coil_rl.reproduce.table_6_measures import measure, smoothness
 from coil_rl.reproduce.table_6_page import page
@@ -117,8 +118,8 @@ class Table6(OfRuns):
         )  # fmt: skip
         chosen = [run for of_label in called(self.labels, runs).values() for run in of_label]
         first = configuration(chosen[0].folder, "run", {"device": "cpu"})
-        for name, guide in (guides := build_guides(first)).items():
-            driver = GUIDE if len(guides) == 1 else f"{GUIDE} {name}"
+        guides = build_guides(first)
+        for driver, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
             about = {"policy": driver, "guide": json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))}
             yield Driver(driver.replace(" ", "_"), about, partial(_seated, robots, guide))
         for run in chosen:
