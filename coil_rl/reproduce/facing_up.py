@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from matplotlib.patches import Wedge
 from numpy.typing import NDArray
 from torch import Tensor
 
+from coil_rl.envs.sight import SAMPLES
 from coil_rl.guides.spline import Plan, pick
 from coil_rl.report import style
 
@@ -63,6 +64,26 @@ def places_of(plan: Plan, scale: float = 1.0) -> dict[str, Array]:
 def rows(points: Tensor) -> Array:
     """Points [2, N] as [N, 2]."""
     return points.t().double().numpy()
+
+
+def rows_of_samples(samples: Array, observation: Array) -> Iterator[dict[str, object]]:
+    """What a CSV says of the samples [2, 5, 2] m of both sides and of the observation [20] that tells of them."""
+    for number, (r, theta) in enumerate(observation.reshape(-1, 2)):
+        x, y = samples[divmod(number, SAMPLES)]
+        yield {"part": "sample", "number": number + 1, "x": x, "y": y, "r": r, "theta": theta}
+
+
+def rows_of_places(places: Mapping[str, Array]) -> Iterator[dict[str, object]]:
+    """What a CSV says of places [N, 2] m by their name."""
+    for part, points in places.items():
+        for number, (x, y) in enumerate(points, 1):
+            yield {"part": part, "number": number, "x": x, "y": y}
+
+
+def draw_samples(axes: Axes, samples: Array, side: int, fresh: bool) -> None:
+    """Draw the samples [5, 2] m of a side, filled if they are of now and hollow if remembered."""
+    fill, edge = (LINES[side], style.PAPER) if fresh else (style.PAPER, LINES[side])
+    axes.plot(*up(samples).T, "D", ms=4.4, mfc=fill, mec=edge, mew=0.8, zorder=6)
 
 
 def draw_plan(axes: Axes, plan: Mapping[str, Array]) -> None:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from coil_rl.envs.track import Track
+from coil_rl.envs.track import SIDES, Track
 from coil_rl.evaluation import Drive
 from coil_rl.listening.places import LEFT, RIGHT
 from coil_rl.report import style
@@ -99,7 +99,7 @@ def _draw_map(axes: Axes, track: Track, straight: Straightened) -> None:
     axes.set_title(track.name, size=9, color=style.QUIET)
     axes.set_aspect("equal")
     axes.axis("off")
-    for side in ("left", "right"):
+    for side in SIDES:
         ring = track.boundary(side, 0.2)
         axes.plot(*np.vstack([ring, ring[:1]]).T, color=style.KERB, lw=0.8)
     marks = np.arange(0, straight.length - MARKS / 2, MARKS)

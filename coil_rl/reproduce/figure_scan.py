@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from coil_rl.envs import Perception, simulated_cone_classifier, simulated_drive
 from coil_rl.envs.clusters import FEATURES
-from coil_rl.envs.sight import SAMPLES
 from coil_rl.envs.simulated_lidar import LEAST
 from coil_rl.envs.simulated_recordings import TEST_SEED
+from coil_rl.envs.track import SIDES
 from coil_rl.perception import accuracy, label_clusters
 from coil_rl.report import markdown_table, write_csv
+from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_scan_look import Look, look
 from coil_rl.reproduce.figure_scan_picture import draw
 from coil_rl.reproduce.result import Result
 
 KINDS = ("thin", "thick")
-SIDES = ("left", "right")
 
 COLUMNS = {
     "number": ("cluster", "d"),
@@ -125,13 +125,9 @@ def _clusters(found: Look, numbers: NDArray[np.int64]) -> Iterator[dict[str, obj
 
 def _places(found: Look, numbers: NDArray[np.int64]) -> Iterator[dict[str, object]]:
     yield {"part": "advice", "degrees": found.advice}
-    for number, (r, theta) in enumerate(found.observation.reshape(-1, 2)):
-        x, y = found.samples[divmod(number, SAMPLES)]
-        yield {"part": "sample", "number": number + 1, "x": x, "y": y, "r": r, "theta": theta}
+    yield from rows_of_samples(found.samples, found.observation)
     for (x, y), cluster in zip(found.points, found.cluster, strict=True):
         yield {"part": "point", "x": x, "y": y, "number": numbers[cluster] if cluster >= 0 else None}
     places = {f"boundary {side}": curve for side, curve in zip(SIDES, found.estimate, strict=True)} | dict(found.plan)
     places |= {f"{kind} cone": found.cones[found.thick == bool(thick)] for thick, kind in enumerate(KINDS)}
-    for part, points in places.items():
-        for number, (x, y) in enumerate(points, 1):
-            yield {"part": part, "number": number, "x": x, "y": y}
+    yield from rows_of_places(places)

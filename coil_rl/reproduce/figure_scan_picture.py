@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from coil_rl.envs import Perception
 from coil_rl.envs.robot_course import OUTLINE
 from coil_rl.report import style
-from coil_rl.reproduce.facing_up import CONES, LINES, draw_advice, draw_plan, draw_sight, mark, plan_handles, up
+from coil_rl.reproduce.facing_up import (
+    CONES,
+    LINES,
+    draw_advice,
+    draw_plan,
+    draw_samples,
+    draw_sight,
+    mark,
+    plan_handles,
+    up,
+)
 from coil_rl.reproduce.figure_scan_look import Look
 from coil_rl.reproduce.result import picture
 
@@ -71,9 +81,7 @@ def _draw_clusters(axes: Axes, look: Look, numbers: NDArray[np.int64]) -> None:
 def _draw_side(axes: Axes, look: Look, side: int) -> None:
     axes.plot(*up(look.estimate[side]).T, color=LINES[side], lw=1.3, zorder=4.5)
     if look.known[side]:
-        fresh = len(look.estimate[side]) > 0
-        fill, edge = (LINES[side], style.PAPER) if fresh else (style.PAPER, LINES[side])
-        axes.plot(*up(look.samples[side]).T, "D", ms=4.4, mfc=fill, mec=edge, mew=0.8, zorder=6)
+        draw_samples(axes, look.samples[side], side, fresh=len(look.estimate[side]) > 0)
 
 
 def _handles(look: Look) -> list[Artist]:

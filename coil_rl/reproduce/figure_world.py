@@ -8,13 +8,14 @@ from pathlib import Path
 
 from coil_rl.envs.level_files import shipped_track
 from coil_rl.envs.sight import SAMPLES
+from coil_rl.envs.track import SIDES
 from coil_rl.report import markdown_table, write_csv
+from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_world_look import Look, looks
 from coil_rl.reproduce.figure_world_picture import draw
 from coil_rl.reproduce.result import Result
 
 MOMENTS = {"straight": 10.5, "right bend": 17.5, "left bend": 4.75, "left boundary lost": 5.33}
-SIDES = ("left", "right")
 
 COLUMNS = {
     "name": ("moment", ""),
@@ -67,13 +68,8 @@ def _rows(look: Look) -> Iterator[dict[str, object]]:
     moment = {"moment": look.name, "seconds": look.seconds}
     yield moment | {"part": "advice", "degrees": look.advice}
     yield moment | {"part": "steering before", "degrees": look.steering}
-    for number, (r, theta) in enumerate(look.observation.reshape(-1, 2)):
-        side, place = divmod(number, SAMPLES)
-        x, y = look.samples[side, place]
-        yield moment | {"part": "sample", "number": number + 1, "x": x, "y": y, "r": r, "theta": theta}
-    for part, points in places.items():
-        for number, (x, y) in enumerate(points, 1):
-            yield moment | {"part": part, "number": number, "x": x, "y": y}
+    for row in (*rows_of_samples(look.samples, look.observation), *rows_of_places(places)):
+        yield moment | row
 
 
 def _page(found: Sequence[Look], track: str) -> str:

@@ -14,7 +14,18 @@ from matplotlib.path import Path as Outline
 
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT
 from coil_rl.report import style
-from coil_rl.reproduce.facing_up import CONES, EDGES, LINES, draw_advice, draw_plan, draw_sight, mark, plan_handles, up
+from coil_rl.reproduce.facing_up import (
+    CONES,
+    EDGES,
+    LINES,
+    draw_advice,
+    draw_plan,
+    draw_samples,
+    draw_sight,
+    mark,
+    plan_handles,
+    up,
+)
 from coil_rl.reproduce.figure_world_look import Look
 from coil_rl.reproduce.result import picture
 
@@ -65,9 +76,8 @@ def _draw_side(axes: Axes, look: Look, side: int) -> None:
     axes.plot(*up(look.estimate[side]).T, color=LINES[side], lw=1.5, zorder=4.5)
     if not look.known[side]:
         return
-    fill, edge = (LINES[side], style.PAPER) if look.fresh[side] else (style.PAPER, LINES[side])
+    draw_samples(axes, look.samples[side], side, look.fresh[side])
     samples = up(look.samples[side])
-    axes.plot(*samples.T, "D", ms=4.4, mfc=fill, mec=edge, mew=0.8, zorder=6)
     along = np.gradient(samples, axis=0)
     out = np.stack([-along[:, 1], along[:, 0]], 1) * (1, -1)[side] / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
     for place in (0, SAMPLES - 1):
