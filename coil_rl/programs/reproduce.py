@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app, sweeps
 from coil_rl.programs.versions import versions
-from coil_rl.report.runs import Run, read_runs
-from coil_rl.reproduce import OfRuns, Result, pages
+from coil_rl.report.runs import read_runs
+from coil_rl.reproduce import Result, Runs, pages
 from coil_rl.signature import near
 
 KINDS = ("table", "figure", "claim")
@@ -34,17 +34,13 @@ def reproduce(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     # All are built before the first run begins: a mistake shall cost seconds.
-    results = {name: _built(config, name) for name in chosen(config)}
-    runs = done(config, [result for result in results.values() if isinstance(result, OfRuns)])
+    results = {name: build(config.results[name], f"results.{name}", Result) for name in chosen(config)}
+    runs = done(config, list(results.values()))
     commit, note = versions()["commit"], config.budgets[config.budget].note
     for name, result in results.items():
-        used: Sequence[Run] = ()
-        if isinstance(result, OfRuns):
-            used = [run for experiment in dict.fromkeys(result.experiments) for run in runs[experiment]]
-            text = result.make(folder / name, runs)
-        else:
-            text = result.make(folder / name)
-        text = pages.page(text, name, note, pages.origin(command(config, _asked(name), name), commit, used))
+        used = [run for experiment in dict.fromkeys(result.experiments) for run in runs[experiment]]
+        origin = pages.origin(command(config, _asked(name), name), commit, used)
+        text = pages.page(result.make(folder / name, runs), name, note, origin)
         write_text(folder / f"{name}.md", text)
         print(text)
     kept = {str(name): folder / f"{name}.md" for name in config.results}
@@ -58,7 +54,7 @@ def reproduce(config: DictConfig) -> None:
     print(f"reproduce: {', '.join(results)} made; see {folder / ALL}")
 
 
-def done(config: DictConfig, results: Sequence[OfRuns]) -> Mapping[str, Sequence[Run]]:
+def done(config: DictConfig, results: Sequence[Result]) -> Runs:
     """The runs of all experiments that some results are made from, by experiment, after those missing were done."""
     wanted = list(dict.fromkeys(experiment for result in results for experiment in result.experiments))
     budget = config.budgets[config.budget]
@@ -71,13 +67,6 @@ def done(config: DictConfig, results: Sequence[OfRuns]) -> Mapping[str, Sequence
     for sweep in found:
         sweeps.run(sweep, launcher)
     return {sweep.experiment: read_runs(sweep.all_folders) for sweep in found}
-
-
-def _built(config: DictConfig, name: str) -> Result | OfRuns:
-    made: Any = build(config.results[name], f"results.{name}")
-    if not isinstance(made, Result | OfRuns):
-        raise UserError(f"results.{name}: it makes {type(made).__name__}, but Result or OfRuns is wanted")
-    return made
 
 
 def chosen(config: DictConfig) -> list[str]:

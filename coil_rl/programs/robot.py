@@ -18,7 +18,7 @@ from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.guide_drives import driver_names
 from coil_rl.programs import app
-from coil_rl.reproduce import OfRuns, Result
+from coil_rl.reproduce import Result
 from coil_rl.robot_drives import Driver, agent_of, record
 from coil_rl.trained import configuration
 
@@ -83,9 +83,7 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
 
 
 def _make(config: DictConfig, name: str, folder: Path) -> None:
-    result = build(config[name], name)
-    # Of recordings, which need no runs.
-    text = result.make(folder / name, {}) if isinstance(result, OfRuns) else result.make(folder / name)
+    text = build(config[name], name, Result).make(folder / name)
     write_text(folder / f"{name}.md", text)
     print(f"{text}\n")
 
@@ -114,7 +112,7 @@ def check(config: DictConfig) -> None:
 
 def _check_recordings(config: DictConfig, folder: Path) -> None:
     if config.recordings:
-        build(config.table_6, "table_6", OfRuns)
+        build(config.table_6, "table_6", Result)
     elif "drive" not in config.steps and not (folder / STEPS["drive"]).is_dir():
         raise UserError("recordings is empty and nothing is driven; give recordings=[FILE,...] or add the step drive")
 

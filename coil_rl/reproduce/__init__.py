@@ -7,7 +7,7 @@ from coil_rl.reproduce.figure_lines import FigureLines
 from coil_rl.reproduce.figure_scan import FigureScan
 from coil_rl.reproduce.figure_spline import FigureSpline
 from coil_rl.reproduce.figure_world import FigureWorld
-from coil_rl.reproduce.result import OfRuns, Result
+from coil_rl.reproduce.result import Result, Runs
 from coil_rl.reproduce.table_1 import Table1
 from coil_rl.reproduce.table_4 import Table4
 from coil_rl.reproduce.table_5 import Table5
@@ -22,8 +22,8 @@ __all__ = [
     "FigureScan",
     "FigureSpline",
     "FigureWorld",
-    "OfRuns",
     "Result",
+    "Runs",
     "Table1",
     "Table4",
     "Table5",

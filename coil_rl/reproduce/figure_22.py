@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from coil_rl.report import draw_learning_curves, markdown_table, write_csv
 from coil_rl.report.curve import TRAINING, mean_curve
-from coil_rl.report.runs import GUIDE, Run
-from coil_rl.reproduce.result import OfRuns, called
+from coil_rl.report.runs import GUIDE
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.reproduce.verdict import with_interval
 
 PARTS = {"quarter": (0.25, "a quarter"), "half": (0.5, "half"), "end": (1.0, "all")}
@@ -23,7 +23,7 @@ guide: the first frames after which the mean of the runs is not below that. The 
 and prints no numbers."""
 
 
-class Figure22(OfRuns):
+class Figure22(Result):
     """Learning curves, and the guide's own return as a line.
 
     Args:
@@ -36,8 +36,8 @@ class Figure22(OfRuns):
             raise ValueError("labels=[] draws nothing; give at least one")
         self.experiments, self.labels = list(experiments), list(labels)
 
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: see `OfRuns`."""
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make it: see `Result`."""
         learned = {experiment: [run for run in runs[experiment] if run.curve] for experiment in self.experiments}
         of_label = called(self.labels, learned)
         curves = {label: [run.curve for run in found] for label, found in of_label.items()}

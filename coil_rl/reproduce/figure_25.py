@@ -24,7 +24,7 @@ from coil_rl.perception import (
 from coil_rl.perception.labelling import Scans, one_sided
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.cone_features import draw_cone_features
-from coil_rl.reproduce.result import Result
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 
 PAPER = Share(240, 243)
 DRAWN_EVERY = 4  # scans
@@ -84,7 +84,7 @@ class Figure25(Result):
         # Now, for a mistake shall cost seconds.
         self.surveyed = [surveyed_drive(recording) for recording in self.both]
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         if not self.left:
             with tqdm(total=2 * self.pairs + self.tests, desc="record", unit="drive", leave=False) as bar:

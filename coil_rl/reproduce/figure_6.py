@@ -9,7 +9,7 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import Result, lighten, picture
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
 from coil_rl.tabular import policy_iteration, toymaker, value_iteration
 
 PAPER = 80  # "converges after about 80 iterations"
@@ -30,7 +30,7 @@ class Figure6(Result):
             raise ValueError(f"iterations={iterations} must be at least 1")
         self.iterations = iterations
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         mdp = toymaker()
         limit, history = policy_iteration(mdp).V, value_iteration(mdp).history

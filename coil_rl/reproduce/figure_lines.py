@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.runs import Run
 from coil_rl.report.straightened import Straightened
 from coil_rl.reproduce.figure_lines_picture import draw_straightened
-from coil_rl.reproduce.result import OfRuns, called
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -41,7 +41,7 @@ came around; from the centre: the mean distance. Other seeds drive other lines; 
 prints no numbers of this."""
 
 
-class FigureLines(OfRuns):
+class FigureLines(Result):
     """Driven lines on straightened tracks, with the smoothness of steering below them.
 
     A run does not keep its lines, so its policy drives once more, in its own env with its own transforms.
@@ -71,8 +71,8 @@ class FigureLines(OfRuns):
         self.experiments, self.labels = list(experiments), list(labels)
         self.seed, self.tracks, self.policy = seed, tracks, policy
 
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: see `OfRuns`."""
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make it: see `Result`."""
         chosen = self._chosen({experiment: runs[experiment] for experiment in self.experiments})
         configs = {label: trained.configuration(run.folder, "run", {"device": "cpu"}) for label, run in chosen.items()}
         first = configs[self.labels[0]]
@@ -95,7 +95,7 @@ class FigureLines(OfRuns):
         notes = NOTES.strip().format(policy=self.policy, seed=self.seed, first=self.labels[0])
         return f"## Driven lines on unseen tracks\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
 
-    def _chosen(self, runs: Mapping[str, Sequence[Run]]) -> dict[str, Run]:
+    def _chosen(self, runs: Runs) -> dict[str, Run]:
         """The run of each label that has the seed."""
         found = {}
         for label, of_label in called(self.labels, runs).items():

@@ -18,7 +18,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_scan_look import Look, look
 from coil_rl.reproduce.figure_scan_picture import draw
-from coil_rl.reproduce.result import Result
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 
 KINDS = ("thin", "thick")
 
@@ -57,7 +57,7 @@ class FigureScan(Result):
         self.scan = scan
         self.perception = Perception(simulated_cone_classifier())
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         found = look(self.drive, self.scan, self.perception)
         numbers = _numbers(found)

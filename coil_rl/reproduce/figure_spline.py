@@ -17,7 +17,7 @@ from coil_rl.envs.splines import Spline, smoothing_spline
 from coil_rl.envs.track import SIDES, Side
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.figure_spline_picture import draw
-from coil_rl.reproduce.result import Result
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 
 Array = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ class FigureSpline(Result):
         self.points = self.cones + np.random.default_rng(seed).normal(0, noise, self.cones.shape)
         self.smoothings = [float(smoothing) for smoothing in smoothings]
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         fits = [fit(self.points, self.cones, smoothing) for smoothing in self.smoothings]
         points = [

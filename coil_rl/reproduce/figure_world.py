@@ -13,7 +13,7 @@ from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_world_look import Look, looks
 from coil_rl.reproduce.figure_world_picture import draw
-from coil_rl.reproduce.result import Result
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 
 MOMENTS = {"straight": 10.5, "right bend": 17.5, "left bend": 4.75, "left boundary lost": 5.33}
 
@@ -51,7 +51,7 @@ class FigureWorld(Result):
                 raise ValueError(f"moments.{name}={seconds} must be a finite number of seconds, at least 0")
         self.moments = dict(moments)
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         found = looks(self.track, self.moments)
         write_csv([row for look in found for row in _rows(look)], stem.with_suffix(".csv"))

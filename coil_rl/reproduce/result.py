@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -18,37 +19,33 @@ from coil_rl.files import whole_file
 from coil_rl.report import style
 from coil_rl.report.runs import Run
 
+Runs = Mapping[str, Sequence[Run]]  # of each file of `conf/experiment`, finished
+NO_RUNS: Runs = MappingProxyType({})
+
 
 class Result(ABC):
-    """A table, a figure or a claim of the paper; its constructor takes the choices and refuses wrong ones."""
+    """A table, a figure or a claim of the paper; its constructor takes the choices and refuses wrong ones.
+
+    Attributes:
+        experiments: the files of `conf/experiment` of whose runs it is made; none if it needs no training.
+    """
+
+    experiments: Sequence[str] = ()
 
     @abstractmethod
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it, with the paper's values beside ours.
 
         Args:
             stem: where to, without ending: all numbers go to `stem.csv`, the picture to `stem.png`.
+            runs: of its experiments.
 
         Returns:
             The page, Markdown: the table, and what there is to say about it.
         """
 
 
-class OfRuns(ABC):
-    """A table or figure of the paper that is made from training runs.
-
-    Attributes:
-        experiments: the files of `conf/experiment` whose runs it takes; none if its choices leave it nothing to take.
-    """
-
-    experiments: Sequence[str]
-
-    @abstractmethod
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: as that of a `Result`, from the finished runs of each experiment by its name."""
-
-
-def called(labels: Sequence[str], runs: Mapping[str, Sequence[Run]]) -> dict[str, list[Run]]:
+def called(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
     """The runs of each of some labels.
 
     Args:

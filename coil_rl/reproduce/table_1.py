@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import Result, lighten, picture
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
 from coil_rl.reproduce.verdict import FAILED, HEADING, HELD
 from coil_rl.tabular import toymaker, value_iteration
 
@@ -39,7 +39,7 @@ class Table1(Result):
             raise ValueError(f"tolerance={tolerance} must be more than 0")
         self.tolerance = tolerance
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         mdp = toymaker()
         Q = value_iteration(mdp, self.tolerance).Q

@@ -14,6 +14,7 @@ from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
 from coil_rl.report.curve import TRAINING, points
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
+from coil_rl.reproduce.result import NO_RUNS, Runs
 from coil_rl.reproduce.verdict import HEADING, verdict, with_interval
 from coil_rl.reproduce.worlds import OfWorlds, heading
 
@@ -41,8 +42,8 @@ in about 85 of 100 cases. Its guide: the guide alone on the training tracks, mad
 class Table4(OfWorlds):
     """The best and the final return of each method in training."""
 
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: see `OfRuns`."""
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make it: see `Result`."""
         of_worlds = {
             world: [returns(run) for experiment in experiments for run in runs[experiment] if run.curve]
             for world, experiments in self.worlds.items()

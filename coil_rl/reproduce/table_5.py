@@ -14,6 +14,7 @@ from coil_rl.report.comparison import Group, compare
 from coil_rl.report.paired import paired
 from coil_rl.report.runs import GUIDE, MEASURES, Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap
+from coil_rl.reproduce.result import NO_RUNS, Runs
 from coil_rl.reproduce.table_5_page import beside_the_paper, drivers, held_up, tracks
 from coil_rl.reproduce.worlds import OfWorlds, heading
 
@@ -32,8 +33,8 @@ tables."""
 class Table5(OfWorlds):
     """Laps, smoothness, reward and crashes of each driver on unseen tracks."""
 
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: see `OfRuns`."""
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make it: see `Result`."""
         parts, numbers, worlds = ["## Table 5: unseen tracks"], [], {}
         for world, experiments in self.worlds.items():
             there = [run for experiment in experiments for run in runs[experiment]]

@@ -17,8 +17,7 @@ from coil_rl.envs.recordings import SIMULATED, Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.guide_drives import driver_names
 from coil_rl.report import write_csv
-from coil_rl.report.runs import Run
-from coil_rl.reproduce.result import OfRuns, called
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.reproduce.table_6_measures import measure, smoothness
 from coil_rl.reproduce.table_6_page import page
 from coil_rl.reproduce.table_6_picture import draw_drives
@@ -26,7 +25,7 @@ from coil_rl.robot_drives import Driver, agent_of, record
 from coil_rl.trained import configuration
 
 
-class Table6(OfRuns):
+class Table6(Result):
     """Smoothness, laps, crashes and lines of several drivers, each from one or several recordings.
 
     A recording goes by the `policy` that is noted in it, or else by its file's name. Without recordings the guide and
@@ -93,8 +92,8 @@ class Table6(OfRuns):
             for name, recording in named
         ]
 
-    def make(self, stem: Path, runs: Mapping[str, Sequence[Run]]) -> str:
-        """Make it: see `OfRuns`."""
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make it: see `Result`."""
         if self.experiments:
             own = {experiment: runs[experiment] for experiment in self.experiments}
             self._measure([("", recording) for recording in self._driven(own, stem.with_name(f"{stem.name}_drives"))])
@@ -105,12 +104,12 @@ class Table6(OfRuns):
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{where}")
         return page(rows, where, self.max_steering, self.resamples, self.seed)
 
-    def _driven(self, runs: Mapping[str, Sequence[Run]], folder: Path) -> list[Recording]:
+    def _driven(self, runs: Runs, folder: Path) -> list[Recording]:
         robot = f"{self.car_length:g} m, {self.max_steering:g} degrees"
         about = {"robots": f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"}
         return record(self._drivers(runs), folder, self.repeats, about)
 
-    def _drivers(self, runs: Mapping[str, Sequence[Run]]) -> Iterator[Driver]:
+    def _drivers(self, runs: Runs) -> Iterator[Driver]:
         """The guide of the first run, and the agent of each."""
         robots = partial(
             SimulatedRobotEnv, num_cars=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,

@@ -17,7 +17,7 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.reproduce.result import Result
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.reproduce.tabular_coil_picture import draw
 from coil_rl.reproduce.verdict import FAILED, HEADING, HELD
 from coil_rl.tabular import MDP, garnet, q_learning, solve, value_iteration
@@ -83,7 +83,7 @@ class TabularCoil(Result):
             "worst": worst_guide,
         }
 
-    def make(self, stem: Path) -> str:
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
         rows = [row for seed in seeds for row in self._world(seed)]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from coil_rl.reproduce.result import OfRuns
+from coil_rl.reproduce.result import Result
 
 
-class OfWorlds(OfRuns):
+class OfWorlds(Result):
     """A table of methods in one world, and in others.
 
     Args:

@@ -11,7 +11,6 @@ from run_folders import driven, make_run
 from coil_rl import config as _schema  # noqa: F401
 from coil_rl.programs import sweeps
 from coil_rl.programs.reproduce import ALL
-from coil_rl.reproduce import OfRuns
 
 
 @pytest.fixture(autouse=True)
@@ -129,7 +128,7 @@ def test_runs_that_are_there_are_used_and_one_that_is_gone_is_done_again_alone(t
         ("+other=1", "there is no key other"),
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
         ("table=1 +results.table_1.x=0", "results.table_1: Table1 takes no x; it takes tolerance"),
-        ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "Result or OfRuns is wanted"),
+        ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "but Result is wanted"),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
         ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be at least 1"),
         ("-m table=1,4", "leave out -m, and ask for several as in table=[1,4]"),
@@ -149,7 +148,7 @@ def test_what_a_budget_gives_fits_every_experiment_that_results_name(budget):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("reproduce", ["table=1"])
         results, given = instantiate(config.results, _convert_="all").values(), config.budgets[budget]
-        experiments = {name for result in results if isinstance(result, OfRuns) for name in result.experiments}
+        experiments = {name for result in results for name in result.experiments}
         plans = [
             sweeps.planned(name, [*given.every, *given.only.get(name, [])], range(given.seeds)) for name in experiments
         ]

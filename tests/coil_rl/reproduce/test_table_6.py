@@ -31,7 +31,7 @@ def rows_of(path):
 
 
 def test_recordings_tell_what_the_simulation_measured(crash, tmp_path):
-    page = Table6(recordings=[str(crash)]).make(tmp_path / "table_6", {})
+    page = Table6(recordings=[str(crash)]).make(tmp_path / "table_6")
     rows = {row["recording"]: row for row in rows_of(tmp_path / "table_6.csv")}
     live = drive(SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4), SplineGuide()).episodes
     for robot, episode in enumerate(live):
@@ -51,7 +51,7 @@ def test_recordings_tell_what_the_simulation_measured(crash, tmp_path):
 
 def test_a_recording_of_another_robot_has_what_its_odometry_and_commands_tell(tmp_path):
     file = circle(tmp_path / "mine.mcap", scans=250, odometry=True, commands=True)
-    page = Table6(recordings=[str(file)]).make(tmp_path / "table_6", {})
+    page = Table6(recordings=[str(file)]).make(tmp_path / "table_6")
     (row,) = rows_of(tmp_path / "table_6.csv")
     # On a circle of 1 m at 0.15 m/s; the same action is told all the time, which is new for twenty steps.
     assert float(row["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-3)
@@ -68,14 +68,14 @@ def test_a_recording_of_another_robot_has_what_its_odometry_and_commands_tell(tm
 
 def test_without_odometry_a_robot_did_what_it_was_told(tmp_path):
     file = circle(tmp_path / "mine.mcap", scans=250, commands=True)
-    Table6(recordings=[str(file)]).make(tmp_path / "table_6", {})
+    Table6(recordings=[str(file)]).make(tmp_path / "table_6")
     (row,) = rows_of(tmp_path / "table_6.csv")
     assert float(row["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-2)
 
 
 def test_drivers_can_be_named(crash, tmp_path):
     recordings = {"coil": [str(crash / "0.mcap")], "ppo": [str(crash / "1.mcap")]}
-    Table6(recordings=recordings).make(tmp_path / "table_6", {})
+    Table6(recordings=recordings).make(tmp_path / "table_6")
     assert [row["method"] for row in rows_of(tmp_path / "table_6.csv")] == ["coil", "ppo"]
 
 
@@ -112,7 +112,7 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()} == drives
     again = Table6(["mine"], recordings=[str(tmp_path / "table_6_drives")])
     assert again.experiments == []
-    again.make(tmp_path / "again", {})
+    again.make(tmp_path / "again")
     assert sorted(map(str, rows_of(tmp_path / "again.csv"))) == sorted(map(str, rows))
 
 
