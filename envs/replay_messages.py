@@ -16,6 +16,7 @@ from coil_rl.envs.recording_writer import RecordingWriter
 from coil_rl.envs.recordings import SIMULATED
 from coil_rl.envs.ros_messages import Twist, header
 from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
+from coil_rl.envs.track import SIDES
 
 MARKERS, FLOAT, BOOL, TWIST = (
     "visualization_msgs/msg/MarkerArray",
@@ -24,7 +25,6 @@ MARKERS, FLOAT, BOOL, TWIST = (
     "geometry_msgs/msg/Twist",
 )
 CYLINDER, LINE_STRIP, DELETE_ALL = 3, 4, 3
-SIDES = ("left", "right")
 COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
 DIAMETER = {"left": 0.04, "right": 0.09}  # m, of a cone
 HEIGHT, LINE = 0.1, 0.01  # m

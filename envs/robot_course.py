@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.envs.sight import Frame
-from coil_rl.envs.track import SIDES, Track, TrackError
+from coil_rl.envs.track import SIDES, Track, TrackError, evenly
 
 Array = NDArray[np.float64]
 
@@ -120,11 +120,9 @@ def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Te
 
 def middle_line(track: Track, spacing: float) -> Array:
     """Points half-way between the boundaries of a track, evenly spaced, from the start on: [T, 2] m."""
-    left, right = track.boundary("left", STEP), track.boundary("right", STEP)
-    nearest = ((left[:, None] - right) ** 2).sum(-1).argmin(1)
-    middle = (left + right[nearest]) / 2
+    middle = track.middle(STEP)
     middle = np.roll(middle, -int(((middle - np.array(track.start[:2])) ** 2).sum(1).argmin()), axis=0)
-    return _evenly(middle, spacing)
+    return evenly(middle, spacing)
 
 
 def _centre_line() -> tuple[Array, Array]:
@@ -148,15 +146,7 @@ def _centre_line() -> tuple[Array, Array]:
 
 def _cones(ring: Array) -> Array:
     length = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum()
-    return _evenly(ring, length / round(length / CONE_GAP))
-
-
-def _evenly(ring: Array, spacing: float) -> Array:
-    """Points along a closed line [P, 2], the last of them a step of about `spacing` before the first."""
-    closed = np.vstack([ring, ring[:1]])
-    travelled = np.concatenate([[0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
-    at = np.linspace(0, travelled[-1], round(travelled[-1] / spacing), endpoint=False)
-    return np.stack([np.interp(at, travelled, axis) for axis in closed.T], axis=1)
+    return evenly(ring, length / round(length / CONE_GAP))
 
 
 def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:

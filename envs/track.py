@@ -116,6 +116,15 @@ class Track:
         points: Array = curve(np.linspace(0, chord[-1], int(np.ceil(chord[-1] / spacing)), endpoint=False))
         return points
 
+    def middle(self, spacing: float = 0.05) -> Array:
+        """Half-way from each point of the left boundary to the nearest one of the right boundary: [P, 2], m.
+
+        Args:
+            spacing: of the boundaries, as there.
+        """
+        left, right = self.boundary("left", spacing), self.boundary("right", spacing)
+        return np.asarray((left + right[cKDTree(right).query(left)[1]]) / 2)
+
     def _check_cones(self, side: str, cones: Array) -> None:
         if cones.ndim != 2 or cones.shape[1] != 2 or len(cones) < MINIMUM_CONES:
             raise TrackError(
@@ -175,6 +184,14 @@ class Track:
         place = (self.left[-1] + self.right[-1]) / 2
         ahead = self.finish - place
         return float(place[0]), float(place[1]), float(np.arctan2(ahead[1], ahead[0]))
+
+
+def evenly(ring: Array, spacing: float) -> Array:
+    """Points along a closed line [P, 2], the last of them a step of about `spacing` before the first."""
+    closed = np.vstack([ring, ring[:1]])
+    travelled = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
+    at = np.linspace(0, travelled[-1], max(8, round(travelled[-1] / spacing)), endpoint=False)
+    return np.stack([np.interp(at, travelled, axis) for axis in closed.T], axis=1)
 
 
 def _edges(ring: Array) -> Array:

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from coil_rl.envs.track import AS_COMPLEX, Track
+from coil_rl.envs.track import AS_COMPLEX, Track, evenly
 
 Array = NDArray[np.float64]
 
@@ -20,7 +19,7 @@ STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(PLACES))
 SMOOTHING = 1.0  # m
 
 
-def middle_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
+def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
     """The line half-way between a track's boundaries, without the jitter of single cones.
 
     Args:
@@ -31,13 +30,7 @@ def middle_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHIN
     Returns:
         [P, 2] m, a closed line in driving order from the first cones; the first point is not repeated.
     """
-    left, right = track.boundary("left"), track.boundary("right")
-    middle = (left + right[cKDTree(right).query(left)[1]]) / 2
-    closed = np.vstack([middle, middle[:1]])
-    along = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
-    even = np.linspace(0, along[-1], max(8, round(along[-1] / spacing)), endpoint=False)
-    points = np.stack([np.interp(even, along, axis) for axis in closed.T], axis=1)
-    return np.asarray(gaussian_filter1d(points, smoothing / spacing, axis=0, mode="wrap"))
+    return np.asarray(gaussian_filter1d(evenly(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"))
 
 
 def curvature(line: Array) -> Array:
@@ -112,7 +105,7 @@ class Places:
             if not value > 0:
                 raise ValueError(f"{name}={value} must be more than 0")
         self.tracks = list(tracks)
-        self.lines = [middle_line(track) for track in tracks]
+        self.lines = [smooth_line(track) for track in tracks]
         self.kinds = [kinds(line, turn_radius, approach) for line in self.lines]
         most = max(map(len, self.lines))
         points = np.full((len(self.lines), most, 2), 1e6)

@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from coil_rl.envs.track import Track
-from coil_rl.listening.places import kinds, middle_line
+from coil_rl.listening.places import kinds, smooth_line
 
 Array = NDArray[np.float64]
 
@@ -37,12 +37,12 @@ class Straightened:
     """
 
     def __init__(self, track: Track) -> None:
-        self.line = middle_line(track, SPACING, SMOOTHING)
+        self.line = smooth_line(track, SPACING, SMOOTHING)
         edges = np.roll(self.line, -1, axis=0) - self.line
         lengths = np.linalg.norm(edges, axis=1)
         self.along: Array = np.cumsum(lengths) - lengths
         self.length = float(lengths.sum())
-        self.kinds = kinds(middle_line(track, SPACING))
+        self.kinds = kinds(smooth_line(track, SPACING))
         # Across a point the direction is that from the one before to the one after.
         ahead = edges + np.roll(edges, 1, axis=0)
         self._ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)

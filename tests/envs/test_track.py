@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from coil_rl.envs.track import Track, TrackError
+from coil_rl.envs.track import Track, TrackError, evenly
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
@@ -52,6 +52,15 @@ def test_boundary_passes_through_every_cone():
 
 def test_length_is_that_of_the_centre_line():
     assert ring().length == pytest.approx(20 * np.pi, rel=1e-3)
+
+
+def test_middle_of_a_ring_is_half_way_and_its_points_are_even():
+    middle = ring().middle(0.02)
+    np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 10, atol=1e-3)
+    even = evenly(middle, 0.5)
+    assert len(even) == round(20 * np.pi / 0.5)
+    np.testing.assert_allclose(np.linalg.norm(np.roll(even, -1, axis=0) - even, axis=1), 0.5, rtol=0.01)
+    np.testing.assert_allclose(even[0], middle[0])
 
 
 def test_cones_cannot_be_changed_afterwards():

@@ -7,7 +7,7 @@ from ovals import oval_line
 
 from coil_rl.envs import Track, shipped_tracks
 from coil_rl.listening import PLACES, Places
-from coil_rl.listening.places import curvature, kinds, middle_line
+from coil_rl.listening.places import curvature, kinds, smooth_line
 
 
 def circle(radius, points=60, clockwise=False):
@@ -52,17 +52,17 @@ def test_places_do_not_depend_on_where_the_lap_begins():
 
 
 @pytest.mark.parametrize("clockwise", [False, True])
-def test_the_middle_line_is_half_way_between_the_sides(clockwise):
+def test_the_smooth_line_is_half_way_between_the_sides(clockwise):
     inner, outer = circle(7, 40, clockwise), circle(9, 50, clockwise)
     track = Track("ring", *((outer, inner) if clockwise else (inner, outer)))
-    line = middle_line(track)
+    line = smooth_line(track)
     np.testing.assert_allclose(np.linalg.norm(line, axis=1), 8, atol=0.1)
     assert names(line) == {"right" if clockwise else "left"}
 
 
 def test_each_shipped_track_is_one_turn_around_with_a_bit_of_everything():
     for track in shipped_tracks("test"):
-        line = middle_line(track)
+        line = smooth_line(track)
         step = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1)
         assert step.sum() == pytest.approx(track.length, rel=0.03)
         assert abs((curvature(line) * step).sum()) == pytest.approx(2 * np.pi, rel=0.01)
