@@ -37,11 +37,13 @@ def test_results_leave_their_pages_numbers_and_pictures_and_print_the_pages():
 
 
 def test_a_choice_of_a_result_reaches_it_and_its_page():
-    assert outcome("figure=6", "results.figure_6.iterations=7", "hydra.run.dir=run")[0] == 0
+    of_another = ("~results.table_5.worlds", "+results.table_4.labels=[]")
+    assert outcome("figure=6", "results.figure_6.iterations=7", *of_another, "hydra.run.dir=run")[0] == 0
     assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
     assert "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`" in Path("run/figure_6.md").read_text()
     text = Path("run/RESULTS.md").read_text()
-    assert "`coil-reproduce all=true budget=paper results.figure_6.iterations=7` writes this file" in text
+    everything = "results.figure_6.iterations=7 '~results.table_5.worlds' '+results.table_4.labels=[]'"
+    assert f"`coil-reproduce all=true budget=paper {everything}` writes this file" in text
     assert "- `coil-reproduce table=1 budget=paper`" in text
 
 
