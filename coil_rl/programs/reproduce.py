@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -97,9 +96,10 @@ def command(config: DictConfig, asked: str, name: str = "") -> str:
     """The command that makes a result again, or all without a name, with the choices of this one that matter to it."""
     asking = tuple(f"{key}=" for key in (*KINDS, "all", "budget"))
     given = [word for word in HydraConfig.get().overrides.task if not word.startswith(asking)]
-    own = re.escape(f"results.{name}") + "[.=]" if name else "results"
+    own = (f"results.{name}.", f"results.{name}=") if name else "results."
     # Hydra adds what a + begins, and takes away what a ~ does.
-    others = [word for word in given if not re.match(r"[+~]*results\.", word) or re.match(r"[+~]*" + own, word)]
+    keys = {word: word.lstrip("+~") for word in given}
+    others = [word for word, key in keys.items() if not key.startswith("results.") or key.startswith(own)]
     return shlex.join(["coil-reproduce", asked, f"budget={config.budget}", *others])
 
 
