@@ -15,7 +15,8 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Composite, OneHot
 
-from coil_rl.envs.cone_track import REWARD_TERMS, ConeTrackEnv, Outcome, Reward, check_weights, pay
+from coil_rl.envs.cone_track import ConeTrackEnv
+from coil_rl.envs.reward import REWARD_TERMS, Outcome, Reward, check_weights, pay
 from coil_rl.envs.track import Track
 
 

@@ -16,8 +16,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.boundary_memory import BoundaryMemory
-from coil_rl.envs.cone_track import HISTORY, recent_mean
 from coil_rl.envs.recordings import Recording, read_recording
+from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.sight import SAMPLES, SIGHT, Frame
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]

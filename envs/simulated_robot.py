@@ -20,8 +20,8 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from coil_rl.envs.boundary_memory import BoundaryMemory
 from coil_rl.envs.cone_classifier import simulated_cone_classifier
-from coil_rl.envs.cone_track import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
 from coil_rl.envs.perception import Perception
+from coil_rl.envs.reward import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
 from coil_rl.envs.robot_course import RobotCourse, robot_track
 from coil_rl.envs.seeded import SeededEnv
 from coil_rl.envs.sight import SAMPLES

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchrl.envs.utils import check_env_specs
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
-from coil_rl.envs.cone_track import REWARD_TERMS
+from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
 
 AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}

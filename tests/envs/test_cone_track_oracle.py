@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from oracle import OneCar, Outcome, guide_action, midpoints
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
-from coil_rl.envs.cone_track import REWARD_TERMS
+from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
 
 Array = NDArray[np.float64]
