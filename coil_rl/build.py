@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import hydra.utils
@@ -113,12 +113,16 @@ def as_its_agent_sees(config: DictConfig, env: EnvBase, *, advice: str | None = 
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
     """
+    return _transformed(env, build_transforms(config, advice), "method.transforms")
+
+
+def _transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
     # The sum comes first, before a method changes what the agent is paid.
-    env = TransformedEnv(env, Compose(RewardSum(), *build_transforms(config, advice)))
+    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
     try:
         env.observation_spec  # noqa: B018  transforms look at what stands before them once they are asked
     except (KeyError, ValueError) as error:
-        raise UserError(f"method.transforms: {error.args[0]}") from error
+        raise UserError(f"{name}: {error.args[0]}") from error
     return env
 
 
@@ -154,12 +158,14 @@ def build_guided_env(
         overrides: what to change in `env`, with `num_cars`. There are so many cars for each guide, the first guide's
             first.
         guides: others than those of the configuration.
+
+    Raises:
+        UserError: as `build_env`.
     """
     guides = guides or build_guides(config)
     cars = overrides["num_cars"]
     env = build_bare_env(config, {**overrides, "num_cars": cars * len(guides)})
-    transforms = [GuideActions(guides), *build_all(config.degrade, "degrade")]
-    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    env = _transformed(env, [GuideActions(guides), *build_all(config.degrade, "degrade")], "degrade")
     return env, FollowAdvice(env, [guide for guide in range(len(guides)) for _ in range(cars)])
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from coil_rl.build import (
     build_all,
     build_bare_env,
     build_env,
+    build_guided_env,
     build_guides,
     build_learner,
     check_node,
@@ -73,8 +74,9 @@ def check(config: DictConfig) -> None:
     training = OmegaConf.get_type(config) is Train
     if training and config.method.observes is not None:
         _check_learner(config)
-    for part in ("train", "test") if training else ("test",):
-        if not build(config.track.get(part), f"track.{part}"):
+    cars = {part: len(build(config.track.get(part), f"track.{part}")) for part in (["train"] * training + ["test"])}
+    for part, tracks in cars.items():
+        if not tracks:
             raise UserError(f"track.{part} gives no tracks; give at least one")
     if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
@@ -82,6 +84,8 @@ def check(config: DictConfig) -> None:
         for name, guide in build_guides(config).items():
             check_guide(guide, env, f"guide.{name}")
         build_all(config.degrade, "degrade")
+        if config.degrade:
+            _check_drives(config, cars)
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
@@ -90,6 +94,9 @@ def check(config: DictConfig) -> None:
                 "take another"
             )
         _check_training(config)
+        if config.method.transforms:
+            for advice in config.evaluation.advice:
+                _check_drives(config, {"test": cars["test"]}, advice)
     make_folder(Path(config.run_dir))
 
 
@@ -160,6 +167,19 @@ def check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
     shape, wanted = action.shape, env.action_spec.shape
     if shape != wanted:
         raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
+
+
+def _check_drives(config: DictConfig, cars: Mapping[str, int], advice: str = "") -> None:
+    """Some ways to degrade advice need several cars; where guides and agents are judged there is one on each track."""
+    for part, tracks in cars.items():
+        overrides = {**config.evaluation.env, "num_cars": tracks}
+        try:
+            if advice:
+                build_env(config, overrides, advice=advice)
+            else:
+                build_guided_env(config, overrides)
+        except UserError as error:
+            raise UserError(f"track.{part} gives {tracks} to drive on, one car each: {error}") from error
 
 
 def _check_learner(config: DictConfig) -> None:

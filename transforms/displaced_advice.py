@@ -55,7 +55,7 @@ class ShuffledAdvice(DrawnAdvice, _Remembering):
         memory_key: where the advice goes as it was, [*batch, 1, n_guides, A].
 
     Raises:
-        ValueError: at first use, if the batch is one row.
+        ValueError: if the batch is one row, in an env once it is asked for its specs.
     """
 
     def __init__(
@@ -67,8 +67,7 @@ class ShuffledAdvice(DrawnAdvice, _Remembering):
     def degrade(self, advice: Tensor) -> Tensor:
         """The advice of other rows."""
         rows = advice.flatten(0, -3) if advice.ndim > 2 else advice.unsqueeze(0)
-        if len(rows) < 2:
-            raise ValueError("ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more")
+        self._check_rows(len(rows))
         return rows.roll(int(torch.randint(1, len(rows), (), generator=self.generator)), 0).view_as(advice)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -78,6 +77,15 @@ class ShuffledAdvice(DrawnAdvice, _Remembering):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Shuffle the rows of stored data."""
         return super()._call(tensordict)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add what is remembered, if there are rows to shuffle."""
+        self._check_rows(self.parent.batch_size.numel())
+        return super().transform_observation_spec(observation_spec)
+
+    def _check_rows(self, rows: int) -> None:
+        if rows < 2:
+            raise ValueError("ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more")
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask, before = tensordict.get("_reset", None), tensordict.get(self.memory_key, None)

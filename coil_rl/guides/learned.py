@@ -34,8 +34,8 @@ class LearnedGuide(TensorDictModuleBase):
         config = configuration(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
-        # One car is enough: what the transforms need of an env are its specs.
-        env = TransformedEnv(build_bare_env(config, {"num_cars": 1}), Compose(*build_transforms(config)))
+        # What the transforms need of an env are its specs; one of them is there for two cars or more.
+        env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
         self.policy, self.transforms = policy(folder, config, env, which), None
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
         if config.method.needs_guide or config.action:

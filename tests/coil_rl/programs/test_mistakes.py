@@ -115,6 +115,15 @@ def refusal(name, *arguments):
         # parts
         ("degrade=[noisy,loud]", "no degrade=loud"),
         ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
+        (
+            "method=coil degrade=[shuffled] track.train.count=2",
+            "track.test gives 1 to drive on, one car each: degrade: ShuffledAdvice gives a row the advice of another",
+        ),
+        (
+            "method=coil +degrade@evaluation.advice.other=shuffled",
+            "track.test gives 1 to drive on, one car each: method.transforms: ShuffledAdvice gives a row the advice of",
+        ),
+        ("method=coil degrade=[shuffled] budget.cars=1", "the batch is one row; use more"),
         ("guide=learned", "guide.learned.run must be given"),
         ("guide=learned guide.learned.run=nowhere", "guide.learned: run=nowhere is not the folder of a run"),
         (
