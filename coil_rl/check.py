@@ -201,10 +201,11 @@ def _check_training(config: DictConfig) -> None:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
     learner = build_learner(config, env, untrained(config) if trains_guides(config) else None)
     frames = config.budget.cars * config.budget.steps
-    minibatches = getattr(learner, "minibatches", 1)  # not every learner has them
-    if minibatches > frames:
+    minibatches = getattr(learner, "minibatches", 0)  # not every learner has them
+    if 2 * minibatches > frames:
         raise UserError(
-            f"learner.minibatches={minibatches} must be at most {frames}, the frames of a batch: cars x steps of budget"
+            f"learner.minibatches={minibatches} leaves less than 2 frames of a batch to each, too few to standardise "
+            f"advantages; a batch has cars x steps of budget, here {frames}"
         )
     if config.logger:
         check_node(config.logger, "logger")

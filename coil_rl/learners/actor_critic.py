@@ -135,8 +135,14 @@ class ActorCritic:
         return batch.select(*self.learned_from).reshape(-1)
 
     def passes(self, flat: TensorDictBase, epochs: int) -> Iterator[TensorDictBase]:
-        """Minibatches of several passes over the rows, each in a random order."""
+        """Minibatches of several passes over the rows, each in a random order.
+
+        Raises:
+            ValueError: if there is one row to a minibatch, or none: one advantage cannot be standardised.
+        """
         size = len(flat) // self.minibatches
+        if size < 2:
+            raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {len(flat)} frames to each")
         for _ in range(epochs):
             order = torch.randperm(len(flat), generator=self.generator)[: size * self.minibatches]
             yield from flat[order.to(flat.device)].split(size)

@@ -152,6 +152,14 @@ def test_numbers_outside_their_range_are_refused(learner, name, value):
         learner(CartPoles(2), **{name: value})
 
 
+@pytest.mark.parametrize("learner", LEARNERS)
+def test_a_minibatch_of_one_frame_is_refused(learner):
+    # The standard deviation of one advantage is NaN.
+    learned(learner, CartPoles(2), steps=4, minibatches=4)
+    with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
+        learned(learner, CartPoles(2), steps=4, minibatches=5)
+
+
 def test_other_values_outside_their_range_are_refused():
     with pytest.raises(ValueError, match="baseline='mean' must be critic or none"):
         Reinforce(CartPoles(2), baseline="mean")

@@ -94,7 +94,7 @@ def refusal(name, *arguments):
         ("budget.cars=0", "budget.cars=0 must be at least 1"),
         ("device=tpu", "device=tpu must be cpu, cuda, or one GPU such as cuda:0"),
         ("evaluation.policy=worst", "evaluation.policy=worst must be one of last, best"),
-        ("learner.minibatches=257", "learner.minibatches=257 must be at most 256, the frames of a batch"),
+        ("learner.minibatches=129", "learner.minibatches=129 leaves less than 2 frames of a batch to each"),
         ("env.cone_bonus=all", "env: cone_bonus='all' must be one of first_sighting, every_sighting"),
         ("track.train.count=0", "track.train: random_tracks was asked for 0 tracks"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
