@@ -93,7 +93,7 @@ def check(config: DictConfig) -> None:
                 f"label={config.label} cannot name an agent: it must not be empty, not guide, and have no /; "
                 "take another"
             )
-        _check_training(config)
+        _check_training(config, cars["train"])
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_drives(config, {"test": cars["test"]}, advice)
@@ -193,7 +193,7 @@ def _check_learner(config: DictConfig) -> None:
         )
 
 
-def _check_training(config: DictConfig) -> None:
+def _check_training(config: DictConfig, tracks: int) -> None:
     if not config.method.observes:
         raise UserError("method.observes=[] lets the agent see nothing; name entries of the env, or null for no agent")
     env = build_env(config)
@@ -206,6 +206,11 @@ def _check_training(config: DictConfig) -> None:
         raise UserError(
             f"learner.minibatches={minibatches} leaves less than 2 frames of a batch to each, too few to standardise "
             f"advantages; a batch has cars x steps of budget, here {frames}"
+        )
+    if tracks == 1 and getattr(learner, "validate", False) and learner.group_key is not None:
+        raise UserError(
+            "track.train gives one track, which cannot be left out to validate; set learner.group_key=null, "
+            "or learner.validate=false"
         )
     if config.logger:
         check_node(config.logger, "logger")

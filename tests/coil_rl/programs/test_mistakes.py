@@ -124,6 +124,7 @@ def refusal(name, *arguments):
             "track.test gives 1 to drive on, one car each: method.transforms: ShuffledAdvice gives a row the advice of",
         ),
         ("method=coil degrade=[shuffled] budget.cars=1", "the batch is one row; use more"),
+        ("method=oil", "track.train gives one track, which cannot be left out to validate; set learner.group_key=null"),
         ("guide=learned", "guide.learned.run must be given"),
         ("guide=learned guide.learned.run=nowhere", "guide.learned: run=nowhere is not the folder of a run"),
         (
