@@ -74,9 +74,10 @@ def check(config: DictConfig) -> None:
     training = OmegaConf.get_type(config) is Train
     if training and config.method.observes is not None:
         _check_learner(config)
-    cars = {part: len(build(config.track.get(part), f"track.{part}")) for part in (["train"] * training + ["test"])}
-    for part, tracks in cars.items():
-        if not tracks:
+    parts = ("train", "test") if training else ("test",)
+    tracks = {part: len(build(config.track.get(part), f"track.{part}")) for part in parts}
+    for part, count in tracks.items():
+        if not count:
             raise UserError(f"track.{part} gives no tracks; give at least one")
     if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
@@ -85,7 +86,7 @@ def check(config: DictConfig) -> None:
             check_guide(guide, env, f"guide.{name}")
         build_all(config.degrade, "degrade")
         if config.degrade:
-            _check_drives(config, cars)
+            _check_drives(config, tracks)
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
@@ -93,10 +94,10 @@ def check(config: DictConfig) -> None:
                 f"label={config.label} cannot name an agent: it must not be empty, not guide, and have no /; "
                 "take another"
             )
-        _check_training(config, cars["train"])
+        _check_training(config, tracks["train"])
         if config.method.transforms:
             for advice in config.evaluation.advice:
-                _check_drives(config, {"test": cars["test"]}, advice)
+                _check_drives(config, {"test": tracks["test"]}, advice)
     make_folder(Path(config.run_dir))
 
 
@@ -169,17 +170,17 @@ def check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
         raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
 
 
-def _check_drives(config: DictConfig, cars: Mapping[str, int], advice: str = "") -> None:
+def _check_drives(config: DictConfig, tracks: Mapping[str, int], advice: str = "") -> None:
     """Some ways to degrade advice need several cars; where guides and agents are judged there is one on each track."""
-    for part, tracks in cars.items():
-        overrides = {**config.evaluation.env, "num_cars": tracks}
+    for part, count in tracks.items():
+        overrides = {**config.evaluation.env, "num_cars": count}
         try:
             if advice:
                 build_env(config, overrides, advice=advice)
             else:
                 build_guided_env(config, overrides)
         except UserError as error:
-            raise UserError(f"track.{part} gives {tracks} to drive on, one car each: {error}") from error
+            raise UserError(f"track.{part} gives {count} to drive on, one car each: {error}") from error
 
 
 def _check_learner(config: DictConfig) -> None:
