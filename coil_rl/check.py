@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,11 +83,13 @@ def check(config: DictConfig) -> None:
     if training or OmegaConf.select(config, "run") is None:
         check_node(config.env, "env")
         env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
-        for name, guide in build_guides(config).items():
+        guides = build_guides(config)
+        for name, guide in guides.items():
             check_guide(guide, env, f"guide.{name}")
         build_all(config.degrade, "degrade")
         if config.degrade:
-            _check_drives(config, tracks)
+            for part, count in tracks.items():
+                _check_drive(config, part, count, partial(build_guided_env, guides=guides))
     build_all(config.evaluation.advice, "evaluation.advice")
     if training and config.method.observes is not None:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
@@ -97,7 +100,7 @@ def check(config: DictConfig) -> None:
         _check_training(config, tracks["train"])
         if config.method.transforms:
             for advice in config.evaluation.advice:
-                _check_drives(config, {"test": tracks["test"]}, advice)
+                _check_drive(config, "test", tracks["test"], partial(build_env, advice=advice))
     make_folder(Path(config.run_dir))
 
 
@@ -170,17 +173,12 @@ def check_guide(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
         raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(wanted)}")
 
 
-def _check_drives(config: DictConfig, tracks: Mapping[str, int], advice: str = "") -> None:
+def _check_drive(config: DictConfig, part: str, tracks: int, build_it: Callable[..., Any]) -> None:
     """Some ways to degrade advice need several cars; where guides and agents are judged there is one on each track."""
-    for part, count in tracks.items():
-        overrides = {**config.evaluation.env, "num_cars": count}
-        try:
-            if advice:
-                build_env(config, overrides, advice=advice)
-            else:
-                build_guided_env(config, overrides)
-        except UserError as error:
-            raise UserError(f"track.{part} gives {count} to drive on, one car each: {error}") from error
+    try:
+        build_it(config, {**config.evaluation.env, "num_cars": tracks})
+    except UserError as error:
+        raise UserError(f"track.{part} gives {tracks} to drive on, one car each: {error}") from error
 
 
 def _check_learner(config: DictConfig) -> None:
