@@ -2,22 +2,11 @@
 
 import pytest
 import torch
+from point_batches import SLOTS, random_batch, tensors
 from torch import Tensor
 
 from coil_rl.envs.self_evolving_spline import SelfEvolvingSpline
-from coil_rl.envs.splines import Spline, smoothing_spline
-
-SLOTS = 16
-
-
-def random_batch() -> tuple[Tensor, Tensor]:
-    draw = torch.Generator().manual_seed(3)
-    points = torch.randn(2, SLOTS, 37, dtype=torch.float64, generator=draw).cumsum(1)
-    return points, torch.randint(0, SLOTS + 1, (37,), generator=draw)
-
-
-def tensors(spline: Spline) -> tuple[Tensor, ...]:
-    return spline.knots, spline.values, spline.bends
+from coil_rl.envs.splines import smoothing_spline
 
 
 def test_wrong_arguments_are_named() -> None:

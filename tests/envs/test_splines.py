@@ -5,11 +5,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from point_batches import SLOTS, random_batch, tensors
 from scipy.interpolate import make_interp_spline, make_smoothing_spline
 from torch import Tensor
 
 from coil_rl.envs.splines import (
-    Spline,
     least_squares_parabola,
     quadratic_spline,
     smoothing_spline,
@@ -22,7 +22,6 @@ FITS = {
     "parabola": least_squares_parabola,
 }
 every_fit = pytest.mark.parametrize("fit", FITS.values(), ids=FITS.keys())
-SLOTS = 16
 steady = settings(derandomize=True, deadline=None, max_examples=40)
 seeds = st.integers(0, 2**31)
 
@@ -44,16 +43,6 @@ def padded(rows: list[np.ndarray], slots: int = SLOTS, garbage: float = 7.0) -> 
 
 def chord(row: np.ndarray) -> np.ndarray:
     return np.concatenate([[0], np.linalg.norm(np.diff(row), axis=0).cumsum()])
-
-
-def tensors(spline: Spline) -> tuple[Tensor, ...]:
-    return spline.knots, spline.values, spline.bends, spline.equidistant(7)
-
-
-def random_batch(dtype: torch.dtype = torch.float64, batch: int = 37) -> tuple[Tensor, Tensor]:
-    draw = torch.Generator().manual_seed(3)
-    points = torch.randn(2, SLOTS, batch, dtype=dtype, generator=draw).cumsum(1)
-    return points, torch.randint(0, SLOTS + 1, (batch,), generator=draw)
 
 
 @steady
