@@ -1,0 +1,75 @@
+"""Seeded runs whose logs and tables are compared with the ones in `tests/pins/`.
+
+After a change that is meant to alter numbers: `python tests/test_pins.py` writes the pins again, in that change's commit.
+"""
+
+import csv
+import math
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+from programs import LAP, called
+
+PINS = Path(__file__).parent / "pins"
+FILES = ("metrics.csv", "evaluation.csv")
+SMALL = [*LAP, "budget.frames=2048", "budget.cars=8", "budget.steps=64", "evaluation.repeats=1", "logger=none"]
+RUNS = {
+    "ppo": ["method=ppo"],
+    "coil": ["method=coil"],
+    "dagger": ["method=dagger", "learner.validate=false"],
+    "dynamic_coil_sequential": [
+        "method=dynamic_coil_sequential",
+        "guide=[spline,undertuned]",
+        "learner.phases.agent_phase.frames=512",
+        "learner.phases.guide_phase.frames=512",
+        "proxy.budget.frames=512",
+    ],
+    "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],
+}
+TOLERANCE = 1e-4  # relative; on one machine the numbers are the same to the bit, on another they round differently
+
+
+def run(name: str, folder: Path) -> Path:
+    called("train", *RUNS[name], *SMALL, f"hydra.run.dir={folder / name}", cwd=folder)
+    return folder / name
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def same(one: str, other: str) -> bool:
+    try:
+        return one == other or math.isclose(float(one), float(other), rel_tol=TOLERANCE, abs_tol=1e-6)
+    except ValueError:
+        return False
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_short_run_gives_the_pinned_numbers(name: str, tmp_path: Path) -> None:
+    folder = run(name, tmp_path)
+    for file in FILES:
+        found, pinned = rows(folder / file), rows(PINS / name / file)
+        assert [list(row) for row in found] == [list(row) for row in pinned], file
+        wrong = [
+            f"{file} row {number} {column}: {row[column]} instead of {pin[column]}"
+            for number, (row, pin) in enumerate(zip(found, pinned, strict=True))
+            for column in pin
+            if not same(row[column], pin[column])
+        ]
+        assert not wrong, wrong[:10]
+
+
+if __name__ == "__main__":
+    import torch
+
+    torch.set_num_threads(1)
+    with tempfile.TemporaryDirectory() as folder:
+        for name in RUNS:
+            made = run(name, Path(folder))
+            (PINS / name).mkdir(parents=True, exist_ok=True)
+            for file in FILES:
+                shutil.copy(made / file, PINS / name / file)
