@@ -4,10 +4,10 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from coil_rl.envs.cdr import definition
-from coil_rl.envs.mcap_files import Source, Stored
-from coil_rl.envs.recording_writer import RecordingWriter
-from coil_rl.envs.ros_messages import LaserScan, Odometry, Twist
+from coil_rl.envs.recordings.cdr import definition
+from coil_rl.envs.recordings.mcap_files import Source, Stored
+from coil_rl.envs.recordings.ros_messages import LaserScan, Odometry, Twist
+from coil_rl.envs.recordings.writer import RecordingWriter
 
 TURN = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns

@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 import torch  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
-from coil_rl import checkpoint  # noqa: E402
+from coil_rl.train import checkpoint  # noqa: E402
 
 SMALL = ["budget.frames=10240", "budget.cars=32", "budget.steps=16", "track=generated", "track.train.count=1",
          "track.test.count=1", "env.laps=1", "env.time_limit=2", "evaluation.repeats=2", "evaluation.gif=false",

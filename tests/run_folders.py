@@ -10,10 +10,9 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl import checkpoint
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build_env, build_learner
 from coil_rl.report import write_csv
+from coil_rl.train import checkpoint
+from coil_rl.train.build import build_env, build_learner
 
 Row = dict[str, Any]
 OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0, "clearance": 0.3}

@@ -95,7 +95,7 @@ def test_nobody_imports_the_folders_by_their_bare_names(folder: str) -> None:
         ("from coil_rl.transforms import GuideActions", ["coil_rl.transforms.GuideActions"]),
         ("from .. import transforms", ["coil_rl.transforms"]),
         ("def f():\n    from ..learners.ppo import PPO", ["coil_rl.learners.ppo.PPO"]),
-        ("from coil_rl import build", ["coil_rl.build"]),
+        ("from coil_rl import build", ["coil_rl.train.build"]),
         ("import envs.track", ["envs.track"]),
         ("import hydra", ["hydra"]),
     ],

@@ -1,6 +1,7 @@
 """Seeded runs whose logs and tables are compared with the ones in `tests/pins/`.
 
-After a change that is meant to alter numbers: `python tests/test_pins.py` writes the pins again, in that change's commit.
+After a change that is meant to alter numbers,
+`python tests/test_pins.py` writes the pins again, in that change's commit.
 """
 
 import csv

@@ -12,7 +12,7 @@ from torch.profiler import ProfilerActivity, profile
 from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from coil_rl.benchmark.turns import Turns, synchronise
-from coil_rl.build import build_all, build_bare_env
+from coil_rl.train.build import build_all, build_bare_env
 
 OPERATORS = 10
 

@@ -12,10 +12,10 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from coil_rl.benchmark.plain_ppo import PlainPPO
 from coil_rl.benchmark.turns import Sections, Turns, median_ratio
-from coil_rl.build import build, build_bare_env, build_env, build_guides, build_learner
-from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.rollout import Rollout
+from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner
+from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 METHODS = ("ppo", "coil")

@@ -17,7 +17,7 @@ import coil_rl
 from coil_rl.benchmark.driving import Driving, drive_env
 from coil_rl.benchmark.training import Training, has_yardstick
 from coil_rl.benchmark.turns import Turns, median_ratio
-from coil_rl.build import build
+from coil_rl.train.build import build
 
 ORACLE = Path(coil_rl.__file__).resolve().parents[1] / "tests" / "oracle.py"
 ORACLE_STEPS = 20

@@ -10,8 +10,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.build import build_bare_env, build_transforms
-from coil_rl.trained import configuration, policy
+from coil_rl.train.build import build_bare_env, build_transforms
+from coil_rl.train.load import load_policy, read_config
 
 
 class LearnedGuide(TensorDictModuleBase):
@@ -31,12 +31,12 @@ class LearnedGuide(TensorDictModuleBase):
     def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
         super().__init__()
         folder = Path(run).expanduser()
-        config = configuration(folder, "run", {"device": device})
+        config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
         # What the transforms need of an env are its specs; one of them is there for two cars or more.
         env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
-        self.policy, self.transforms = policy(folder, config, env, which), None
+        self.policy, self.transforms = load_policy(folder, config, env, which), None
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
         if config.method.needs_guide or config.action:
             self.transforms = env.transform

@@ -24,7 +24,7 @@ from coil_rl.errors import UserError
 from coil_rl.imitation import dataset as folders
 from coil_rl.imitation.regressor import Regressor
 from coil_rl.imitation.validation import cross_validated, scores
-from coil_rl.networks import Joined, Keyed
+from coil_rl.learners.networks import Joined, Keyed
 from coil_rl.transforms.action_space import ActionSpace
 
 
@@ -60,7 +60,7 @@ class Imitation:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
         >>> from coil_rl.imitation import Sklearn
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> from coil_rl.transforms import GuideActions
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))

@@ -11,7 +11,7 @@ from torchrl.modules import MLP
 from torchrl.objectives import BCLoss
 
 from coil_rl.imitation.regressor import Regressor
-from coil_rl.networks import Keyed, tanh_layers
+from coil_rl.learners.networks import Keyed, tanh_layers
 from coil_rl.schedules import Schedule, schedule
 
 

@@ -33,7 +33,7 @@ class A2C(ActorCritic):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> a2c = A2C(env)
         >>> metrics = a2c.update(Rollout(env, a2c.policy, steps=8).collect())

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
-from coil_rl import networks
+from coil_rl.learners import networks
 from coil_rl.learners.advantages import standardised
 from coil_rl.learners.guide_loss import AuxiliaryLoss
 from coil_rl.learners.limits import check_numbers

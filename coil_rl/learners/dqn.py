@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss
 
-from coil_rl import networks
+from coil_rl.learners import networks
 from coil_rl.learners.limits import check_numbers
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Schedule, schedule
@@ -51,7 +51,7 @@ class DQN(OffPolicy):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> from coil_rl.transforms import DiscreteActions
         >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_cars=64), DiscreteActions(5))
         >>> dqn = DQN(env, starts=256)

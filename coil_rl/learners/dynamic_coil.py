@@ -18,8 +18,8 @@ from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
-from coil_rl import networks
 from coil_rl.guides.advice import Advice
+from coil_rl.learners import networks
 from coil_rl.learners.phases import Phases
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Schedule, schedule
@@ -47,7 +47,7 @@ class DynamicCoil(PPO):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> first, second = (networks.Keyed(networks.Network(env, ["observation"], [8], 1, 1.0), ["observation"],
         ...                                 ["action"]) for _ in range(2))

@@ -38,7 +38,7 @@ class PPO(ActorCritic):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> ppo = PPO(env)
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())

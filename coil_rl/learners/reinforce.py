@@ -41,7 +41,7 @@ class Reinforce(ActorCritic):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> reinforce = Reinforce(env)
         >>> metrics = reinforce.update(Rollout(env, reinforce.policy, steps=32).collect())

@@ -15,7 +15,7 @@ import torch
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss
 
-from coil_rl import networks
+from coil_rl.learners import networks
 from coil_rl.learners.limits import check_numbers
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Schedule
@@ -48,7 +48,7 @@ class SAC(OffPolicy):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> sac = SAC(env, starts=256)
         >>> metrics = sac.update(Rollout(env, sac.policy, steps=8, keys=sac.keys).collect())

@@ -48,7 +48,7 @@ class TRPO(ActorCritic):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.rollout import Rollout
+        >>> from coil_rl.train.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
         >>> trpo = TRPO(env)
         >>> metrics = trpo.update(Rollout(env, trpo.policy, steps=32).collect())

@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.evaluation import drive
 from coil_rl.listening.parts import ADVICE, Intercepted
 from coil_rl.listening.places import PLACES, Places
+from coil_rl.train.evaluation import evaluate_policy
 
 
 class Ablation(NamedTuple):
@@ -79,5 +79,5 @@ def drive_ablated(
         silent = of_guide & ((place == everywhere) | (place == here)).unsqueeze(-1)
         return seen.set(ADVICE, torch.where(silent.unsqueeze(-1), silence, seen[ADVICE]))
 
-    episodes = drive(env, Intercepted(policy, remove), names=names, tick=tick).episodes
+    episodes = evaluate_policy(env, Intercepted(policy, remove), names=names, tick=tick).episodes
     return [episodes[start : start + share] for start in range(0, cars, share)]

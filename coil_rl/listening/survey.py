@@ -12,10 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.evaluation import Drive, drive
 from coil_rl.listening.measures import agreement, gradient, intervention
 from coil_rl.listening.parts import ADVICE, Intercepted
 from coil_rl.listening.places import Places
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace
 
@@ -34,7 +34,7 @@ class Survey:
     """
 
     guides: list[str]
-    drive: Drive
+    drive: EvaluationResult
     track: Tensor
     point: Tensor
     advice: Tensor
@@ -88,7 +88,7 @@ def survey(
         return seen
 
     listener, guides = Intercepted(policy, note), guide_names(env, policy)
-    driven = drive(env, listener, names=names, tick=tick)
+    driven = evaluate_policy(env, listener, names=names, tick=tick)
     steps = torch.tensor([episode["steps"] for episode in driven.episodes], device=env.device)
     running = torch.arange(len(moments), device=env.device).unsqueeze(-1) < steps
     states: TensorDictBase = torch.stack(moments)[running]

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from coil_rl.evaluation import summarise
 from coil_rl.listening.ablation import Ablation
 from coil_rl.listening.places import PLACES, Places, curvature
 from coil_rl.listening.survey import Survey
+from coil_rl.train.evaluation import summarise
 
 EVERYWHERE = "everywhere"
 

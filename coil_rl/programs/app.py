@@ -18,10 +18,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl import config as _schema  # noqa: F401  registers the typed roots
-from coil_rl.check import check
 from coil_rl.errors import UserError
 from coil_rl.programs.refusal import refuse
+from coil_rl.train.check import check
 
 
 def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check) -> None:

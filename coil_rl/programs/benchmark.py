@@ -20,11 +20,11 @@ from coil_rl.benchmark.summary import goals, summarise
 from coil_rl.benchmark.training import measure_shares, measure_training
 from coil_rl.benchmark.turns import Turns
 from coil_rl.benchmark.yardsticks import measure_oracle, measure_sb3
-from coil_rl.build import learner_kind
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app
-from coil_rl.programs.versions import versions
+from coil_rl.train.build import learner_kind
+from coil_rl.train.versions import versions
 
 SETTINGS = ("device", "threads", "seed", "seconds", "repeats", "starts", "quick", "parts", "preset", "guide", "learner")
 

@@ -8,10 +8,10 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from coil_rl import proxies
-from coil_rl.build import build_guides
-from coil_rl.programs import app, training
+from coil_rl.programs import app
 from coil_rl.report import markdown_table
+from coil_rl.train import distillation, run
+from coil_rl.train.build import build_guides
 
 COLUMNS = {
     "guide": ("guide", ""),
@@ -30,8 +30,8 @@ def distill(config: DictConfig) -> float:
     """Make the proxy of every guide that is not there yet; returns the lowest mean test reward of one."""
     table = []
     for name in build_guides(config):
-        wanted = proxies.configuration(config, name)
-        reward = training.run(wanted, wait=True)
+        wanted = distillation.configuration(config, name)
+        reward = run.run(wanted, wait=True)
         table.append({"guide": name, "reward": reward, **_found(Path(wanted.run_dir))})
     print(markdown_table(table, COLUMNS))
     worst = min(table, key=lambda row: float(row["reward"]))

@@ -8,10 +8,10 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from coil_rl.build import build_env
 from coil_rl.programs import app
-from coil_rl.programs.judge import judge, outcome
-from coil_rl.trained import configuration, policy
+from coil_rl.train.build import build_env
+from coil_rl.train.evaluate_run import evaluate_run, outcome
+from coil_rl.train.load import load_policy, read_config
 
 
 def evaluate(config: DictConfig) -> float:
@@ -22,7 +22,7 @@ def evaluate(config: DictConfig) -> float:
     seed, agent = config.seed, None
     if config.run is not None:
         config, agent = restore(Path(config.run), config)
-    judge(config, agent, folder, seed)
+    evaluate_run(config, agent, folder, seed)
     return outcome(folder)
 
 
@@ -35,10 +35,10 @@ def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module |
     resolved: Any = OmegaConf.to_container(asked, resolve=True)
     # The run was trained with advice of its own; this is what else to show it.
     resolved["evaluation"]["advice"] |= resolved["degrade"]
-    config = configuration(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
+    config = read_config(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
     if config.method.observes is None:
         return config, None
-    return config, policy(run, config, build_env(config), config.evaluation.policy)
+    return config, load_policy(run, config, build_env(config), config.evaluation.policy)
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from coil_rl.programs.versions import versions
+from coil_rl.train.versions import versions
 
 
 def main() -> None:

@@ -9,8 +9,6 @@ import torch
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from coil_rl.build import build, build_env
-from coil_rl.check import check as check_common
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.listening import Places, ablations, drive_ablated, split, survey
@@ -18,6 +16,8 @@ from coil_rl.listening.tables import EVERYWHERE, along, along_lines, by_place
 from coil_rl.programs import app
 from coil_rl.programs.evaluate import restore
 from coil_rl.report import draw_listening_map, markdown_table, write_csv
+from coil_rl.train.build import build, build_env
+from coil_rl.train.check import check as check_common
 
 COLUMNS = {
     "guide": ("guide", ""),

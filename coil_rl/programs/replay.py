@@ -12,9 +12,6 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from coil_rl import trained
-from coil_rl.build import build, build_guides
-from coil_rl.check import check_guide, check_values, make_folder
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
@@ -33,6 +30,9 @@ from coil_rl.replay import (
 from coil_rl.replay.names import numbered, of_runs, plain, repeated
 from coil_rl.replay.tables import extent, farthest, notes
 from coil_rl.report import write_csv
+from coil_rl.train import load
+from coil_rl.train.build import build, build_guides
+from coil_rl.train.check import check_guide, check_values, make_folder
 
 Runs = Mapping[str, tuple[Path, DictConfig]]
 
@@ -88,12 +88,12 @@ def find_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policie
     folders = [Path(run).expanduser() for run in config.runs]
     if twice := repeated([str(folder.resolve()) for folder in folders]):
         raise UserError(f"runs names {twice} twice; leave one out")
-    kept = [trained.configuration(folder, "runs", {"device": config.device}) for folder in folders]
+    kept = [load.read_config(folder, "runs", {"device": config.device}) for folder in folders]
     called = [plain(name) for name in guides], of_runs([own.label for own in kept], [own.seed for own in kept])
     if twice := repeated([RECORDED, *called[0], *called[1]]):
         raise UserError(f"two policies would be called {twice}; leave one out, or give the guide another name")
     runs = dict(zip(called[1], zip(folders, kept, strict=True), strict=True))
-    agents = {name: trained.in_env(run, own, env, config.policy) for name, (run, own) in runs.items()}
+    agents = {name: load.load_policy_in_env(run, own, env, config.policy) for name, (run, own) in runs.items()}
     return runs, {name: (env, guide) for name, guide in zip(called[0], guides.values(), strict=True)} | agents
 
 
@@ -107,7 +107,7 @@ def write(config: DictConfig, found: OpenLoop, runs: Runs, folder: Path) -> None
     for name, (run, _) in runs.items():
         attached[f"{name}/config.yaml"] = (run / "config.yaml").read_bytes()
         about[f"{name}_config_sha256"] = _sum(attached[f"{name}/config.yaml"])
-        about[f"{name}_checkpoint_sha256"] = _sum(trained.weights(run, config.policy).read_bytes())
+        about[f"{name}_checkpoint_sha256"] = _sum(load.weights_file(run, config.policy).read_bytes())
     annotate(
         found,
         folder / "annotated.mcap",

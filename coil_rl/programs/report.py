@@ -12,7 +12,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.check import check_keys
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app
@@ -21,6 +20,7 @@ from coil_rl.report.comparison import Comparison, compare
 from coil_rl.report.runs import GUIDE, Run, read_runs
 from coil_rl.report.statistics import iqm
 from coil_rl.signature import near
+from coil_rl.train.check import check_keys
 
 ACTIONS = {"deterministic": ("deterministic",), "sampled": ("sampled",), "both": ("deterministic", "sampled")}
 USUAL = "ppo"  # what improvement is over, unless it is said

@@ -13,15 +13,15 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 from tqdm import tqdm
 
-from coil_rl.build import build
-from coil_rl.check import check_keys
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app, sweeps
-from coil_rl.programs.versions import versions
 from coil_rl.report.runs import read_runs
 from coil_rl.reproduce import Result, Runs, pages
 from coil_rl.signature import near
+from coil_rl.train.build import build
+from coil_rl.train.check import check_keys
+from coil_rl.train.versions import versions
 
 KINDS = ("table", "figure", "claim")
 LAUNCHER = ("hydra/launcher=", "hydra.launcher.")

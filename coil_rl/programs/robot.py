@@ -10,17 +10,17 @@ import torch
 from omegaconf import DictConfig, open_dict
 from tqdm import tqdm
 
-from coil_rl.build import build, build_bare_env, build_guided_env, build_guides
-from coil_rl.check import check as check_common
 from coil_rl.envs import SimulatedRobotEnv
-from coil_rl.envs.simulated_recordings import record_labelling_drives
+from coil_rl.envs.robot.simulated_recordings import record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
-from coil_rl.guide_drives import driver_names
 from coil_rl.programs import app
 from coil_rl.reproduce import Result
-from coil_rl.robot_drives import Driver, agent_of, record
-from coil_rl.trained import configuration
+from coil_rl.robot.drives import Driver, agent_of, record
+from coil_rl.train.build import build, build_bare_env, build_guided_env, build_guides
+from coil_rl.train.check import check as check_common
+from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.load import read_config
 
 # From each step, in the order in which they build on each other, to what it leaves.
 STEPS = {"record": "labelling", "train": "figure_25.md", "drive": "drives", "table": "table_6.md"}
@@ -54,7 +54,7 @@ def _record(config: DictConfig, folder: Path) -> None:
 def _see_with(config: DictConfig, classifier: Path) -> None:
     """Let the robots see with the classifier in a file."""
     with open_dict(config):
-        target = {"_target_": "coil_rl.perception.load_classifier", "path": str(classifier)}
+        target = {"_target_": "coil_rl.robot.load_classifier", "path": str(classifier)}
         config.env.perception.classifier = target
 
 
@@ -76,7 +76,7 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
         seated = partial(build_guided_env, config, overrides, {name: guide})
         yield Driver(f"{number:02d}_{called}".replace(" ", "_"), {"policy": called}, seated)
     for number, run in enumerate(map(Path, config.runs), start=len(guides)):
-        of_run = configuration(run, "runs", {"device": config.device})
+        of_run = read_config(run, "runs", {"device": config.device})
         name = f"{number:02d}_{of_run.label}_seed{of_run.seed}".replace(" ", "_")
         bare = partial(build_bare_env, config, overrides)
         yield agent_of(run, of_run, bare, config.evaluation.policy, name)

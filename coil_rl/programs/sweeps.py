@@ -20,10 +20,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl import config as _schema  # noqa: F401  registers the typed roots
 from coil_rl.errors import UserError
-from coil_rl.programs.judge import is_judged
 from coil_rl.sentence import sentence
+from coil_rl.train.evaluate_run import is_evaluated
 
 Choice = tuple[str, ...]  # what is swept besides the seed, as on a command line
 
@@ -50,13 +49,13 @@ class Sweep:
     @property
     def missing(self) -> list[Path]:
         """Those that have not been judged."""
-        return [folder for folder in self.all_folders if not is_judged(folder)]
+        return [folder for folder in self.all_folders if not is_evaluated(folder)]
 
     def commands(self) -> list[list[str]]:
         """What `coil-train` is to be given so that what is missing is done: as few sweeps as that takes."""
         of_seeds: dict[tuple[int, ...], list[Choice]] = {}
         for choice, by_seed in self.folders.items():
-            seeds = tuple(seed for seed, folder in by_seed.items() if not is_judged(folder))
+            seeds = tuple(seed for seed, folder in by_seed.items() if not is_evaluated(folder))
             if seeds:
                 of_seeds.setdefault(seeds, []).append(choice)
         sweeps = [(seeds, part) for seeds, choices in of_seeds.items() for part in _products(choices)]

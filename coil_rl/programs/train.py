@@ -8,15 +8,16 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from coil_rl.errors import UserError
-from coil_rl.programs import app, run_folder, training
-from coil_rl.trained import configuration
+from coil_rl.programs import app
+from coil_rl.train import run, run_folder
+from coil_rl.train.load import read_config
 
 
 def train(config: DictConfig) -> float:
     """Run one configuration; returns the mean test reward of its deterministic policy."""
     if config.resume is not None:
         raise UserError(f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER")
-    return training.run(config)
+    return run.run(config)
 
 
 def resume(folder: Path) -> float:
@@ -25,11 +26,11 @@ def resume(folder: Path) -> float:
     Raises:
         UserError: if the folder holds no run, or one that cannot go on.
     """
-    config = configuration(folder, "resume")
+    config = read_config(folder, "resume")
     folder = folder.absolute()
     config.run_dir = str(folder)
-    with run_folder.claimed(folder):
-        return training.go_on(config, folder)
+    with run_folder.locked(folder):
+        return run.go_on(config, folder)
 
 
 def main() -> None:

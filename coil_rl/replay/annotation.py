@@ -8,9 +8,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from coil_rl.envs.mcap_files import digest
-from coil_rl.envs.recording_writer import RecordingWriter
-from coil_rl.envs.replay_messages import add_sight, add_steering, copy_topics
+from coil_rl.envs.recordings.mcap_files import digest
+from coil_rl.envs.recordings.replay_messages import add_sight, add_steering, copy_topics
+from coil_rl.envs.recordings.writer import RecordingWriter
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import style
 

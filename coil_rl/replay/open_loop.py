@@ -15,8 +15,8 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.envs.mcap_replay import McapReplayEnv
-from coil_rl.envs.recordings import Recording
+from coil_rl.envs.recordings.reading import Recording
+from coil_rl.envs.recordings.replay_env import McapReplayEnv
 from coil_rl.envs.reward import HISTORY, recent_mean
 
 RECORDED = "recorded"  # what the robot was told, as if it were one more policy

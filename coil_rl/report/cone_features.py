@@ -62,7 +62,7 @@ def draw_cone_features(
     """Draw clusters of LiDAR points by the two principal components of their features.
 
     Args:
-        features: [N, F], see `coil_rl.envs.clusters`.
+        features: [N, F], see `coil_rl.envs.robot.clusters`.
         thick: [N], which clusters are of thick cones.
         path: the picture, in the format of its ending, 8 inches wide.
         wrong: [N], which clusters the classifier takes for the other kind; they get a ring.

@@ -9,9 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from coil_rl.envs.recordings import Recording, read_recording
-from coil_rl.envs.simulated_recordings import record_labelling_drives, surveyed_drive
-from coil_rl.perception import (
+from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.cone_features import draw_cone_features
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.robot import (
     Share,
     Training,
     accuracy,
@@ -21,10 +24,7 @@ from coil_rl.perception import (
     save_classifier,
     train_on_drives,
 )
-from coil_rl.perception.labelling import Scans, one_sided
-from coil_rl.report import markdown_table, write_csv
-from coil_rl.report.cone_features import draw_cone_features
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.robot.labelling import Scans, one_sided
 
 PAPER = Share(240, 243)
 DRAWN_EVERY = 4  # scans

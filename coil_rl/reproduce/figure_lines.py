@@ -10,17 +10,17 @@ import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from coil_rl import trained
-from coil_rl.build import build, build_env
 from coil_rl.envs.track import Track
 from coil_rl.errors import UserError
-from coil_rl.evaluation import Drive, drive
-from coil_rl.guide_drives import drive_guides
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.runs import Run
 from coil_rl.report.straightened import Straightened
 from coil_rl.reproduce.figure_lines_picture import draw_straightened
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
+from coil_rl.train import load
+from coil_rl.train.build import build, build_env
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.guide_drives import drive_guides
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -74,7 +74,7 @@ class FigureLines(Result):
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make it: see `Result`."""
         chosen = self._chosen({experiment: runs[experiment] for experiment in self.experiments})
-        configs = {label: trained.configuration(run.folder, "run", {"device": "cpu"}) for label, run in chosen.items()}
+        configs = {label: load.read_config(run.folder, "run", {"device": "cpu"}) for label, run in chosen.items()}
         first = configs[self.labels[0]]
         tracks: list[Track] = build(first.track.test, "track.test")[: self.tracks]
         names = [track.name for track in tracks]
@@ -106,11 +106,11 @@ class FigureLines(Result):
             found[label] = of_seed[0]
         return found
 
-    def _driven(self, folder: Path, config: DictConfig, names: Sequence[str], bar: tqdm[Any]) -> Drive:
+    def _driven(self, folder: Path, config: DictConfig, names: Sequence[str], bar: tqdm[Any]) -> EvaluationResult:
         """The agent of a run, on each track once."""
         env = build_env(config, {**config.evaluation.env, "num_cars": len(names)})
-        policy = trained.policy(folder, config, env, self.policy)
-        return drive(env, policy, names=names, tick=bar.update)
+        policy = load.load_policy(folder, config, env, self.policy)
+        return evaluate_policy(env, policy, names=names, tick=bar.update)
 
 
 def _way(straight: Straightened, length: float, line: Any, laps: int) -> dict[str, float]:

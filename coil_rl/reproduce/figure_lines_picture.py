@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from coil_rl.envs.track import SIDES, Track
-from coil_rl.evaluation import Drive
 from coil_rl.listening.places import LEFT, RIGHT
 from coil_rl.report import style
 from coil_rl.report.straightened import Straightened
 from coil_rl.reproduce.result import lighten, picture
+from coil_rl.train.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,11 @@ MARKS = 20  # m
 
 
 def draw_straightened(
-    tracks: Sequence[Track], straightened: Sequence[Straightened], drives: Mapping[str, Drive], path: Path, title: str
+    tracks: Sequence[Track],
+    straightened: Sequence[Straightened],
+    drives: Mapping[str, EvaluationResult],
+    path: Path,
+    title: str,
 ) -> None:
     """Draw the last lap of every driver on every track, and how smoothly it was steered there.
 

@@ -9,16 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs import Perception, simulated_cone_classifier, simulated_drive
-from coil_rl.envs.clusters import FEATURES
-from coil_rl.envs.simulated_lidar import LEAST
-from coil_rl.envs.simulated_recordings import TEST_SEED
+from coil_rl.envs.robot.clusters import FEATURES
+from coil_rl.envs.robot.lidar import LEAST
+from coil_rl.envs.robot.simulated_recordings import TEST_SEED
 from coil_rl.envs.track import SIDES
-from coil_rl.perception import accuracy, label_clusters
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_scan_look import Look, look
 from coil_rl.reproduce.figure_scan_picture import draw
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.robot import accuracy, label_clusters
 
 KINDS = ("thin", "thick")
 

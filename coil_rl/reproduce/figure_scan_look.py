@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from coil_rl.envs import Perception, SimulatedDrive
-from coil_rl.envs.boundary_memory import BoundaryMemory
-from coil_rl.envs.clusters import Clusters, measure, points_of, single_linkage
+from coil_rl.envs.robot.boundary_memory import BoundaryMemory
+from coil_rl.envs.robot.clusters import Clusters, measure, points_of, single_linkage
+from coil_rl.envs.robot.lidar import MOST
 from coil_rl.envs.sight import Frame
-from coil_rl.envs.simulated_lidar import MOST
 from coil_rl.guides import SplineGuide
-from coil_rl.perception.labelling import majority
 from coil_rl.reproduce.facing_up import FINE, places_of, rows
+from coil_rl.robot.labelling import majority
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

@@ -12,7 +12,7 @@ from matplotlib.patches import Circle, Rectangle
 from numpy.typing import NDArray
 
 from coil_rl.envs import Perception
-from coil_rl.envs.robot_course import OUTLINE
+from coil_rl.envs.robot.course import OUTLINE
 from coil_rl.report import style
 from coil_rl.reproduce.facing_up import (
     CONES,

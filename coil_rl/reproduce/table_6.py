@@ -11,18 +11,18 @@ from omegaconf import OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
-from coil_rl.build import build_guides
 from coil_rl.envs import SimulatedRobotEnv
-from coil_rl.envs.recordings import SIMULATED, Recording, read_recording
+from coil_rl.envs.recordings.reading import SIMULATED, Recording, read_recording
 from coil_rl.errors import UserError
-from coil_rl.guide_drives import driver_names
 from coil_rl.report import write_csv
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.reproduce.table_6_measures import measure, smoothness
 from coil_rl.reproduce.table_6_page import page
 from coil_rl.reproduce.table_6_picture import draw_drives
-from coil_rl.robot_drives import Driver, agent_of, record
-from coil_rl.trained import configuration
+from coil_rl.robot.drives import Driver, agent_of, record
+from coil_rl.train.build import build_guides
+from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.load import read_config
 
 
 class Table6(Result):
@@ -116,13 +116,13 @@ class Table6(Result):
             max_steering=self.max_steering, seed=self.seed,
         )  # fmt: skip
         chosen = [run for of_label in called(self.labels, runs).values() for run in of_label]
-        first = configuration(chosen[0].folder, "run", {"device": "cpu"})
+        first = read_config(chosen[0].folder, "run", {"device": "cpu"})
         guides = build_guides(first)
         for driver, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
             about = {"policy": driver, "guide": json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))}
             yield Driver(driver.replace(" ", "_"), about, partial(_seated, robots, guide))
         for run in chosen:
-            yield agent_of(run.folder, configuration(run.folder, "run", {"device": "cpu"}), robots)
+            yield agent_of(run.folder, read_config(run.folder, "run", {"device": "cpu"}), robots)
 
 
 def _seated(robots: Callable[[], EnvBase], guide: TensorDictModuleBase) -> tuple[EnvBase, TensorDictModuleBase]:

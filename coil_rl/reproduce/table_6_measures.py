@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tensordict.nn import TensorDictModule
 
-from coil_rl.envs.mcap_replay import McapReplayEnv
-from coil_rl.envs.recordings import SIMULATED, Recording
-from coil_rl.envs.robot_course import RobotCourse, middle_line
-from coil_rl.envs.robot_laps import laps
-from coil_rl.envs.simulated_recordings import track_of
+from coil_rl.envs.recordings.reading import SIMULATED, Recording
+from coil_rl.envs.recordings.replay_env import McapReplayEnv
+from coil_rl.envs.robot.course import RobotCourse, middle_line
+from coil_rl.envs.robot.laps import laps
+from coil_rl.envs.robot.simulated_recordings import track_of
 from coil_rl.envs.track import Track
 
 Array = NDArray[np.float64]

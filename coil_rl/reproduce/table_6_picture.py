@@ -11,7 +11,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from coil_rl.envs.robot_course import THICK, THIN
+from coil_rl.envs.robot.course import THICK, THIN
 from coil_rl.report import style
 from coil_rl.reproduce.result import picture
 from coil_rl.reproduce.table_6_measures import Drive

@@ -9,9 +9,9 @@ from torchrl.envs import TransformedEnv
 from coil_rl.envs import TabularEnv
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.ppo import PPO
-from coil_rl.rollout import Rollout
 from coil_rl.tabular import Gridworld, garnet, solve, toymaker, value_iteration
 from coil_rl.testing import check_env, check_transform
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 

@@ -7,8 +7,8 @@ from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import PPO
-from coil_rl.rollout import Rollout
 from coil_rl.testing import check_env, check_transform
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import (
     BiasedAdvice,
     DelayedAdvice,

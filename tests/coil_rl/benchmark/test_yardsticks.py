@@ -3,7 +3,6 @@ from types import SimpleNamespace
 import oracle
 from hydra import compose, initialize_config_module
 
-from coil_rl import config as _schema  # noqa: F401  registers the typed roots
 from coil_rl.benchmark import yardsticks
 from coil_rl.benchmark.turns import Turns
 

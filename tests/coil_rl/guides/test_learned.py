@@ -3,13 +3,12 @@ import torch
 from hydra import compose, initialize_config_module
 from run_folders import make_untrained_run
 
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build_env, build_guides
 from coil_rl.errors import UserError
-from coil_rl.evaluation import drive
 from coil_rl.guides.learned import LearnedGuide
 from coil_rl.programs.evaluate import restore
 from coil_rl.testing import check_guide
+from coil_rl.train.build import build_env, build_guides
+from coil_rl.train.evaluation import evaluate_policy
 
 TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
         "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
@@ -29,9 +28,9 @@ def run(request, tmp_path_factory):
 def test_it_drives_as_the_policy_does_in_the_env_it_was_trained_in(run):
     config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
     overrides = {"num_cars": 3, "assignment": "cyclic"}
-    alone = drive(build_env(config, overrides), agent)
+    alone = evaluate_policy(build_env(config, overrides), agent)
     guided = composed(*TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
-    learned = drive(build_env(guided, overrides), build_guides(guided)["learned"])
+    learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in alone.episodes]
 
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
-from coil_rl.evaluation import drive
 from coil_rl.guides import RacingGuide, SplineGuide
 from coil_rl.testing import check_guide
+from coil_rl.train.evaluation import evaluate_policy
 
 # Two midpoints, (2, 0.5) and (3, 0.5), and with a spacing of 1 m just these targets.
 TWO_TARGETS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])
@@ -39,7 +39,7 @@ def arc(x, y, turn=1.4):
 
 
 def lap(track, guide, rate=24.0):
-    return drive(ConeTrackEnv([track], 1, rate=rate, laps=1), guide).episodes[0]
+    return evaluate_policy(ConeTrackEnv([track], 1, rate=rate, laps=1), guide).episodes[0]
 
 
 def test_arc_to_the_farthest_target_that_is_clear_is_driven():

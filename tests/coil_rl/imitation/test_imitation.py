@@ -9,13 +9,13 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, GymEnv, PendulumEnv, TransformedEnv
 
-from coil_rl import checkpoint
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.imitation import Imitation, Network, Sklearn
 from coil_rl.imitation.dataset import save
-from coil_rl.rollout import Rollout
+from coil_rl.train import checkpoint
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 REGRESSORS = {

@@ -21,9 +21,9 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from sklearn.svm import SVR
 
-from coil_rl import checkpoint
 from coil_rl.errors import UserError
 from coil_rl.imitation import Sklearn
+from coil_rl.train import checkpoint
 
 ESTIMATORS = [
     LinearRegression(),

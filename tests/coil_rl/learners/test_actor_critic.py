@@ -8,10 +8,10 @@ import worlds
 from cart_poles import CartPoles
 from torchrl.envs import RewardSum, TransformedEnv
 
-from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.learners import A2C, TRPO, GuideLoss, Reinforce
-from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import JumpStart, Takeover
 
 LEARNERS = [A2C, TRPO, Reinforce]  # besides PPO, which has a file of its own

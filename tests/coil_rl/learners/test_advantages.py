@@ -4,8 +4,8 @@ from torchrl.objectives.value import GAE
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide
 from coil_rl.learners.advantages import Advantages
-from coil_rl.networks import critic
-from coil_rl.rollout import Rollout
+from coil_rl.learners.networks import critic
+from coil_rl.train.rollout import Rollout
 
 
 def batch_with_every_end(ring):

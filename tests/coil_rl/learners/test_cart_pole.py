@@ -5,10 +5,10 @@ import torch
 from cart_poles import CartPoles
 from torchrl.envs import RewardSum, TransformedEnv
 
-from coil_rl.evaluation import drive
 from coil_rl.learners import A2C, DQN, PPO, TRPO, Reinforce
-from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.train.rollout import Rollout
 
 
 def frames_to_solve(learner, carts, steps, frames, seed=0, **options):
@@ -58,4 +58,4 @@ def test_dqn_solves_it():
     rollout = Rollout(env, dqn.policy, 16, dqn.keys)
     for update in range(195):  # 50,000 steps
         dqn.update(rollout.collect(update / 195), update / 195)
-    assert drive(CartPoles(100, seed=1), dqn.policy).mean_reward >= 475
+    assert evaluate_policy(CartPoles(100, seed=1), dqn.policy).mean_reward >= 475

@@ -8,10 +8,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl import networks
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.learners import AfterFrames, DynamicCoil, Phases
-from coil_rl.rollout import Rollout
+from coil_rl.learners import AfterFrames, DynamicCoil, Phases, networks
+from coil_rl.train.rollout import Rollout
 
 
 def cars():

@@ -7,8 +7,8 @@ from torch.distributions import Normal, kl_divergence
 
 from coil_rl.learners import PPO, GuideLoss
 from coil_rl.learners.guide_loss import EDGE
-from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.train.rollout import Rollout
 
 
 def some(env, in_keys=("observation",), steps=16):

@@ -3,9 +3,8 @@
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build_env, build_learner
-from coil_rl.rollout import Rollout
+from coil_rl.train.build import build_env, build_learner
+from coil_rl.train.rollout import Rollout
 
 
 @pytest.mark.parametrize("learner", ["a2c", "reinforce", "trpo"])

@@ -5,10 +5,10 @@ import torch
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.experiment import Experiment, watched_keys
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import DQN, SAC
-from coil_rl.rollout import Rollout
+from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import DelayedAdvice, DiscreteActions, GuideActions
 
 TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8]}

@@ -7,8 +7,8 @@ from torchrl.envs import GymEnv, PendulumEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import PPO
-from coil_rl.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import JumpStart, Takeover
 
 

@@ -7,7 +7,7 @@ from cart_poles import CartPoles
 
 from coil_rl.learners import TRPO, GuideLoss
 from coil_rl.learners.trpo import conjugate_gradients
-from coil_rl.rollout import Rollout
+from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import Takeover
 
 

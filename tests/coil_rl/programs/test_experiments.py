@@ -6,9 +6,8 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.check import check
 from coil_rl.programs.train import train
+from coil_rl.train.check import check
 
 CONF = Path(__file__).parents[3] / "conf"
 EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))

@@ -5,11 +5,10 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.build import build_env, build_learner
-from coil_rl.check import check
 from coil_rl.errors import UserError
-from coil_rl.rollout import Rollout
+from coil_rl.train.build import build_env, build_learner
+from coil_rl.train.check import check
+from coil_rl.train.rollout import Rollout
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
 DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]

@@ -9,13 +9,12 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from coil_rl import config as _schema  # noqa: F401
-from coil_rl.check import check
 from coil_rl.errors import UserError
-from coil_rl.evaluation import drive
 from coil_rl.imitation import dataset
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
+from coil_rl.train.check import check
+from coil_rl.train.evaluation import evaluate_policy
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
 # What these are made of is also in another: one learner and one more option, one transform in place of another.
@@ -134,7 +133,7 @@ def test_residual_of_scale_zero_is_the_guide_exactly(tmp_path):
 def test_driving_leaves_what_is_only_for_learning_out(residual):
     config, agent = evaluate.restore(residual, compose_evaluate(residual))
     env = evaluate.build_env(config, {"num_cars": 2})
-    drive(env, agent)
+    evaluate_policy(env, agent)
     assert not env.transform.training
 
 

@@ -11,13 +11,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called
 
-from coil_rl import checkpoint
-from coil_rl.build import build, build_env
-from coil_rl.check import check
-from coil_rl.config import Train  # noqa: F401  registers the schema
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate, train
 from coil_rl.sentence import sentence
+from coil_rl.train import checkpoint
+from coil_rl.train.build import build, build_env
+from coil_rl.train.check import check
 
 TINY = ["budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1", "track.test.count=1"]
 # All examples of a test share its folder; each looks at what it adds.

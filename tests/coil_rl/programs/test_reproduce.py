@@ -8,7 +8,6 @@ from hydra.utils import instantiate
 from programs import TRACK, called, program
 from run_folders import driven, make_run
 
-from coil_rl import config as _schema  # noqa: F401
 from coil_rl.programs import sweeps
 from coil_rl.programs.reproduce import ALL
 

@@ -7,11 +7,11 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import called
 
-import coil_rl.config  # noqa: F401  registers the typed roots
-from coil_rl import checkpoint
-from coil_rl.build import build_env, build_learner
+import coil_rl.train.config  # noqa: F401  registers the typed roots
 from coil_rl.envs import McapReplayEnv, Perception, read_recording, simulated_cone_classifier
 from coil_rl.guides import SplineGuide
+from coil_rl.train import checkpoint
+from coil_rl.train.build import build_env, build_learner
 
 SHORT = ["evaluation.repeats=1", "env.time_limit=2"]
 SMALL = [*SHORT, "figure_25.pairs=2", "figure_25.tests=1"]

@@ -6,10 +6,10 @@ import pytest
 from PIL import Image
 
 from coil_rl.envs import RecordingError, read_recording, save_drive, simulated_drive
-from coil_rl.envs.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
 from coil_rl.errors import UserError
-from coil_rl.perception import accuracy, label_clusters, load_classifier
 from coil_rl.reproduce import Figure25
+from coil_rl.robot import accuracy, label_clusters, load_classifier
 
 
 @pytest.fixture(scope="module")

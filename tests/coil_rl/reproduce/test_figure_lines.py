@@ -6,15 +6,15 @@ from PIL import Image
 from programs import LAP
 from run_folders import make_untrained_run
 
-from coil_rl import trained
-from coil_rl.build import build_env
 from coil_rl.envs import shipped_tracks
 from coil_rl.errors import UserError
-from coil_rl.evaluation import drive
 from coil_rl.report.runs import Run
 from coil_rl.report.straightened import Straightened
 from coil_rl.reproduce import FigureLines
 from coil_rl.reproduce.figure_lines_picture import last_lap
+from coil_rl.train import load
+from coil_rl.train.build import build_env
+from coil_rl.train.evaluation import evaluate_policy
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def test_each_driver_drives_as_its_own_run_does(made, runs):
     _, rows, _ = made
     assert [(row["driver"], row["crashed"]) for row in rows] == [("guide", "False"), ("ppo", "True"), ("coil", "True")]
     run = runs["mine"][1].folder
-    config = trained.configuration(run, "run")
+    config = load.read_config(run, "run")
     env = build_env(config, {**config.evaluation.env, "num_cars": 1})
-    (alone,) = drive(env, trained.policy(run, config, env)).episodes
+    (alone,) = evaluate_policy(env, load.load_policy(run, config, env)).episodes
     assert {key: float(rows[2][key]) for key in ("reward", "smoothness")} == pytest.approx(
         {key: alone[key] for key in ("reward", "smoothness")}
     )

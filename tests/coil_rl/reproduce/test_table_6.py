@@ -9,10 +9,10 @@ from run_folders import make_untrained_run
 
 from coil_rl.envs import RecordingError, SimulatedRobotEnv, read_recording, record_drives
 from coil_rl.errors import UserError
-from coil_rl.evaluation import drive
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.report.runs import Run
 from coil_rl.reproduce import Table6
+from coil_rl.train.evaluation import evaluate_policy
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +33,14 @@ def rows_of(path):
 def test_recordings_tell_what_the_simulation_measured(crash, tmp_path):
     page = Table6(recordings=[str(crash)]).make(tmp_path / "table_6")
     rows = {row["recording"]: row for row in rows_of(tmp_path / "table_6.csv")}
-    live = drive(SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4), SplineGuide()).episodes
+    live = evaluate_policy(SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4), SplineGuide()).episodes
     for robot, episode in enumerate(live):
         row = rows[f"{robot}.mcap"]
         assert float(row["smoothness"]) == pytest.approx(episode["smoothness"], abs=1e-5)
         assert float(row["clearance"]) == pytest.approx(episode["clearance"], abs=1e-5)
         assert row["crashed"] == "False"
         assert float(row["off_centre"]) < 0.05
-    (ended,) = drive(SimulatedRobotEnv(seed=4), ConstantGuide(1.0)).episodes
+    (ended,) = evaluate_policy(SimulatedRobotEnv(seed=4), ConstantGuide(1.0)).episodes
     assert rows["crash.mcap"]["crashed"] == "True"
     assert float(rows["crash.mcap"]["clearance"]) == pytest.approx(ended["clearance"], abs=1e-5)
     assert "## Table 6: the robot (simulated)" in page

@@ -1,0 +1,1 @@
+"""A training run: configuration, building of parts, rollouts, updates, evaluation, checkpoints and the run folder."""

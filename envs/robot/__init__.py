@@ -1,0 +1,1 @@
+"""A simulated robot with a LiDAR, and the perception of cones in its scans."""

@@ -1,0 +1,61 @@
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torch.nn import Linear
+from torchrl.envs import GymEnv, PendulumEnv, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import ZeroGuide
+from coil_rl.learners.networks import Keyed, actor, critic
+from coil_rl.transforms import GuideActions
+
+
+def test_actions_of_a_bounded_env_stay_in_its_bounds():
+    env = PendulumEnv()
+    policy = actor(env, ["th"], scale=10.0)
+    with set_exploration_type(ExplorationType.RANDOM):
+        action = policy(env.reset().expand(500).clone())["action"]
+    assert action.abs().max() <= 2
+    assert action.abs().max() > 1.5
+
+
+def test_advice_is_flattened_into_the_observation():
+    env = TransformedEnv(ConeTrackEnv(shipped_tracks("test"), 4), GuideActions({"a": ZeroGuide(), "b": ZeroGuide()}))
+    policy, value = actor(env, ["observation", "guide_action"]), critic(env, ["observation", "guide_action"])
+    data = value(policy(env.reset()))
+    assert policy.module[0].module.network.layers[0].in_features == 22
+    assert data["action"].shape == data["state_value"].shape == (4, 1)
+
+
+@pytest.mark.parametrize("categorical", [True, False])
+def test_discrete_actions_fit_the_env(categorical):
+    env = GymEnv("CartPole-v1", categorical_action_encoding=categorical)
+    policy = actor(env, ["observation"])
+    with set_exploration_type(ExplorationType.RANDOM):
+        rollout = env.rollout(5, policy)
+    assert env.action_spec.is_in(rollout["action"][0])
+
+
+def test_deterministic_action_is_the_squashed_mean():
+    env = ConeTrackEnv(shipped_tracks("test"), 3)
+    policy = actor(env, ["observation"])
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        data = policy(env.reset())
+    torch.testing.assert_close(data["action"], data["loc"].tanh())
+
+
+def test_unknown_entry_is_named_beside_those_that_exist():
+    env = ConeTrackEnv(shipped_tracks("test"), 3)
+    with pytest.raises(KeyError, match=r"no entry guide_action to observe; it has .*observation"):
+        actor(env, ["observation", "guide_action"])
+
+
+def test_a_keyed_module_is_a_tensordict_module():
+    split = Linear(3, 4)
+    ours, theirs = (
+        kind(lambda x: tuple(split(x).chunk(2, -1)), ["x"], ["a", "b"]) for kind in (Keyed, TensorDictModule)
+    )
+    data = TensorDict({"x": torch.randn(5, 3)}, [5])
+    assert (ours(data.clone()) == theirs(data.clone())).all()

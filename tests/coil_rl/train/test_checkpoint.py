@@ -1,0 +1,134 @@
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coil_rl.errors import UserError
+from coil_rl.files import remove_unfinished
+from coil_rl.train import checkpoint
+
+
+def test_state_comes_back_as_it_was(tmp_path):
+    state = {"weights": torch.arange(3.0), "updates": 7, "returns": [1.5, 2.5], "none": None}
+    checkpoint.save(state, tmp_path / "state.pt")
+    again = checkpoint.load(tmp_path / "state.pt")
+    assert torch.equal(again.pop("weights"), state.pop("weights"))
+    assert again == state
+    assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
+
+
+def test_failed_save_leaves_the_file_before_it(tmp_path):
+    checkpoint.save(1, tmp_path / "state.pt")
+    with pytest.raises(Exception, match="pickle"):
+        checkpoint.save(lambda: None, tmp_path / "state.pt")
+    assert checkpoint.load(tmp_path / "state.pt") == 1
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_missing_and_broken_files_are_named(tmp_path):
+    with pytest.raises(UserError, match=r"there is no file .*state\.pt"):
+        checkpoint.load(tmp_path / "state.pt")
+    checkpoint.save(torch.zeros(1000), tmp_path / "state.pt")
+    whole = (tmp_path / "state.pt").read_bytes()
+    (tmp_path / "state.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match=r"state\.pt is not a whole checkpoint"):
+        checkpoint.load(tmp_path / "state.pt")
+
+
+def test_a_checkpoint_runs_no_code(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return (print, ("code ran",))
+
+    torch.save(Payload(), tmp_path / "evil.pt")
+    with pytest.raises(UserError, match="checksum does not fit"):
+        checkpoint.load(tmp_path / "evil.pt")
+    checkpoint.save(Payload(), tmp_path / "evil.pt")
+    with pytest.raises(UserError, match="not a whole checkpoint"):
+        checkpoint.load(tmp_path / "evil.pt")
+
+
+def test_torch_reads_what_is_saved(tmp_path):
+    checkpoint.save({"weights": torch.arange(3.0)}, tmp_path / "state.pt")
+    assert torch.load(tmp_path / "state.pt", weights_only=True)["weights"].tolist() == [0, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """A folder with a checkpoint 2 and, before it, a checkpoint 1; and the bytes of 2."""
+    folder = tmp_path_factory.mktemp("run")
+    for number in (1, 2):
+        checkpoint.save_newest({"updates": number, "weights": torch.zeros(50)}, folder)
+    return folder, (folder / "checkpoint.pt").read_bytes()
+
+
+@given(st.data())
+def test_an_altered_or_cut_checkpoint_is_refused_and_the_one_before_it_used(two, data):
+    folder, whole = two
+    at = data.draw(st.integers(0, len(whole) - 1))
+    if data.draw(st.booleans()):
+        broken = whole[:at]
+    else:
+        broken = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
+    (folder / "checkpoint.pt").write_bytes(broken)
+    before = (folder / "checkpoint_previous.pt").read_bytes()
+    assert checkpoint.load_newest(folder)["updates"] == 1
+    assert (folder / "checkpoint.pt").read_bytes() == before
+    (folder / "checkpoint_previous.pt").write_bytes(before)
+
+
+def test_going_back_is_said_in_one_line(two, capsys):
+    folder, whole = two
+    (folder / "checkpoint.pt").write_bytes(whole[:-1])
+    checkpoint.load_newest(folder)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line == (
+        f"{folder / 'checkpoint.pt'} is not a whole checkpoint: its checksum does not fit; "
+        "going back to checkpoint_previous.pt"
+    )
+
+
+def test_two_broken_checkpoints_are_both_named(tmp_path):
+    assert checkpoint.load_newest(tmp_path) is None
+    for name in ("checkpoint.pt", "checkpoint_previous.pt"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(UserError, match=r"neither .*checkpoint\.pt nor .*checkpoint_previous\.pt is a whole .* copy"):
+        checkpoint.load_newest(tmp_path)
+
+
+def test_a_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    for step in range(8):
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        checkpoint.save_newest(1, folder)
+        left = iter(range(step))
+
+        def dying(function, left=left):
+            def call(*arguments, **named):
+                if next(left, None) is None:
+                    raise Killed
+                return function(*arguments, **named)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            # All that touches the disk; a killed process tidies nothing up either.
+            for owner, name in [(Path, "write_bytes"), (os, "fsync"), (Path, "replace"), (Path, "unlink")]:
+                patch.setattr(owner, name, dying(getattr(owner, name)))
+            try:
+                checkpoint.save_newest(2, folder)
+                died = False
+            except Killed:
+                died = True
+        assert checkpoint.load_newest(folder) in ((1, 2) if died else (2,))
+        remove_unfinished(folder)
+        checkpoint.save_newest(3, folder)
+        assert checkpoint.load_newest(folder) == 3
+        assert {file.name for file in folder.iterdir()} <= {"checkpoint.pt", "checkpoint_previous.pt"}
+    assert not died

@@ -1,0 +1,92 @@
+import math
+
+import pytest
+import torch
+
+from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track, random_tracks
+from coil_rl.guides import ConstantGuide, SplineGuide
+from coil_rl.learners.networks import actor
+from coil_rl.train.evaluation import evaluate_policy, summarise
+
+TRACKS = random_tracks(2, seed=5)
+
+
+def test_guide_completes_its_laps_and_the_measures_agree_with_one_another(ring):
+    tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
+    env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=8)
+    driven = evaluate_policy(env, SplineGuide(), names=[track.name for track in tracks])
+    for track, row, line in zip(tracks, driven.episodes, driven.lines, strict=True):
+        assert row["track"] == track.name
+        assert row["completed"]
+        assert not row["crashed"]
+        assert row["laps"] == 1
+        assert row["clearance"] > 0
+        # The middle line at 2 m/s, less what is cut at corners.
+        assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
+        assert len(line) == row["steps"] >= row["lap_time"] * 8
+    again = evaluate_policy(env, SplineGuide(), names=[track.name for track in tracks])
+    assert again.episodes == driven.episodes
+
+
+def test_crash_ends_the_measuring():
+    env = ConeTrackEnv(TRACKS, 4, assignment="cyclic")
+    driven = evaluate_policy(env, ConstantGuide(1.0))
+    for row in driven.episodes:
+        assert row["crashed"]
+        assert not row["completed"]
+        assert math.isnan(row["lap_time"])
+        assert row["clearance"] <= 0
+        assert -100 < row["reward"] < -80
+
+
+def test_sampled_actions_differ_from_the_deterministic_ones():
+    env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", rate=8)
+    policy = actor(env, ["observation"])
+    plain, drawn = (
+        evaluate_policy(env, policy, sampled=sampled).episodes[0]["smoothness"] for sampled in (False, True)
+    )
+    assert drawn > 10 * plain
+    mixed = evaluate_policy(env, policy, sampled=torch.tensor([False, True])).episodes
+    assert mixed[0]["smoothness"] == pytest.approx(plain, rel=0.01)
+    assert mixed[1]["smoothness"] > 10 * plain
+
+
+def test_summary_is_the_mean_over_tracks_of_means_over_episodes():
+    def episode(track, reward, lap_time, crashed):
+        return {
+            "track": track, "reward": reward, "lap_time": lap_time, "smoothness": 0.1, "completed": not crashed,
+            "crashed": crashed, "clearance": reward / 100,
+        }  # fmt: skip
+
+    rows = summarise([episode("a", 10, 5.0, False), episode("a", 20, math.nan, True), episode("b", 40, math.nan, True)])
+    assert [row["track"] for row in rows] == ["a", "b", "mean"]
+    assert [row["reward"] for row in rows] == [15, 40, 27.5]
+    assert rows[0]["lap_time"] == rows[2]["lap_time"] == 5
+    assert math.isnan(rows[1]["lap_time"])
+    assert [row["crashed"] for row in rows] == [0.5, 1, 0.75]
+    assert rows[2]["clearance"] == 0.1
+
+
+def test_reward_is_told_apart_by_the_task_that_paid_it():
+    tasks = {"left": {"alive": 1.0, "crash": 0.0, "cone": 0.0}, "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0}}
+    env = DrivingTasksEnv(TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0})
+    driven = evaluate_policy(env, ConstantGuide(1.0))
+    for row in driven.episodes:
+        assert row["steps_left"] + row["steps_right"] == row["steps"]
+        assert row["reward_left"] + row["reward_right"] == pytest.approx(row["reward"])
+    assert sum(row["steps_left"] for row in driven.episodes) > 6
+    *rows, mean = summarise(driven.episodes)
+    for row in rows:
+        alike = [episode for episode in driven.episodes if episode["track"] == row["track"]]
+        steps, paid = (sum(episode[f"{what}_left"] for episode in alike) for what in ("steps", "reward"))
+        assert row["per_step_left"] == pytest.approx(paid / steps)
+        # Every step but that of the crash.
+        assert 0.8 < row["per_step_left"] <= 1
+    assert mean["per_step_left"] == pytest.approx(sum(row["per_step_left"] for row in rows) / 2)
+
+
+def test_task_that_never_came_up_has_no_reward():
+    env = DrivingTasksEnv(TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left")
+    rows = summarise(evaluate_policy(env, ConstantGuide(1.0)).episodes)
+    assert all(math.isnan(row["per_step_right"]) for row in rows)
+    assert not any(math.isnan(row["per_step_left"]) for row in rows)

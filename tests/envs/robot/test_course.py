@@ -1,0 +1,71 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from coil_rl.envs import TrackError, robot_track, robot_tracks
+from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, cones_of, middle_line, noted_track, track_notes
+
+
+def test_a_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
+    track = robot_track()
+    line = middle_line(track, 0.03)
+    assert track.length == pytest.approx(6.0, abs=0.05)
+    way = np.roll(line, -1, axis=0) - line
+    heading = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
+    # Over 15 cm, for the middle between two splines is a little rough.
+    bend = (np.roll(heading, -5) - heading)[:-10] / 0.15
+    assert bend.max() > 1.2  # 1/m, left
+    assert bend.min() < -1.2
+    straight = np.abs(bend) < 0.2
+    assert straight.mean() > 0.12
+    assert heading[-1] - heading[0] == pytest.approx(2 * np.pi, abs=0.1)
+
+
+def test_cones_stand_evenly_and_leave_room_for_the_robot():
+    track = robot_track()
+    for ring in (track.left, track.right):
+        gaps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
+        assert (np.abs(gaps - 0.23) < 0.02).all()
+    across = np.linalg.norm(track.left[:, None] - track.right, axis=-1).min(1)
+    assert (np.abs(across - 0.36) < 0.03).all()
+
+
+def test_thin_cones_are_left_and_thick_ones_right():
+    track = robot_track()
+    place, radius = cones_of(track)
+    assert place.shape == (2, len(track.left) + len(track.right))
+    assert radius.tolist() == pytest.approx([THIN] * len(track.left) + [THICK] * len(track.right))
+    np.testing.assert_allclose(cones_of(track, left=False)[0].T, track.right, atol=1e-6)
+    np.testing.assert_allclose(cones_of(track, right=False)[0].T, track.left, atol=1e-6)
+    with pytest.raises(ValueError, match="neither left nor right"):
+        cones_of(track, left=False, right=False)
+
+
+@pytest.mark.parametrize(("heading", "half"), [(0.0, 0.06), (math.pi / 2, 0.10)])
+def test_clearance_is_from_the_outline_to_a_cone(heading, half):
+    course = RobotCourse([robot_track()])
+    x, y, _ = robot_track().start
+    course.cones, course.radius = torch.tensor([x, y + 0.15]).view(2, 1, 1), torch.tensor([[0.045]])
+    clearance, _ = course.clearance(torch.tensor([0]), torch.tensor([[x], [y], [heading]]))
+    assert clearance.item() == pytest.approx(0.15 - half - 0.045, abs=1e-5)
+
+
+def test_a_noted_track_is_the_track():
+    again = noted_track(track_notes(robot_track()))
+    assert np.array_equal(again.left, robot_track().left)
+    assert np.array_equal(again.right, robot_track().right)
+    assert again.start == pytest.approx(robot_track().start)
+    assert again.name == robot_track().name
+
+
+@pytest.mark.parametrize("notes", [{}, {"left": "[[0, 0]", "right": "[]"}, {"left": "[1, 2, 3]", "right": "[]"}])
+def test_notes_that_hold_no_track_are_refused(notes):
+    with pytest.raises(TrackError, match="note each side as"):
+        noted_track(notes)
+
+
+def test_a_track_seven_times_as_large_is_as_long_as_seven():
+    (large,) = robot_tracks(scale=7.0)
+    assert large.length == pytest.approx(7 * robot_track().length, rel=1e-3)

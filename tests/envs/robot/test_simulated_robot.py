@@ -1,0 +1,192 @@
+import math
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+
+from coil_rl import testing
+from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, Track, robot_track, shipped_tracks
+from coil_rl.envs import simulated_cone_classifier as classifier
+from coil_rl.guides import ConstantGuide, SplineGuide
+from coil_rl.train.build import build_env
+from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.transforms import GuideActions
+
+
+def robots(count=2, **world) -> SimulatedRobotEnv:
+    return SimulatedRobotEnv(num_cars=count, **world)
+
+
+def steered(env, actions):
+    """The states after constant or listed actions."""
+    states = [env.reset()]
+    for action in actions:
+        states.append(env.step(states[-1].set("action", torch.full((*env.batch_size, 1), action)))["next"])
+    return states
+
+
+def test_it_is_an_env():
+    testing.check_env(robots(3))
+
+
+def test_it_is_the_cone_world_to_whoever_drives():
+    robot, world = robots(2), ConeTrackEnv(shipped_tracks("test"), 2)
+    given, expected = (env.rollout(2, break_when_any_done=False) for env in (robot, world))
+    for key in expected.keys(True, True):
+        assert given[key].shape == expected[key].shape, key
+        assert given[key].dtype == expected[key].dtype, key
+    more = set(given.keys(True, True)) - set(expected.keys(True, True))
+    assert more == {("info", "valid"), ("next", "info", "valid")}
+    assert robot.action_spec == world.action_spec
+
+
+def test_the_guide_and_the_advice_of_the_cone_world_work_here():
+    env = TransformedEnv(robots(3), GuideActions({"spline": SplineGuide()}))
+    rollout = env.rollout(4, SplineGuide(), break_when_any_done=False)
+    torch.testing.assert_close(rollout["guide_action"].squeeze(-2), rollout["action"])
+    testing.check_guide(SplineGuide(), rollout[:, -1])
+
+
+def test_it_turns_as_the_bicycle_model_says():
+    env = robots(1, speed=0.15)
+    before, after = (state["info", "pose"][0] for state in steered(env, [0.5]))
+    turn = 0.15 / 5.5 / (2 / 7) * math.sin(math.radians(40))
+    assert (after[2] - before[2]).item() == pytest.approx(turn, rel=1e-4)
+    assert (after[:2] - before[:2]).norm().item() == pytest.approx(0.15 / 5.5, rel=1e-3)
+
+
+def test_the_cones_it_sees_are_those_that_stand_there():
+    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
+    env = robots(1, lidar=exact)
+    state = env.reset()
+    (left, right), (lefts, rights) = state["cones"][0] / 7, state["cone_count"][0]
+    x, y, heading = robot_track().start
+    turn = torch.tensor([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
+    for seen, ring, radius in ((left[:lefts], robot_track().left, 0.02), (right[:rights], robot_track().right, 0.045)):
+        stand = (torch.tensor(ring).float() - torch.tensor([x, y])) @ turn.T
+        assert len(seen) >= 3
+        off = torch.cdist(seen, stand).amin(1)
+        assert (off <= radius).all()
+
+
+def test_the_same_seed_is_the_same_drive_and_another_one_is_not():
+    first, second, third = (steered(robots(2, seed=seed), [0.1, -0.2])[-1]["observation"] for seed in (1, 1, 2))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, third)
+
+
+def test_a_robot_does_not_depend_on_who_drives_beside_it_but_for_the_noise():
+    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
+    alone, many = (steered(robots(count, lidar=exact), [0.3, -0.1, 0.2])[-1] for count in (1, 4))
+    torch.testing.assert_close(alone["observation"][0], many["observation"][3])
+
+
+def test_its_state_is_all_of_it():
+    first, second = robots(2, seed=1), robots(2, seed=9)
+    state = steered(first, [0.2] * 3)[-1]
+    second.load_state_dict(first.state_dict())
+    one, other = (env.step(state.clone().set("action", torch.zeros(2, 1)))["next"] for env in (first, second))
+    for key, value in one.items(True, True):
+        assert torch.equal(value, other[key]), key
+    assert torch.equal(first.scan, second.scan)
+
+
+@pytest.mark.parametrize("action", [1.0, -1.0, 0.0])
+def test_whoever_does_not_steer_well_crashes_into_a_cone_or_leaves_the_track(action):
+    episodes = evaluate_policy(robots(2), ConstantGuide(action)).episodes
+    assert all(episode["crashed"] and not episode["completed"] for episode in episodes)
+    assert all(-0.03 < episode["clearance"] <= 0 for episode in episodes)
+    assert all(episode["reward"] < -90 for episode in episodes)
+
+
+def test_the_guide_drives_its_laps_without_a_crash():
+    result = evaluate_policy(robots(3, laps=1), SplineGuide())
+    assert all(episode["completed"] and not episode["crashed"] for episode in result.episodes)
+    # A lap of 6 m takes 40 s at 0.15 m/s, a little less where corners are cut.
+    assert all(36 < episode["lap_time"] < 42 for episode in result.episodes)
+
+
+def test_an_episode_ends_with_its_laps_or_its_time():
+    env = robots(1, time_limit=1.0)
+    states = steered(env, [0.0] * 6)
+    # 5.5 steps, rounded to the even one.
+    assert [bool(state["truncated"]) for state in states[1:]] == [False] * 5 + [True]
+    assert not states[-1]["terminated"].any()
+
+
+def test_what_it_sees_follows_the_rules_of_its_perception():
+    near = robots(1, perception=Perception(classifier(), range_max=0.4)).reset()["cone_count"]
+    assert (near < robots(1).reset()["cone_count"]).all()
+
+
+def mirrored() -> Track:
+    """The robot's track driven the other way round."""
+    here = robot_track()
+    return Track("mirrored", left=here.right * [1, -1], right=here.left * [1, -1])
+
+
+def test_robots_drive_on_their_own_tracks():
+    env = robots(4, tracks=[robot_track(), mirrored()], assignment="cyclic", laps=1)
+    result = evaluate_policy(env, SplineGuide(), names=["one", "other"])
+    assert [episode["track"] for episode in result.episodes] == ["one", "other"] * 2
+    assert all(episode["completed"] for episode in result.episodes)
+    ends = [line[:, 1].max() - line[:, 1].min() for line in result.lines]
+    assert all(end > 1 for end in ends)
+    assert result.lines[0][:, 1].mean() > 0.3 > -0.3 > result.lines[1][:, 1].mean()
+
+
+def test_a_robots_world_does_not_depend_on_the_tracks_of_others():
+    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
+    kept = {"lidar": exact, "assignment": "cyclic"}
+    alone = steered(robots(1, **kept), [0.2, -0.1])[-1]
+    among = steered(robots(2, tracks=[robot_track(), shorter()], **kept), [0.2, -0.1])[-1]
+    torch.testing.assert_close(alone["observation"][0], among["observation"][0])
+    torch.testing.assert_close(alone["info", "clearance"][0], among["info", "clearance"][0])
+
+
+def shorter() -> Track:
+    """A track with fewer cones."""
+    turn = torch.arange(0, 2 * math.pi, 2 * math.pi / 12).numpy()
+    circle = torch.tensor([[math.cos(t), math.sin(t)] for t in turn]).numpy()
+    return Track("ring", left=0.4 * circle, right=0.8 * circle)
+
+
+def test_tracks_are_drawn_at_random_at_each_reset():
+    env = robots(64, tracks=[robot_track(), mirrored()])
+    first, second = (env.reset()["info", "track"] for _ in range(2))
+    assert 15 < first.sum() < 49
+    assert not torch.equal(first, second)
+
+
+def test_a_policy_may_be_any_module_of_the_observation():
+    policy = TensorDictModule(lambda seen: seen[..., :1] * 0, in_keys=["observation"], out_keys=["action"])
+    assert evaluate_policy(robots(1), policy).episodes[0]["crashed"]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"num_cars": 0}, {"speed": -1}, {"laps": 0}, {"max_steering": 100}, {"car_length": math.inf}]
+)
+def test_what_cannot_be_is_refused(wrong):
+    with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
+        SimulatedRobotEnv(**wrong)
+    with pytest.raises(ValueError, match="tracks is empty"):
+        SimulatedRobotEnv([])
+    with pytest.raises(ValueError, match="assignment='all' must be one of random, cyclic"):
+        SimulatedRobotEnv(assignment="all")
+    with pytest.raises(ValueError, match="reward has no weight"):
+        SimulatedRobotEnv(reward={"speed": 1.0})
+
+
+@pytest.mark.parametrize("program", ["train", "evaluate"])
+def test_configuration_builds_the_env_as_its_defaults_are(program):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose(program, ["env=simulated_robot", "track=robot", "budget.cars=2", "run_dir=unused"])
+    env = build_env(config, {**config.evaluation.env, "num_cars": 3}).base_env
+    assert isinstance(env, SimulatedRobotEnv)
+    plain = SimulatedRobotEnv(num_cars=3, assignment="cyclic")
+    for one, other in ((env, plain), (env.perception, plain.perception), (env.lidar, plain.lidar)):
+        numbers = {name: value for name, value in vars(other).items() if isinstance(value, (int, float))}
+        assert {name: vars(one)[name] for name in numbers} == pytest.approx(numbers, rel=1e-5)
+    assert {key: float(value) for key, value in env.weights.items()} == plain.weights
