@@ -1,32 +1,11 @@
-"""The paper's tables and figures made again, the paper's value beside ours."""
+"""Reproduced tables and figures of the paper, each with the paper's values next to ours."""
 
-from coil_rl.reproduce.figure_6 import Figure6
-from coil_rl.reproduce.figure_22 import Figure22
-from coil_rl.reproduce.figure_25 import Figure25
-from coil_rl.reproduce.figure_lines import FigureLines
-from coil_rl.reproduce.figure_scan import FigureScan
-from coil_rl.reproduce.figure_spline import FigureSpline
-from coil_rl.reproduce.figure_world import FigureWorld
+from coil_rl.reproduce.classifier import Figure25
 from coil_rl.reproduce.result import Result, Runs
-from coil_rl.reproduce.table_1 import Table1
-from coil_rl.reproduce.table_4 import Table4
-from coil_rl.reproduce.table_5 import Table5
-from coil_rl.reproduce.table_6 import Table6
-from coil_rl.reproduce.tabular_coil import TabularCoil
+from coil_rl.reproduce.robot import Table6
+from coil_rl.reproduce.tabular_claim import TabularCoil
+from coil_rl.reproduce.toymaker import Figure6, Table1
+from coil_rl.reproduce.training import Figure22, Table4
+from coil_rl.reproduce.unseen import Table5
 
-__all__ = [
-    "Figure6",
-    "Figure22",
-    "Figure25",
-    "FigureLines",
-    "FigureScan",
-    "FigureSpline",
-    "FigureWorld",
-    "Result",
-    "Runs",
-    "Table1",
-    "Table4",
-    "Table5",
-    "Table6",
-    "TabularCoil",
-]
+__all__ = ["Figure6", "Figure22", "Figure25", "Result", "Runs", "Table1", "Table4", "Table5", "Table6", "TabularCoil"]

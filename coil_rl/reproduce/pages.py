@@ -1,4 +1,4 @@
-"""From results to pages: where each comes from, and RESULTS.md, which has them all."""
+"""Markdown pages of reproduced results, and RESULTS.md with all of them."""
 
 from __future__ import annotations
 
@@ -7,105 +7,114 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from coil_rl.report.runs import Run
-from coil_rl.reproduce.verdict import END, divide
+from coil_rl.reproduce.result import CLAIMS_HEADING
+
+FOOTER = "<sub>"  # begins the origin of a page
+
+INTRODUCTION = """
+`{command}` writes this file; do not edit it. Below each result stand the command that makes it alone, and the commits
+of the code. The paper's numbers are beside ours; its tracks and its robot are not part of this project, so compare the
+order of the methods and the distances between them."""
+
+VERDICTS = """
+Each claim of the paper with our number and its 95 % interval: held up if the whole interval is on the paper's side, did
+not hold up if it is on the other side, undecided otherwise."""
 
 
 def page(text: str, name: str, note: str | None, origin: str) -> str:
-    """The page of a result: its heading, what to know before reading, its picture, its text, and where it comes from.
+    """Return the page of a result: heading, note, picture, text, origin.
 
     Args:
-        text: that it made, heading first.
-        name: of its files.
-        note: what to know; None for nothing.
-        origin: of `origin`.
+        text: of the result, the heading first.
+        name: stem of its files.
+        note: a warning to the reader, if any.
+        origin: see `origin`.
     """
     heading, _, rest = text.partition("\n")
-    warning = [f"> **{note}**"] if note else []
-    parts = [heading, *warning, f"![{heading.lstrip('# ')}]({name}.png)", rest.strip(), f"{END}{origin}</sub>"]
+    parts = [
+        heading,
+        *_warning(note),
+        f"![{heading.lstrip('# ')}]({name}.png)",
+        rest.strip(),
+        f"{FOOTER}{origin}</sub>",
+    ]
     return "\n\n".join(parts) + "\n"
 
 
 def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
-    """Where a result comes from, in a line.
+    """Return one line on the origin of a result.
 
     Args:
-        command: that makes it again.
-        commit: of the code that made it, as `git describe` says it.
-        runs: that it was made from.
+        command: the command that makes it.
+        commit: the code's commit, by `git describe`.
+        runs: its training runs.
     """
-    said = f"Made by `{command}` at commit {_commit(commit)}."
+    made = f"Made by `{command}` at commit {_commit(commit)}."
     if not runs:
-        return said
+        return made
     seeds = sorted({run.seed for run in runs})
-    trained: dict[int, list[str]] = {}
+    labels: dict[int, dict[str, None]] = {}
     for run in runs:
         if run.curve:
-            labels = trained.setdefault(int(run.curve[-1]["frames"]), [])
-            labels += [] if run.label in labels else [run.label]
-    frames = "; ".join(f"{count:,} ({', '.join(labels)})" for count, labels in trained.items())
-    commits = dict.fromkeys(_commit_of(run.folder) for run in runs)
+            labels.setdefault(int(run.curve[-1]["frames"]), {})[run.label] = None
+    frames = "; ".join(f"{count:,} ({', '.join(names)})" for count, names in labels.items())
+    commits = dict.fromkeys(_commit(_run_commit(run.folder)) for run in runs)
     return (
-        f"{said} {len(runs)} runs with the seeds {', '.join(map(str, seeds))}, done at commit "
-        f"{', '.join(map(_commit, commits))}. Frames of training: {frames or 'none'}."
+        f"{made} {len(runs)} runs with the seeds {', '.join(map(str, seeds))}, made at commit {', '.join(commits)}. "
+        f"Training frames: {frames or 'none'}."
     )
 
 
-def results(
+def all_results(
     pages: Mapping[str, str | None],
     commands: Mapping[str, str],
-    everything: str,
+    command: str,
     note: str | None,
     known_problems: Iterable[str],
-    cannot: Iterable[str],
+    limits: Iterable[str],
 ) -> str:
-    """RESULTS.md.
+    """Return RESULTS.md.
 
     Args:
-        pages: of all results by name; None for one that has not been made.
-        commands: that make each of them.
-        everything: the command that makes them all.
-        note: what to know before reading; None for nothing.
-        known_problems: of the paper's numbers, a sentence or two each.
-        cannot: what cannot be shown here, a sentence or two each.
+        pages: page of each result by name; None for a missing one.
+        commands: command of each result by name.
+        command: the command that makes all results.
+        note: a warning to the reader, if any.
+        known_problems: sentences on problems of the paper's numbers.
+        limits: sentences on parts of the paper that are not reproduced.
     """
-    made = {name: text for name, text in pages.items() if text is not None}
-    parts = ["# Results", *([f"> **{note}**"] if note else [])]
-    parts.append(
-        f"`{everything}` writes this file; do not edit it. Below each result stand the command that makes it alone, "
-        "and the commits of the code. Numbers of the paper are beside ours; its tracks and its robot are not part of "
-        "this project, so what can be compared is the order of the methods and how far they are apart."
-    )
-    divided = {name: divide(text) for name, text in made.items()}
-    if held := [f"**{_title(made[name])}**\n\n{end}" for name, (_, end) in divided.items() if end]:
-        parts += ["## What held up, and what did not", _HOW, *held]
-    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in divided.values()]
-    if lacking := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
-        parts += ["## Not made yet", "\n".join(lacking)]
-    for heading, sentences in {
-        "What is known about the paper's numbers": known_problems,
-        "What cannot be shown here": cannot,
-    }.items():
+    split = {name: _split_claims(text) for name, text in pages.items() if text is not None}
+    parts = ["# Results", *_warning(note), INTRODUCTION.strip().format(command=command)]
+    if claims := [
+        f"**{text.partition(chr(10))[0].lstrip('# ')}**\n\n{table}" for text, table in split.values() if table
+    ]:
+        parts += ["## What held up, and what did not", VERDICTS.strip(), *claims]
+    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split.values()]
+    if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
+        parts += ["## Not made yet", "\n".join(missing)]
+    lists = {"What is known about the paper's numbers": known_problems, "What cannot be shown here": limits}
+    for heading, sentences in lists.items():
         parts += [f"## {heading}", "\n".join(f"- {' '.join(sentence.split())}" for sentence in sentences)]
     return "\n\n".join(parts) + "\n"
 
 
-_HOW = (
-    "What the paper says, and our number with its 95 % interval: held up where all of it is on the paper's side, did "
-    "not hold up where all of it is on the other, undecided in between."
-)
+def _split_claims(text: str) -> tuple[str, str]:
+    """Split a page into the page without its claims, and the claims."""
+    before, _, after = text.partition(CLAIMS_HEADING)
+    claims, _, origin = after.partition(FOOTER)
+    return (f"{before}{FOOTER}{origin}", claims.strip()) if claims else (text, "")
 
 
-def _title(text: str) -> str:
-    return text.partition("\n")[0].lstrip("# ")
+def _warning(note: str | None) -> list[str]:
+    return [f"> **{note}**"] if note else []
 
 
 def _commit(described: str) -> str:
-    plain = described.removesuffix("-dirty")
-    return f"`{plain}`" if plain == described else f"`{plain}` with local changes"
+    clean = described.removesuffix("-dirty")
+    return f"`{clean}`" if clean == described else f"`{clean}` with local changes"
 
 
-def _commit_of(folder: Path) -> str:
-    """Of the code that began a run."""
+def _run_commit(folder: Path) -> str:
     try:
         return str(json.loads((folder / "versions.json").read_text())["commit"])
     except (OSError, ValueError, KeyError, TypeError):

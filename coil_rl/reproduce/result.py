@@ -1,12 +1,14 @@
-"""What a result of the paper is to the program that makes it again."""
+"""Base classes of reproduced results, and the verdict on the paper's claims."""
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -16,52 +18,120 @@ from matplotlib.figure import Figure
 
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
-from coil_rl.report import style
+from coil_rl.report import markdown_table, style
 from coil_rl.report.runs import Run
 
-Runs = Mapping[str, Sequence[Run]]  # of each file of `conf/experiment`, finished
+Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
+CLAIMS_HEADING = "### What held up"
 
 
 class Result(ABC):
-    """A table, a figure or a claim of the paper; its constructor takes the choices and refuses wrong ones.
+    """A table, figure or claim of the paper; the constructor takes its options and checks them.
 
     Attributes:
-        experiments: the files of `conf/experiment` of whose runs it is made; none if it needs no training.
+        experiments: experiments whose runs it needs; empty if it needs no training.
     """
 
     experiments: Sequence[str] = ()
 
     @abstractmethod
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
-        """Make it, with the paper's values beside ours.
+        """Make the result.
 
         Args:
-            stem: where to, without ending: all numbers go to `stem.csv`, the picture to `stem.png`.
-            runs: of its experiments.
+            stem: output path without suffix: the numbers are written to `stem.csv`, the picture to `stem.png`.
+            runs: finished runs of its experiments.
 
         Returns:
-            The page, Markdown: the table, and what there is to say about it.
+            The page in Markdown.
         """
 
 
-def called(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
-    """The runs of each of some labels.
+class WorldsResult(Result):
+    """A result about runs in the main world and in variants of it.
 
     Args:
-        labels: that are wanted.
-        runs: by experiment.
+        experiments: experiments in the main world.
+        worlds: experiment by the name of each variant.
+        against: label of the runs to compare the others with.
+        resamples: number of bootstrap resamples.
+        seed: seed of the bootstrap.
+    """
+
+    def __init__(
+        self,
+        experiments: Sequence[str],
+        worlds: Mapping[str, str] | None = None,
+        against: str = "ppo",
+        resamples: int = 2000,
+        seed: int = 0,
+    ) -> None:
+        if resamples < 1:
+            raise ValueError(f"resamples={resamples} must be at least 1")
+        # The main world has no name.
+        self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}
+        self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]
+        self.against, self.resamples, self.seed = against, resamples, seed
+
+
+def world_heading(world: str) -> list[str]:
+    """Return the heading of a world's part of a page as a list; empty for the main world."""
+    return [f"### {world[:1].upper()}{world[1:]}"] if world else []
+
+
+def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
+    """Return the runs of each label.
 
     Raises:
-        UserError: if a label has none.
+        UserError: if a label has no run.
     """
-    there = [run for of_experiment in runs.values() for run in of_experiment]
-    found = {label: [run for run in there if run.label == label] for label in labels}
-    for label, of_label in found.items():
+    available = [run for of_experiment in runs.values() for run in of_experiment]
+    selected = {label: [run for run in available if run.label == label] for label in labels}
+    for label, of_label in selected.items():
         if not of_label:
-            known = ", ".join(dict.fromkeys(run.label for run in there))
-            raise UserError(f"no run of {', '.join(runs)} is called {label}; there are {known or 'none'}")
-    return found
+            existing = ", ".join(dict.fromkeys(run.label for run in available)) or "none"
+            raise UserError(f"no run of {', '.join(runs)} has the label {label}; available: {existing}")
+    return selected
+
+
+def with_interval(value: float, low: float, high: float, spec: str = ".1f") -> str | None:
+    """Format a number with its 95 % interval: None if the number is NaN, no interval if that is NaN."""
+    if math.isnan(value):
+        return None
+    return f"{value:{spec}}" if math.isnan(low) else f"{value:{spec}} ({low:{spec}} to {high:{spec}})"
+
+
+def verdict(value: float, low: float, high: float, spec: str = ".1f", sign: int = 1) -> str | None:
+    """Return the verdict on the claim that a number is positive, as a table cell.
+
+    Args:
+        value: our number; the verdict is None if it is NaN.
+        low: lower end of its 95 % interval; NaN if there is none, then the claim is undecided.
+        high: upper end.
+        spec: number format.
+        sign: -1 if the claim is that the number is negative.
+    """
+    number = with_interval(value, low, high, spec)
+    lower, upper = sorted((sign * low, sign * high))
+    word = "held up" if lower > 0 else "did not hold up" if upper < 0 else "undecided"
+    return None if number is None else f"**{word}**: {number}"
+
+
+def certain_verdict(holds: bool, details: str) -> str:
+    """Return the verdict on a claim that needs no interval, as a table cell."""
+    return f"**{'held up' if holds else 'did not hold up'}**: {details}"
+
+
+def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """Return the last section of a page.
+
+    Args:
+        claims: table rows with the paper's `claim` and our numbers.
+        columns: headings of the numbers by key.
+    """
+    headings = {key: (heading, "") for key, heading in {"claim": "the paper says", **columns}.items()}
+    return f"{CLAIMS_HEADING}\n\n{markdown_table(claims, headings)}"
 
 
 @contextmanager

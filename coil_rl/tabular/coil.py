@@ -1,13 +1,12 @@
-"""COIL where everything fits into a table: the guide's action is one more part of the state (equation 97).
+"""Tabular COIL: the guide's action becomes part of the state (equation 97).
 
-The agent's policy is pi(s, a_guide(s), a). So a world in which the advice belongs to the state is again a Markov
-decision process, and every method for those is COIL there, Q-learning as it is.
+The policy is pi(s, a_guide(s), a). The world in which the advice belongs to the state is again a Markov decision
+process, so every method for Markov decision processes is COIL there, Q-learning included.
 
-What that can bring is plain to see here. An agent that sees the whole state knows as much without advice: the best
-policy is as good with it as without. Advice from a guide that always says the same in the same state only gives states
-another name, and advice that changes makes more of them to learn. It is of use to an agent that does not see all that
-the guide sees. Then following it is a policy that such an agent has and would not have without, so that the best COIL
-policy is at least as good as the guide. Nothing says that Q-learning finds it.
+Advice does not help an agent that observes the whole state: the best policy is as good without it. Deterministic advice
+only renames the states, and random advice adds states to learn. Advice helps an agent with fewer observations than the
+guide: following the guide becomes one of its policies, so the best COIL policy is at least as good as the guide. There
+is no guarantee that Q-learning finds it.
 """
 
 from __future__ import annotations
@@ -20,56 +19,57 @@ from coil_rl.tabular.planning import value_iteration
 
 
 def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
-    """The world as an agent with a guide lives in it.
+    """Return the world with the guide's advice in the state.
 
     Args:
         mdp: the world.
-        guide: its policy, [S] actions or their probabilities [S, A]; then it draws each time a state is entered.
+        guide: the guide's policy, actions [S] or their probabilities [S, A]; then one is drawn whenever a state is
+            entered.
 
     Returns:
-        A world with S * A states: s * A + g is state s, where the guide says g.
+        A world with S * A states: s * A + g is state s with the advice g.
 
     Example:
         >>> from coil_rl.tabular import toymaker, with_advice
         >>> with_advice(toymaker(), [1, 1]).states[1]
         'successful toy, advised advertising'
     """
-    says = mdp.probabilities(guide)
+    advice = mdp.probabilities(guide)
     count, choices = mdp.P.shape[:2]
-    # P[s, a, s'] of the world, then what the guide says in s'; neither depends on what it said in s.
-    P = np.einsum("sat,th->sath", mdp.P, says).reshape(count, choices, count * choices)
+    # P[s, a, s'] of the world times the advice in s'; neither depends on the advice in s.
+    P = np.einsum("sat,th->sath", mdp.P, advice).reshape(count, choices, count * choices)
     R = mdp.R.repeat(choices, axis=2)
     return MDP(
         P.repeat(choices, axis=0),
         R.repeat(choices, axis=0),
         mdp.gamma,
-        start=(mdp.start[:, None] * says).ravel(),
+        start=(mdp.start[:, None] * advice).ravel(),
         states=[f"{state}, advised {action}" for state in mdp.states for action in mdp.actions],
         actions=mdp.actions,
     )
 
 
-def sees_advice(sees: ArrayLike, choices: int) -> Integers:
-    """What an agent sees of the states of `with_advice`, which saw `sees` [S] of those of the world without advice."""
-    seen: Integers = (np.asarray(sees)[:, None] * choices + np.arange(choices)).ravel()
-    return seen
+def observations_with_advice(observations: ArrayLike, actions: int) -> Integers:
+    """Return the observation of each state of `with_advice` [S * A], given that of each state without advice [S]."""
+    pairs: Integers = (np.asarray(observations)[:, None] * actions + np.arange(actions)).ravel()
+    return pairs
 
 
 def optimal_guide(mdp: MDP) -> Array:
-    """[S, A]: an optimal policy."""
+    """Return an optimal policy, [S, A] probabilities."""
     return mdp.probabilities(value_iteration(mdp).policy)
 
 
 def noisy_guide(mdp: MDP, noise: float = 0.5) -> Array:
-    """[S, A]: an optimal policy, but with the probability `noise` any action."""
+    """Return an optimal policy that takes a random action with probability `noise`, [S, A] probabilities."""
     return (1 - noise) * optimal_guide(mdp) + noise * random_guide(mdp)
 
 
 def random_guide(mdp: MDP) -> Array:
-    """[S, A]: all actions alike."""
+    """Return the uniform policy, [S, A] probabilities."""
     return np.full_like(mdp.r, 1 / mdp.r.shape[1])
 
 
 def worst_guide(mdp: MDP) -> Array:
-    """[S, A]: the policy that is worth least, which is optimal where all rewards are turned round."""
+    """Return the policy with the lowest value, [S, A] probabilities: the optimal one for negated rewards."""
     return optimal_guide(MDP(mdp.P, -mdp.R, mdp.gamma))

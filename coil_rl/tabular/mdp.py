@@ -1,4 +1,4 @@
-"""A finite Markov decision process, written down: all that the classical methods need to know of a world."""
+"""Finite Markov decision processes as arrays."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ Integers = NDArray[np.int64]
 
 
 class MDP:
-    """States, actions, where they lead and what that pays.
+    """A finite Markov decision process: transition probabilities, rewards and a discount factor.
 
-    A state that every action leaves as it is, for nothing, is terminal: an episode has ended there.
+    A state that every action leaves unchanged, with reward 0, is terminal: it ends an episode.
 
     Args:
         P: [S, A, S], P[s, a, s'] the probability that action a leads from state s to state s'.
         R: [S, A, S], R[s, a, s'] the reward of that transition.
         gamma: discount factor, from 0 to less than 1.
-        start: [S], the probability of each state to be the first one; all alike where it is not given.
-        states: their names, for tables and messages; numbers where they are not given.
+        start: [S], start-state probabilities; uniform by default.
+        states: their names, for tables and messages; numbers by default.
         actions: their names.
 
     Attributes:
-        r: [S, A], the mean reward of an action in a state.
+        r: [S, A], expected reward of an action in a state.
 
     Raises:
-        ValueError: saying where the numbers are no Markov decision process.
+        ValueError: if the arrays are no Markov decision process, naming the entry.
 
     Example:
         >>> stay, change = ([[1, 0], [0, 1]], [[0, 1], [1, 0]])
@@ -63,67 +63,66 @@ class MDP:
         self._check_model()
         self.start: Array = np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
         if self.start.shape != (count,) or (self.start < 0).any() or not np.isclose(self.start.sum(), 1):
-            raise ValueError(f"start must be {count} probabilities, one a state, that add up to 1; got {self.start}")
+            raise ValueError(f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}")
         self.r: Array = (self.P * self.R).sum(axis=2)
 
     @property
     def terminal(self) -> NDArray[np.bool_]:
-        """[S], whether nothing can happen any more."""
+        """[S], whether each state is terminal."""
         stays = np.einsum("sas->sa", self.P) == 1
-        ended: NDArray[np.bool_] = (stays & (self.r == 0)).all(axis=1)
-        return ended
+        terminal: NDArray[np.bool_] = (stays & (self.r == 0)).all(axis=1)
+        return terminal
 
     def q(self, V: Array) -> Array:
-        """[S, A]: the mean reward of each action, and the discounted worth V [S] of where it leads."""
+        """Return r + gamma P V, [S, A], given state values V [S]."""
         values: Array = self.r + self.gamma * self.P @ V
         return values
 
     def probabilities(self, policy: ArrayLike) -> Array:
-        """A policy as the probabilities [S, A] of its actions.
+        """Return a policy as action probabilities [S, A].
 
         Args:
-            policy: [S] whole numbers, the action in each state; or these probabilities.
+            policy: [S] integers, the action in each state; or probabilities [S, A].
 
         Raises:
             ValueError: if it is neither, naming the state.
         """
-        given = np.asarray(policy)
+        array = np.asarray(policy)
         count, choices = self.P.shape[:2]
-        if given.shape == (count,) and given.dtype.kind in "iu":
-            if wrong := [s for s in range(count) if not 0 <= given[s] < choices]:
+        if array.shape == (count,) and array.dtype.kind in "iu":
+            if wrong := [s for s in range(count) if not 0 <= array[s] < choices]:
                 raise ValueError(
-                    f"policy[{wrong[0]}]={given[wrong[0]]} is no action in state {self.states[wrong[0]]}; "
+                    f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}; "
                     f"actions are 0 to {choices - 1}"
                 )
-            return np.eye(choices)[given]
-        if given.shape != (count, choices):
+            return np.eye(choices)[array]
+        if array.shape != (count, choices):
             raise ValueError(
-                f"A policy is [{count}] whole numbers, an action a state, or [{count}, {choices}] probabilities; "
-                f"got {given.dtype} of the shape {given.shape}"
+                f"A policy is [{count}] integers, an action a state, or [{count}, {choices}] probabilities; "
+                f"got {array.dtype} of the shape {array.shape}"
             )
         for s in range(count):
-            if (given[s] < 0).any() or not np.isclose(given[s].sum(), 1):
-                raise ValueError(f"policy[{s}]={given[s]} must be probabilities, state {self.states[s]}: they sum to 1")
-        return given.astype(np.float64)
+            if (array[s] < 0).any() or not np.isclose(array[s].sum(), 1):
+                raise ValueError(f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}")
+        return array.astype(np.float64)
 
     def _check_model(self) -> None:
         for s, state in enumerate(self.states):
             for a, action in enumerate(self.actions):
-                where = f"state {state}, action {action}"
                 if not np.isfinite(self.R[s, a]).all():
-                    raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
-                # The sum of what is not a number is none either.
+                    raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite (state {state}, action {action})")
+                # A sum with NaN in it is never close to 1.
                 total = self.P[s, a].sum()
                 if not np.isclose(total, 1, rtol=0, atol=1e-9) or (self.P[s, a] < 0).any():
                     raise ValueError(
-                        f"P[{s}, {a}]={self.P[s, a]} must be probabilities that add up to 1 ({where}); "
-                        f"they add up to {total:g}"
+                        f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 "
+                        f"(state {state}, action {action}); they sum to {total:g}"
                     )
 
 
-def _names(what: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:
+def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if names is None:
         return tuple(map(str, range(count)))
     if len(names) != count:
-        raise ValueError(f"{what} has {len(names)} names, but P has {count} {what}")
+        raise ValueError(f"{kind} has {len(names)} names, but P has {count} {kind}")
     return tuple(names)

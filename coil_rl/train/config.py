@@ -209,11 +209,11 @@ class Reproduce:
     all: bool = False
     budget: str = MISSING
     budgets: dict[str, RunsBudget] = MISSING
-    also: dict[str, str] = field(default_factory=dict)
+    aliases: dict[str, str] = field(default_factory=dict)
     threads: int = 1
     train: list[str] = field(default_factory=list)
     known_problems: list[str] = field(default_factory=list)
-    cannot: list[str] = field(default_factory=list)
+    not_reproduced: list[str] = field(default_factory=list)
     results: dict[str, Any] = MISSING
     run_dir: str = MISSING
 

@@ -1,0 +1,140 @@
+"""Figure 25 of the paper: features of thin and thick cones, and the accuracy of their classifier."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.cone_features import draw_cone_features
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.robot import (
+    Share,
+    accuracy,
+    cone_classifier,
+    label_clusters,
+    recall,
+    save_classifier,
+    train_on_drives,
+)
+from coil_rl.robot.labelling import Scans, one_sided
+
+PAPER_ACCURACY = Share(240, 243)
+DRAW_EVERY = 4  # scans
+
+COLUMNS = {
+    "of": ("", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"), "high": ("to", ".4f"),
+    "wrong": ("wrong", "d"), "total": ("of", "d"),
+}  # fmt: skip
+
+
+class Figure25(Result):
+    """Cone classifier, trained on recordings past cones of one side and tested on recordings past both sides.
+
+    The classifier is saved as `cones.skops` next to the picture. Without recordings, drives are simulated.
+
+    Args:
+        left: recordings past thin cones only, on the left; at least two.
+        right: recordings past thick cones only.
+        both: recordings past both sides with the cones' positions in their notes, for testing; without any, there is
+            only the cross-validation.
+        pairs: number of left and of right drives to simulate.
+        tests: number of drives past both sides to simulate.
+        scan: topic of the LiDAR.
+        odometry: topic of the odometry.
+
+    Raises:
+        ValueError: for numbers out of range, or recordings of one side only.
+        RecordingError: for an unusable recording.
+    """
+
+    def __init__(
+        self,
+        left: Sequence[str] = (),
+        right: Sequence[str] = (),
+        both: Sequence[str] = (),
+        *,
+        pairs: int = 5,
+        tests: int = 3,
+        scan: str = "/scan",
+        odometry: str | None = "/odom",
+    ) -> None:
+        if pairs < 2 or tests < 1:
+            raise ValueError(f"pairs={pairs} must be at least 2 and tests={tests} at least 1")
+        if bool(left) != bool(right) or (both and not left):
+            raise ValueError(f"left={list(left)} and right={list(right)} must both be given, or neither and no both")
+        self.pairs, self.tests, self.scan, self.odometry = pairs, tests, scan, odometry
+        self._read(left, right, both)
+
+    def _read(self, left: Sequence[str], right: Sequence[str], both: Sequence[str]) -> None:
+        self.left, self.right, self.both = (
+            [read_recording(path, self.scan, self.odometry, None) for path in paths] for paths in (left, right, both)
+        )
+        self.surveyed = [surveyed_drive(recording) for recording in self.both]
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        if not self.left:
+            with tqdm(total=2 * self.pairs + self.tests, desc="record", unit="drive", leave=False) as bar:
+                made = record_labelling_drives(stem.with_name("labelling"), self.pairs, self.tests, bar.update)
+            self._read(made["left"], made["right"], made["both"])
+        simulated = any("simulated" in recording.notes for recording in (*self.left, *self.right, *self.both))
+        suffix = " (simulated)" if simulated else ""
+        left, right = _scans(self.left), _scans(self.right)
+        training = train_on_drives(left, right)
+        save_classifier(training.pipeline, stem.with_name("cones.skops"))
+        classifier = cone_classifier(training.pipeline)
+        shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
+        shares["cross-validation"] = {"all": Share(training.right, training.total)}
+        if self.surveyed:
+            labelled = label_clusters(self.surveyed)
+            shares["accuracy"] = accuracy(classifier, labelled)
+            shares |= {f"recall of {kind} cones": of for kind, of in recall(classifier, self.surveyed).items()}
+            drawn = labelled.scan % DRAW_EVERY == 0
+            features, thick = labelled.features[drawn], labelled.thick[drawn]
+        else:
+            thin_features, thick_features = (one_sided(side, DRAW_EVERY).features for side in (left, right))
+            features = np.concatenate([thin_features, thick_features])
+            thick = np.arange(len(features)) >= len(thin_features)
+        kind = "test" if self.surveyed else "training"
+        draw_cone_features(
+            features, thick, stem.with_suffix(".png"), wrong=classifier.thick(features) != thick,
+            title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
+        )  # fmt: skip
+        rows = [{"measure": name, **_row(of, share)} for name in shares for of, share in shares[name].items()]
+        write_csv(rows, stem.with_suffix(".csv"))
+        folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
+        return _page(shares, folds, suffix)
+
+
+def _page(shares: Mapping[str, Mapping[str, Share]], folds: str, suffix: str) -> str:
+    tables = {name: [_row(of, share) for of, share in of_name.items()] for name, of_name in shares.items()}
+    overall = [{**tables.pop(name)[0], "of": name} for name in ("paper, its own robot", "cross-validation")]
+    parts = [
+        f"## Figure 25: thin cones and thick ones{suffix}",
+        f"Accuracy{suffix}, clusters within 1 m; cross-validation leaves out pairs of drives ({folds}):",
+        markdown_table(overall, COLUMNS),
+    ]
+    for name, rows in tables.items():
+        heading = f"{name.capitalize()}{suffix}: cones within 1 m and hit by a beam, detected and classified correctly:"
+        if name == "accuracy":
+            heading = f"On drives past both sides, not used in training{suffix}:"
+        parts += [heading, markdown_table(rows, COLUMNS)]
+    parts.append("The intervals (Wilson) assume independent clusters; those of neighbouring scans are correlated.")
+    return "\n\n".join(parts)
+
+
+def _row(of: str, share: Share) -> dict[str, Any]:
+    low, high = share.interval
+    wrong = share.total - share.right
+    return {"of": of, "share": share.share, "low": low, "high": high, "wrong": wrong, "total": share.total}
+
+
+def _scans(recordings: Sequence[Recording]) -> list[Scans]:
+    return [(recording.ranges, recording.angles(0)) for recording in recordings]

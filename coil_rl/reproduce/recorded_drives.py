@@ -1,0 +1,180 @@
+"""Measures of a robot's recorded drives: smoothness, laps, crashes and the driven line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.collections import PatchCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from coil_rl.envs.recordings.reading import SIMULATED, Recording
+from coil_rl.envs.reward import HISTORY, recent_mean
+from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, middle_line
+from coil_rl.envs.robot.laps import laps
+from coil_rl.envs.robot.simulated_recordings import track_of
+from coil_rl.envs.track import Track
+from coil_rl.report import style
+from coil_rl.reproduce.result import picture
+
+Array = NDArray[np.float64]
+Row = Mapping[str, Any]
+
+MIDDLE_SPACING = 0.002  # m
+MAX_POSES = 1000  # in one call, to limit the memory
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedDrive:
+    """A recorded drive.
+
+    Attributes:
+        method: display name of the driver.
+        row: its measures without `smoothness`; `seed` is that of its run, None if there is no run.
+        line: [M, 2] m, positions of the robot.
+        track: the track, if the recording has it.
+    """
+
+    method: str
+    row: Row
+    line: Array
+    track: Track | None
+
+
+def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
+    """Measure a drive, except for its smoothness.
+
+    Args:
+        recording: of one drive.
+        method: display name of the driver; by default the `policy` in the recording's notes, or the file name.
+
+    Raises:
+        RecordingError: if the recording's notes contain an invalid track.
+    """
+    notes = recording.notes.get(SIMULATED, {})
+    poses, seconds = _timed_poses(recording)
+    completed = laps(poses, seconds)
+    row: dict[str, Any] = {
+        "method": method or notes.get("policy", recording.path.stem), "seed": notes.get("seed"),
+        "recording": recording.path.name, "laps": len(completed.seconds),
+        "lap_time": float(completed.seconds.mean()) if len(completed.seconds) else np.nan,
+        "crashed": None, "off_centre": np.nan, "clearance": np.nan, "corner_cut": np.nan,
+    }  # fmt: skip
+    track = track_of(recording) if "track" in recording.notes else None
+    if track is not None:
+        course, middle = RobotCourse([track]), cKDTree(middle_line(track, MIDDLE_SPACING))
+        parts = torch.from_numpy(poses).float().t().split(MAX_POSES, 1)
+        index = torch.zeros(MAX_POSES, dtype=torch.int64)
+        row["clearance"] = min(float(course.clearance(index[: part.shape[1]], part)[0].min()) for part in parts)
+        row["crashed"] = row["clearance"] <= 0
+        row["off_centre"] = float(middle.query(poses[:, :2])[0].mean())
+        if len(completed.metres):
+            row["corner_cut"] = float(completed.metres.mean()) / track.length
+    return RecordedDrive(row["method"], row, poses[:, :2], track)
+
+
+def smoothness(recording: Recording, car_length: float, max_steering: float) -> float:
+    """Return the mean of |a - weighted mean of the last 20 actions|; NaN for a recording without commands.
+
+    Args:
+        recording: of one drive.
+        car_length: L of the robot, m.
+        max_steering: degrees of an action of 1.
+    """
+    if recording.commands is None:
+        return np.nan
+    actions = _actions(*recording.commands, recording.log_time, car_length, np.radians(max_steering))
+    history, steps = torch.zeros(HISTORY, 1), []
+    for action in torch.from_numpy(actions).split(1):
+        steps.append((action - recent_mean(history)).abs())
+        history = torch.cat([action.unsqueeze(0), history[:-1]])
+    return float(torch.cat(steps).double().mean())
+
+
+def means(rows: Sequence[Row]) -> dict[str, Any]:
+    """Return the means over drives: the minimum of the clearance, lap time and corner cut weighted by laps."""
+    crashes = [row["crashed"] for row in rows if row["crashed"] is not None]
+    completed = [row for row in rows if row["laps"]]
+    counts = [row["laps"] for row in completed]
+    values = {key: float(np.mean([row[key] for row in rows])) for key in ("smoothness", "off_centre")}
+    for key in ("lap_time", "corner_cut"):
+        values[key] = float(np.average([row[key] for row in completed], weights=counts)) if counts else np.nan
+    clearance, crashed = min(row["clearance"] for row in rows), sum(crashes) if crashes else None
+    return {"drives": len(rows), "laps": sum(counts), "crashes": crashed, "clearance": clearance, **values}
+
+
+def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None:
+    """Draw the lines of each driver in a panel, with the cones of known tracks.
+
+    Args:
+        drives: at least one.
+        path: of the picture.
+        title: above it.
+    """
+    methods = list(dict.fromkeys(drive.method for drive in drives))
+    strokes = style.strokes(methods)
+    handles: list[Artist] = []
+    if any(drive.track is not None for drive in drives):
+        handles += [_dot("o", style.LEFT_CONE, "thin cones"), _dot("o", style.RIGHT_CONE, "thick cones")]
+    if any(drive.row["crashed"] for drive in drives):
+        handles.append(_dot("X", style.INK, "crash"))
+    rows = -(-len(methods) // 2)
+    with picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
+        panels = list(figure.subplots(rows, 2, squeeze=False).flat)
+        for axes, method in zip(panels, methods, strict=False):
+            _draw_panel(axes, [drive for drive in drives if drive.method == method], strokes[method].colour)
+        for axes in panels[len(methods) :]:
+            axes.axis("off")
+
+
+def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], colour: str) -> None:
+    count = f"{len(drives)} drives" if len(drives) > 1 else "one drive"
+    axes.set_title(f"{drives[0].method}, {count} (m)", size=9, color=style.QUIET)
+    axes.set_aspect("equal")
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0, labelsize=7)
+    axes.grid(color=style.ASPHALT, lw=0.5)
+    axes.set_axisbelow(True)
+    for track in {id(drive.track): drive.track for drive in drives if drive.track is not None}.values():
+        for cones, radius, fill in ((track.left, THIN, style.LEFT_CONE), (track.right, THICK, style.RIGHT_CONE)):
+            discs = [Circle((x, y), radius) for x, y in cones.tolist()]
+            axes.add_collection(PatchCollection(discs, fc=fill, ec=style.INK, lw=0.3, zorder=3))
+    for drive in drives:
+        axes.plot(*drive.line.T, color=colour, lw=0.8, alpha=0.6, zorder=4)
+        if drive.row["crashed"]:
+            axes.plot(*drive.line[-1], "X", ms=7, mfc=colour, mec=style.PAPER, mew=0.8, zorder=5)
+
+
+def _dot(marker: str, colour: str, label: str) -> Line2D:
+    return Line2D([], [], ls="", marker=marker, ms=5, mfc=colour, mec=style.INK, mew=0.4, label=label)
+
+
+def _actions(
+    commands: Array, times: NDArray[np.int64], scan_times: NDArray[np.int64], car_length: float, max_steering: float
+) -> NDArray[np.float32]:
+    """Return the commanded steering after each scan, [N] as fractions of `max_steering` (equations 99 and 100)."""
+    # The last command before the next scan; the robot stands until the first one.
+    until = np.append(scan_times[1:], np.iinfo(np.int64).max)
+    last = np.searchsorted(times, until) - 1
+    speed, turn_rate = np.where(last[:, None] < 0, 0.0, commands[last]).T
+    sine = np.divide(turn_rate * car_length, speed, out=np.zeros(len(last)), where=speed != 0)
+    actions = np.arcsin(sine.clip(-1, 1)) / max_steering
+    return actions.clip(-1, 1).astype(np.float32)
+
+
+def _timed_poses(recording: Recording) -> tuple[Array, Array]:
+    """Return poses [M, 3] and times [M] s: those of the odometry, or of the scans if there is none."""
+    if recording.odometry is None:
+        return recording.poses(), recording.seconds
+    poses, log_time, stamp = recording.odometry
+    clock = stamp if (np.diff(stamp) > 0).all() else log_time
+    return poses, (clock - clock[0]) / 1e9

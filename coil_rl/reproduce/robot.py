@@ -1,0 +1,234 @@
+"""Tables 6 and 7 of the paper: drives of a robot, measured from recordings."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from coil_rl.envs import SimulatedRobotEnv
+from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.errors import UserError
+from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.statistics import stratified_bootstrap
+from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
+from coil_rl.reproduce.result import (
+    NO_RUNS,
+    Result,
+    Runs,
+    certain_verdict,
+    claims_section,
+    runs_by_label,
+    verdict,
+)
+from coil_rl.robot.drives import Driver, agent_of, record
+from coil_rl.train.build import build_guides
+from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.load import read_config
+
+PAPER_ROBOT: dict[str, dict[str, Any]] = {
+    "guide": {"smoothness": 0.265, "lap_time": 43.67, "remark": "sways, stays central"},
+    "oil": {"smoothness": 0.104, "lap_time": 43.32, "remark": "smoother, less central"},
+    "ppo": {"smoothness": 0.102, "lap_time": 40.14, "remark": "nearer the boundary"},
+    "coil": {"smoothness": 0.082, "lap_time": 39.53, "remark": "cuts corners most"},
+}
+TABLE_6 = {
+    "method": ("method", ""), "seeds": ("seeds", "d"), "drives": ("drives", "d"), "laps": ("laps", "d"),
+    "crashes": ("crashes", "d"), "smoothness": ("smoothness", ".3f"), "paper smoothness": ("paper", ".3f"),
+    "lap_time": ("lap (s)", ".2f"), "paper lap_time": ("paper (s)", ".2f"),
+}  # fmt: skip
+TABLE_7 = {
+    "method": ("method", ""), "off_centre": ("from the centre (m)", ".3f"),
+    "clearance": ("smallest clearance (m)", ".3f"), "corner_cut": ("path / centre line", ".3f"),
+    "paper remark": ("paper", ""),
+}  # fmt: skip
+# The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
+CLAIMS = (
+    ("PPO steers more smoothly than the guide", "smoothness", "ppo", "guide", -1),
+    ("COIL steers more smoothly than its guide", "smoothness", "coil", "guide", -1),
+    ("COIL steers more smoothly than PPO", "smoothness", "coil", "ppo", -1),
+    ("PPO's laps take less time than the guide's", "lap_time", "ppo", "guide", -1),
+    ("COIL's laps take less time than PPO's", "lap_time", "coil", "ppo", -1),
+    ("OIL steers more smoothly than the guide", "smoothness", "oil", "guide", -1),
+    ("OIL is less central than the guide", "off_centre", "oil", "guide", 1),
+    ("PPO drives nearer to the boundary than the guide", "clearance", "ppo", "guide", -1),
+    ("COIL cuts corners more than PPO", "corner_cut", "coil", "ppo", -1),
+)
+NOTES = """
+smoothness: mean of |a - weighted mean of the last 20 actions|, a the commanded steering as a fraction of
+{max_steering:g} degrees. laps: from the start back to the start, by odometry, and their mean time. crashes and the
+measures of Table 7 need the cones' positions, the `track` of a recording: the robot crashed if its outline touched a
+cone or its centre crossed the line between two. The paper's robot drove on another track, so its lap times compare only
+with each other. Each drive is a row of the CSV."""
+CLAIM_NOTES = """
+Differences are of the same seed, each the mean over its drives (the minimum of the clearance); seeds: how many of them,
+as drivers without a complete lap are compared by clearance only. Intervals: percentile bootstrap of seeds, {resamples}
+resamples; a single seed has none and decides nothing."""
+
+
+class Table6(Result):
+    """Smoothness, laps, crashes and lines of several drivers, from recordings.
+
+    A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide and
+    the agents of runs drive the simulated robot and are recorded next to the page; existing recordings are reused.
+
+    Args:
+        experiments: experiments whose agents drive if there are no recordings.
+        recordings: MCAP files, rosbag2 directories or folders of MCAP files; or lists of them by driver name.
+        labels: labels of the runs that drive, with the guide of the first of them.
+        repeats: drives of each driver, which differ by the LiDAR noise.
+        laps: laps of a drive.
+        scan: topic of the LiDAR.
+        odometry: topic of the odometry; None to integrate the commands instead.
+        command: topic of the robot's commands, or of another policy's, such as a replay's.
+        car_length: L of the robot, m.
+        max_steering: degrees of an action of 1.
+        resamples: number of bootstrap resamples.
+        seed: of the bootstrap and of the LiDAR.
+
+    Raises:
+        UserError: if there are neither recordings nor experiments.
+        RecordingError: for an unusable recording.
+    """
+
+    def __init__(
+        self,
+        experiments: Sequence[str] = (),
+        recordings: Sequence[str] | Mapping[str, Sequence[str]] = (),
+        *,
+        labels: Sequence[str] = ("oil", "ppo", "coil"),
+        repeats: int = 3,
+        laps: int = 3,
+        scan: str = "/scan",
+        odometry: str | None = "/odom",
+        command: str | None = "/cmd_vel",
+        car_length: float = 2 / 7,
+        max_steering: float = 80.0,
+        resamples: int = 2000,
+        seed: int = 0,
+    ) -> None:
+        for name, count in {"repeats": repeats, "laps": laps, "resamples": resamples}.items():
+            if count < 1:
+                raise ValueError(f"{name}={count} must be at least 1")
+        if not labels:
+            raise ValueError("labels=[] leaves the guide alone; give at least one")
+        by_name = recordings if isinstance(recordings, Mapping) else {"": recordings}
+        files = [(name, file) for name, paths in by_name.items() for path in paths for file in _files(Path(path))]
+        self.recordings = [read_recording(file, scan, odometry, command) for _, file in files]
+        # Measured here, so that a bad recording fails before any training.
+        self.drives = [measure(found, name) for (name, _), found in zip(files, self.recordings, strict=True)]
+        if recordings and not files:
+            raise UserError(f"recordings={recordings} has no MCAP file; give some, or none to let the runs drive")
+        if not files and not experiments:
+            raise UserError("recordings=[] and experiments=[] give no driver; give one of them")
+        self.experiments = [] if files else list(experiments)
+        self.labels, self.repeats, self.laps, self.seed, self.resamples = list(labels), repeats, laps, seed, resamples
+        self.car_length, self.max_steering = car_length, max_steering
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        if self.experiments:
+            own = {experiment: runs[experiment] for experiment in self.experiments}
+            self.recordings = self._record(own, stem.with_name(f"{stem.name}_drives"))
+            self.drives = [measure(recording) for recording in self.recordings]
+        rows = [
+            {**drive.row, "smoothness": smoothness(recording, self.car_length, self.max_steering)}
+            for drive, recording in zip(self.drives, self.recordings, strict=True)
+        ]
+        write_csv(rows, stem.with_suffix(".csv"))
+        suffix = " (simulated)" if any(recording.simulated for recording in self.recordings) else ""
+        draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
+        return robot_page(rows, suffix, self.max_steering, self.resamples, self.seed)
+
+    def _record(self, runs: Runs, folder: Path) -> list[Recording]:
+        robot = f"{self.car_length:g} m, {self.max_steering:g} degrees"
+        about = {"robots": f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"}
+        return record(self._drivers(runs), folder, self.repeats, about)
+
+    def _drivers(self, runs: Runs) -> Iterator[Driver]:
+        """Yield the guide of the first run, and the agent of each run."""
+        make_env = partial(
+            SimulatedRobotEnv, num_cars=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
+            max_steering=self.max_steering, seed=self.seed,
+        )  # fmt: skip
+        selected = [run for of_label in runs_by_label(self.labels, runs).values() for run in of_label]
+        first = read_config(selected[0].folder, "run", {"device": "cpu"})
+        guides = build_guides(first)
+        for display_name, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
+            config = json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))
+            about = {"policy": display_name, "guide": config}
+            yield Driver(display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide))
+        for run in selected:
+            yield agent_of(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
+
+
+def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples: int, seed: int) -> str:
+    """Return the page of Tables 6 and 7.
+
+    Args:
+        rows: measures of the drives.
+        suffix: of the headings, such as " (simulated)".
+        max_steering: degrees of an action of 1.
+        resamples: number of bootstrap resamples.
+        seed: of the bootstrap.
+    """
+    by_method: dict[str, dict[str | None, list[Row]]] = {}
+    for row in rows:
+        by_method.setdefault(row["method"], {}).setdefault(row["seed"], []).append(row)
+    table = []
+    for method, by_seed in by_method.items():
+        paper = PAPER_ROBOT.get(method, dict.fromkeys(PAPER_ROBOT["guide"]))
+        line = means([row for drives in by_seed.values() for row in drives])
+        line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
+        table.append(line | {f"paper {key}": value for key, value in paper.items()})
+    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, TABLE_6)]
+    parts += [f"### Table 7, measured{suffix}", markdown_table(table, TABLE_7)]
+    notes = NOTES.format(max_steering=max_steering).strip()
+    of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
+    verdicts = [_claim(of_seeds, *claim, resamples=resamples, seed=seed) for claim in CLAIMS]
+    claims = [claim for claim in verdicts if claim is not None]
+    if not claims:
+        return "\n\n".join([*parts, notes])
+    crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
+    details = ", ".join(f"{line['method']} {line['crashes']} of {line['drives']} drives" for line in crashes)
+    ours = certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
+    claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
+    section = claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
+    return "\n\n".join([*parts, notes + CLAIM_NOTES.format(resamples=resamples), section])
+
+
+def _claim(
+    by_method: Mapping[str, Mapping[str | None, Row]], claim: str, key: str, driver: str, other: str, sign: int,
+    *, resamples: int, seed: int,
+) -> dict[str, Any] | None:  # fmt: skip
+    """Return the verdict on a claim; None if a driver is missing, or they have no seed in common."""
+    if driver not in by_method or other not in by_method:
+        return None
+    # A driver without seeds, such as the guide, is compared with every seed.
+    without_seed = by_method[other].get(None)
+    pairs = [(row, by_method[other].get(number, without_seed)) for number, row in by_method[driver].items()]
+    both = [(row, reference) for row, reference in pairs if reference is not None]
+    if not both:
+        return None
+    # A drive without a complete lap has not steered through every turn.
+    complete = [pair for pair in both if key == "clearance" or all(row["laps"] for row in pair)]
+    differences = np.array([row[key] - reference[key] for row, reference in complete])
+    differences = differences[np.isfinite(differences)]
+    spec = "+.2f" if key == "lap_time" else "+.3f"
+    line: dict[str, Any] = {"claim": claim, "seeds": f"{len(differences)} of {len(both)}", "paper": None, "ours": None}
+    if key in ("smoothness", "lap_time"):
+        line["paper"] = f"{PAPER_ROBOT[driver][key] - PAPER_ROBOT[other][key]:{spec}}"
+    if len(differences):
+        ends = stratified_bootstrap(differences[:, None], np.mean, resamples=resamples, seed=seed)
+        line["ours"] = verdict(float(differences.mean()), *ends, spec, sign)
+    return line
+
+
+def _files(path: Path) -> list[Path]:
+    """Return the MCAP files of a folder; any other path is itself a recording."""
+    return sorted(path.glob("*.mcap")) if path.is_dir() and not (path / "metadata.yaml").exists() else [path]

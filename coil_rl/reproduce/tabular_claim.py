@@ -1,0 +1,200 @@
+"""The claim that COIL is "at least as good as its guide" (paper 3.2), tested with tabular COIL.
+
+Q-learning with a guide's advice on random worlds, small enough to compute the value of each policy exactly, so that
+every case is a yes or a no; next to it Q-learning without advice. The agent observes the state, or only its class out
+of a few; the guide always observes the state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
+from scipy.stats import binomtest
+from tqdm import tqdm
+
+from coil_rl.report import markdown_table, style, write_csv
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, certain_verdict, claims_section, lighten, picture
+from coil_rl.tabular import MDP, garnet, observations_with_advice, q_learning, solve, value_iteration, with_advice
+from coil_rl.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
+from coil_rl.tabular.mdp import Array, Integers
+
+NEARLY = 0.01  # of a score
+ROUNDING = 1e-9  # scores of equal policies differ by less
+LOWEST_SCORE = -0.2  # in the picture
+LINE_OFFSET = 1.6  # points between coinciding lines
+PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": (0, style.SECOND_ROUND)}
+
+NOTES = """
+Scores: 0 for the random policy, 1 for the optimal policy of each world; means over {worlds} random worlds, one seed
+each, after the last step. ≥ guide: the share of worlds in which the greedy policy's value is at least the guide's,
+exactly, with the 95 % (Wilson) interval of the last share. The paper: at least as good as the guide, guaranteed, which
+would be 100 %. Plain: Q-learning without advice."""
+
+
+class TabularCoil(Result):
+    """Tabular COIL with guides of different quality.
+
+    Args:
+        worlds: number of random worlds; world k has the seed k.
+        states: of each world.
+        actions: of each world.
+        classes: number of state classes; the agent that observes classes does not observe the state.
+        noise: probability of a random action of the noisy guide.
+        epsilon: see `q_learning`.
+        power: see `q_learning`.
+        episode_steps: length of an episode.
+        steps: numbers of steps after which the policies are evaluated.
+    """
+
+    def __init__(
+        self,
+        worlds: int = 20,
+        states: int = 12,
+        actions: int = 3,
+        classes: int = 4,
+        noise: float = 0.2,
+        epsilon: float = 0.2,
+        power: float = 0.6,
+        episode_steps: int = 50,
+        steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000),
+    ) -> None:
+        counts = {"worlds": worlds, "actions": actions, "classes": classes, "episode_steps": episode_steps}
+        for name, value in counts.items():
+            if value < 1:
+                raise ValueError(f"{name}={value} must be at least 1")
+        if states < max(3, classes):
+            raise ValueError(f"states={states} must be at least 3, and at least classes={classes}")
+        if not 0 <= noise <= 1 or not 0 < epsilon <= 1 or not 0.5 < power <= 1:
+            raise ValueError(
+                f"noise={noise} must be between 0 and 1, epsilon={epsilon} more than 0 and at most 1, "
+                f"and power={power} more than 0.5 and at most 1"
+            )
+        if not steps or list(steps) != sorted(set(steps)) or steps[0] < 1:
+            raise ValueError(f"steps={list(steps)} must be increasing integers from 1")
+        self.worlds, self.states, self.actions, self.classes = worlds, states, actions, classes
+        self.steps = tuple(steps)
+        self.learn = partial(
+            q_learning, epsilon=epsilon, power=power, episode_steps=episode_steps, snapshots=self.steps
+        )
+        self.guides: Mapping[str, Callable[[MDP], Array]] = {
+            "optimal": optimal_guide,
+            f"noisy ({noise:.0%})": partial(noisy_guide, noise=noise),
+            "random": random_guide,
+            "worst": worst_guide,
+        }
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
+        rows = [row for seed in seeds for row in self._world(seed)]
+        write_csv(rows, stem.with_suffix(".csv"))
+        groups = [self._group(rows, view, guide) for view in ("state", "class") for guide in self.guides]
+        _draw(groups, self.steps, stem.with_suffix(".png"))
+        table = markdown_table(groups, {
+            "view": ("agent observes", ""), "guide": ("guide", ""), "guide_score": ("guide's score", ".2f"),
+            "coil_score": ("COIL", ".2f"), "plain_score": ("plain", ".2f"),
+            **{f"share_{n}": (f"≥ guide, {n:,} steps", ".0%") for n in self.steps[-1::-2][::-1]},
+            "interval": ("95 %", ""), "nearly": (f"≥ guide - {NEARLY}", ".0%"),
+            "plain_share": ("plain ≥ guide", ".0%"),
+        })  # fmt: skip
+        reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)
+        ours = certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
+        claims = [{"claim": "COIL ends at least as good as its guide, guaranteed", "ours": ours}]
+        section = claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
+        notes = NOTES.format(worlds=self.worlds)
+        return f"## COIL at least as good as its guide\n\n{table}\n{notes}\n\n{section}"
+
+    def _world(self, seed: int) -> Iterator[dict[str, Any]]:
+        """Yield the scores in one world, a row for each view, guide and number of steps."""
+        rng = np.random.default_rng(seed)
+        mdp = garnet(self.states, self.actions, rng)
+        views = {"state": np.arange(self.states), "class": rng.permutation(self.states) % self.classes}
+        random, best = _value(mdp, random_guide(mdp)), _value(mdp, value_iteration(mdp).policy)
+        for view, observations in views.items():
+            plain = self._learned_values(mdp, observations, seed)
+            for name, guide in self.guides.items():
+                policy = guide(mdp)
+                advised = observations_with_advice(observations, self.actions)
+                coil = self._learned_values(with_advice(mdp, policy), advised, seed)
+                own = np.full(len(self.steps), _value(mdp, policy))
+                scores = (np.stack([own, coil, plain], axis=1) - random) / (best - random)
+                for n, of_step in zip(self.steps, scores.tolist(), strict=True):
+                    names = ("guide_score", "coil_score", "plain_score")
+                    row = {"view": view, "guide": name, "world": seed, "steps": n}
+                    yield row | dict(zip(names, of_step, strict=True))
+
+    def _learned_values(self, mdp: MDP, observations: Integers, seed: int) -> Array:
+        """Return the value of the greedy policy after each number of steps."""
+        learned = self.learn(mdp, self.steps[-1], np.random.default_rng(seed), observations=observations)
+        return np.array([_value(mdp, Q.argmax(axis=1)[observations]) for Q in learned.history])
+
+    def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:
+        """Return shares and mean scores over all worlds, for one view and guide."""
+        own, coil, plain = (
+            np.array([row[key] for row in rows if row["view"] == view and row["guide"] == guide]).reshape(
+                self.worlds, len(self.steps)
+            )
+            for key in ("guide_score", "coil_score", "plain_score")
+        )
+        reached = (coil >= own - ROUNDING).sum(axis=0)
+        shares = reached / self.worlds
+        interval = binomtest(int(reached[-1]), self.worlds).proportion_ci(method="wilson")
+        return {
+            "view": "the state" if view == "state" else f"one of {self.classes} classes", "guide": guide,
+            "guide_score": own.mean(), "coil_score": coil[:, -1].mean(), "plain_score": plain[:, -1].mean(),
+            **{f"share_{n}": share for n, share in zip(self.steps, shares, strict=True)},
+            "interval": f"{interval.low:.0%} to {interval.high:.0%}",
+            "nearly": (coil[:, -1] >= own[:, -1] - NEARLY).mean(),
+            "plain_share": (plain >= own - ROUNDING).mean(axis=0)[-1],
+            "reached": int(reached[-1]), "shares": shares,
+            "coil_scores": coil.mean(axis=0), "plain_scores": plain.mean(axis=0),
+        }  # fmt: skip
+
+
+def _value(mdp: MDP, policy: Array | Integers) -> float:
+    """Return the expected return of a policy from the start."""
+    return float(mdp.start @ solve(mdp, policy))
+
+
+def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path) -> None:
+    """Draw one column per view: shares above, scores below."""
+    views, guides = (list(dict.fromkeys(group[key] for group in groups)) for key in ("view", "guide"))
+    lines: dict[str, Any] = {
+        name: {"color": colour, "lw": 2, "marker": "o", "ms": 4}
+        for name, colour in zip(guides, style.AGENTS, strict=False)
+    }
+    handles: list[Artist] = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
+    handles.append(Line2D([], [], label="plain Q-learning", **PLAIN))
+    handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=(0, style.DASHES), label="guide alone (its colour)"))
+    with picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
+        grid = figure.subplots(2, len(views), sharex=True, sharey="row", squeeze=False)
+        for (share, score), view in zip(grid.T, views, strict=True):
+            of_view = [group for group in groups if group["view"] == view]
+            for index, group in enumerate(of_view):
+                line = lines[group["guide"]]
+                shift = ScaledTranslation(0, (index - 1.5) * LINE_OFFSET / 72, figure.dpi_scale_trans)
+                share.plot(steps, group["shares"], transform=share.transData + shift, clip_on=False, **line)
+                score.plot(steps, group["coil_scores"], **line)
+                score.axhline(group["guide_score"], color=line["color"], lw=1.2, ls=(0, style.DASHES), zorder=1.5)
+                if group["guide_score"] < LOWEST_SCORE:
+                    text = f"↓ guide {group['guide']} at {group['guide_score']:.2f}"
+                    where = {"xycoords": "axes fraction", "textcoords": "offset points"}
+                    score.annotate(text, (0, 0), (4, 4), color=line["color"], **where)
+            score.plot(steps, of_view[0]["plain_scores"], **PLAIN)
+            share.set_title(f"the agent observes {view}", size=9, loc="left", color=style.QUIET)
+            score.set_xlabel("steps of experience")
+        for axes in grid.flat:
+            lighten(axes)
+            axes.set_xscale("log")
+            axes.set_xticks(steps, [f"{n:,}" for n in steps])
+            axes.minorticks_off()
+        grid[0, 0].set(ylabel="worlds where COIL\nis at least the guide", ylim=(0, 1))
+        grid[0, 0].yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
+        grid[1, 0].set(ylabel="mean score\n(0 random, 1 optimal)", ylim=(LOWEST_SCORE, 1.05))

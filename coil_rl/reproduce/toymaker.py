@@ -1,0 +1,146 @@
+"""Table 1 and figure 6 of the paper: values of the toymaker, and the convergence of value iteration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from coil_rl.report import markdown_table, style, write_csv
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, certain_verdict, claims_section, lighten, picture
+from coil_rl.tabular import policy_iteration, toymaker, value_iteration
+from coil_rl.tabular.mdp import Array
+
+PAPER_Q = np.array([[41.37, 42.21], [31.42, 32.26]])
+PAPER_ITERATIONS = 80  # "converges after about 80 iterations"
+ROUNDING = 0.005  # largest rounding error of two decimals
+SHARES = (0.1, 0.05, 0.02, 0.01, 0.001)
+
+
+class Table1(Result):
+    """Q of the toymaker, by value iteration.
+
+    Args:
+        tolerance: largest error of Q.
+    """
+
+    def __init__(self, tolerance: float = 1e-9) -> None:
+        if not tolerance > 0:
+            raise ValueError(f"tolerance={tolerance} must be more than 0")
+        self.tolerance = tolerance
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        mdp = toymaker()
+        Q = value_iteration(mdp, self.tolerance).Q
+        rows = [
+            {
+                "state": mdp.states[s], "action": mdp.actions[a], "ours": Q[s, a], "paper": PAPER_Q[s, a],
+                "difference": Q[s, a] - PAPER_Q[s, a],
+            }
+            for s, a in np.ndindex(Q.shape)
+        ]  # fmt: skip
+        write_csv(rows, stem.with_suffix(".csv"))
+        difference = (Q - PAPER_Q).flatten()
+        _draw_differences([f"{row['state']}, {row['action']}" for row in rows], difference, stem.with_suffix(".png"))
+        table = markdown_table([row | {"rounded": row["ours"]} for row in rows], {
+            "state": ("state", ""), "action": ("action", ""), "ours": ("Q", ".4f"), "rounded": ("rounded", ".2f"),
+            "paper": ("paper", ".2f"), "difference": ("difference", "+.4f"),
+        })  # fmt: skip
+        equal, largest = int((np.abs(difference) <= ROUNDING).sum()), np.abs(difference).max()
+        notes = (
+            f"{equal} of {len(difference)} values round to the printed ones; the largest difference is {largest:.4f}. "
+            "Value iteration that stops early is short of the optimum by nearly the same amount everywhere; no such "
+            f"shortfall rounds to more than {most_explained(difference)} of the printed values."
+        )
+        gain = Q[:, 1] - Q[:, 0]
+        details = f"{equal} of {len(difference)} values, off by {largest:.4f} at most"
+        claims = {
+            "Advertising is worth more in both states": certain_verdict(
+                bool((gain > 0).all()), "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
+            ),
+            "Q to two decimals": certain_verdict(equal == len(difference), details),
+        }
+        section = claims_section([{"claim": claim, "ours": ours} for claim, ours in claims.items()], {"ours": "ours"})
+        return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
+
+
+class Figure6(Result):
+    """V of both states after each step of value iteration.
+
+    Args:
+        iterations: number of iterations to show.
+    """
+
+    def __init__(self, iterations: int = 160) -> None:
+        if iterations < 1:
+            raise ValueError(f"iterations={iterations} must be at least 1")
+        self.iterations = iterations
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        mdp = toymaker()
+        limit, history = policy_iteration(mdp).V, value_iteration(mdp).history
+        error = (np.abs(history - limit) / np.abs(limit)).max(axis=1)
+        rows = [
+            {"iteration": k, **dict(zip(mdp.states, V, strict=True)), "short": error[k]}
+            for k, V in enumerate(history[: self.iterations + 1])
+        ]
+        write_csv(rows, stem.with_suffix(".csv"))
+        _draw_convergence(mdp.states, history[: len(rows)], limit, stem.with_suffix(".png"))
+        paper = f"about {PAPER_ITERATIONS}"
+        table = markdown_table(
+            [{"short": share, "ours": int((error > share).sum()), "paper": paper} for share in SHARES],
+            {"short": ("short of its limit by", ".1%"), "ours": ("iterations", "d"), "paper": ("paper", "")},
+        )
+        after = history[min(PAPER_ITERATIONS, len(history) - 1)]
+        values = ", ".join(f"{value:.2f} of {final:.2f}" for value, final in zip(after, limit, strict=True))
+        notes = f"After {PAPER_ITERATIONS} iterations V is {values}. The paper does not define convergence."
+        return f"## Figure 6: value iteration on the toymaker\n\n{table}\n\n{notes}"
+
+
+def most_explained(differences: Array) -> int:
+    """Return the largest number of differences that one common shift brings within rounding."""
+    # Among intervals of equal width, the most that share a point share the lower end of one of them.
+    lower = differences - ROUNDING
+    return max(int(((lower <= end) & (end <= lower + 2 * ROUNDING)).sum()) for end in lower)
+
+
+def _draw_differences(labels: list[str], differences: Array, path: Path) -> None:
+    handles: list[Artist] = [
+        Line2D([], [], color=style.AGENTS[0], ls="", marker="o", ms=6, label="ours - paper"),
+        Patch(color=style.ASPHALT, lw=0, label="rounding to two decimals"),
+    ]
+    with picture(path, "Table 1: Q of the toymaker, beside the paper's", handles, height=2.4) as figure:
+        axes = figure.add_subplot(xlabel="difference of Q")
+        lighten(axes, grid="x")
+        axes.axvspan(-ROUNDING, ROUNDING, color=style.ASPHALT, lw=0)
+        axes.axvline(0, color=style.KERB, lw=1)
+        axes.plot(differences, range(len(differences)), color=style.AGENTS[0], ls="", marker="o", ms=6)
+        axes.set_yticks(range(len(differences)), labels)
+        axes.set_ylim(len(differences) - 0.5, -0.5)
+        reach = 1.15 * max(3 * ROUNDING, float(np.abs(differences).max()))
+        axes.set_xlim(-reach, reach)
+
+
+def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, path: Path) -> None:
+    dashes: Any = {"color": style.QUIET, "ls": (0, style.DASHES), "lw": 1.3}
+    colours = dict(zip(states, style.AGENTS, strict=False))
+    handles: list[Artist] = [Line2D([], [], color=c, lw=2, label=f"V of {state}") for state, c in colours.items()]
+    handles.append(Line2D([], [], label="limit", **dashes))
+    with picture(path, "Figure 6: value iteration on the toymaker", handles, 4.2) as figure:
+        axes = figure.add_subplot(xlabel="iteration", ylabel="V", xlim=(0, len(history) - 1))
+        lighten(axes)
+        for values, final, colour in zip(history.T, limit, colours.values(), strict=True):
+            axes.plot(values, color=colour, lw=2)
+            axes.axhline(final, zorder=1.5, **dashes)
+        if len(history) > PAPER_ITERATIONS + 1:
+            axes.axvline(PAPER_ITERATIONS, color=style.KERB, lw=1)
+            axes.annotate(
+                f"paper: converged\nafter about {PAPER_ITERATIONS}", (PAPER_ITERATIONS, 0), (4, 6),
+                xycoords=("data", "axes fraction"), textcoords="offset points", color=style.QUIET,
+            )  # fmt: skip

@@ -1,0 +1,200 @@
+"""Table 4 and figure 22 of the paper: the return during training."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
+from coil_rl.report.curve import TRAINING, mean_curve, points
+from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
+from coil_rl.reproduce.result import (
+    NO_RUNS,
+    Result,
+    Runs,
+    WorldsResult,
+    claims_section,
+    runs_by_label,
+    verdict,
+    with_interval,
+    world_heading,
+)
+
+Row = Mapping[str, Any]
+
+PAPER_RETURNS = {"coil": 477.6, "ppo": 414.2}  # mean over 5 runs of the highest mean reward during training
+FRACTIONS = {0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
+
+TABLE_4_NOTES = """
+The return of a run is the mean over its last 100 finished episodes on the training tracks, actions sampled; best: the
+highest during training, as in the paper; final: the last one. The highest point of a noisy curve is above the policy's
+mean return, the more so the longer the run. Differences to {against} are of the same seed; better: the share of seeds
+with a higher best. Intervals: percentile bootstrap of whole seeds, {resamples} resamples; with five seeds they contain
+the mean in about 85 of 100 cases. Its guide: the guide alone on the training tracks, degraded as the agent's was."""
+
+FIGURE_22_NOTES = """
+The return is the mean over the last 100 finished episodes on the training tracks, actions sampled; the curve is the
+mean of the runs, the band the 95 % bootstrap interval of that mean. The guide alone earns {guide} there. Up to the
+guide: the number of frames after which the mean of the runs first reaches that. The paper draws three curves of each
+method and prints no numbers."""
+
+
+class Table4(WorldsResult):
+    """Best and final training return of each method."""
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        rows = {
+            world: [training_returns(run) for experiment in experiments for run in runs[experiment] if run.curve]
+            for world, experiments in self.worlds.items()
+        }
+        write_csv([{"world": world} | row for world in rows for row in rows[world]], stem.with_suffix(".csv"))
+        tables = {world: self._table(of_world) for world, of_world in rows.items()}
+        _draw_returns(rows[""], tables[""], self.against, stem.with_suffix(".png"))
+        columns = {
+            "label": ("method", ""), "runs": ("runs", "d"), "best cell": ("best: mean (95 %)", ""),
+            "best_iqm cell": ("best: IQM (95 %)", ""), "final cell": ("final: mean (95 %)", ""),
+            "guide": ("its guide", ".1f"), "difference cell": (f"best - {self.against}'s (95 %)", ""),
+            "better": (f"better than {self.against}", ".0%"),
+        }  # fmt: skip
+        parts = ["## Table 4: the return in training", _paper_table(tables[""])]
+        for world, table in tables.items():
+            parts += [*world_heading(world), markdown_table(table, columns)]
+        parts += [TABLE_4_NOTES.strip().format(against=self.against, resamples=self.resamples)]
+        claims = []
+        for world, table in tables.items():
+            for line in table:
+                if line["label"] == "coil" and self.against == "ppo":
+                    claim = ", ".join(filter(None, ("COIL's best return in training is above PPO's", world)))
+                    paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
+                    ours = verdict(line["difference"], line["difference_low"], line["difference_high"], "+.1f")
+                    claims.append({"claim": claim, "paper": paper, "ours": ours})
+        if claims:
+            parts.append(claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
+        return "\n\n".join(parts)
+
+    def _table(self, rows: Sequence[Row]) -> list[dict[str, Any]]:
+        """Return one row per label, the best first."""
+        by_label: dict[str, dict[int, Row]] = {}
+        for row in rows:
+            by_label.setdefault(row["label"], {})[row["seed"]] = row
+        reference = by_label.get(self.against, {})
+        table = []
+        for label, by_seed in by_label.items():
+            best, final, guide = (
+                np.array([row[key] for row in by_seed.values()]) for key in ("best", "final", "guide")
+            )
+            common = [seed for seed in by_seed if seed in reference and label != self.against]
+            ours, theirs = (np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference))
+            line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
+            line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
+            statistics: dict[str, Any] = {
+                "best": (best, np.mean), "best_iqm": (best, iqm), "final": (final, np.mean),
+                "difference": (ours - theirs, np.mean),
+            }  # fmt: skip
+            for name, (values, statistic) in statistics.items():
+                value = low = high = math.nan
+                if values.size and np.isfinite(values).all():
+                    value = float(statistic(values))
+                    low, high = stratified_bootstrap(
+                        values[:, None], statistic, resamples=self.resamples, seed=self.seed
+                    )
+                cell = with_interval(value, low, high, "+.1f" if name == "difference" else ".1f")
+                line |= {name: value, f"{name}_low": low, f"{name}_high": high, f"{name} cell": cell}
+            table.append(line)
+        return sorted(table, key=lambda line: -line["best"] if math.isfinite(line["best"]) else math.inf)
+
+
+class Figure22(Result):
+    """Learning curves, with the guide's return as a line.
+
+    Args:
+        experiments: experiments in one world.
+        labels: labels of the runs to draw; the guide is that of the first.
+    """
+
+    def __init__(self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo")) -> None:
+        if not labels:
+            raise ValueError("labels=[] draws nothing; give at least one")
+        self.experiments, self.labels = list(experiments), list(labels)
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        learned = {experiment: [run for run in runs[experiment] if run.curve] for experiment in self.experiments}
+        by_label = runs_by_label(self.labels, learned)
+        curves = {label: [run.curve for run in of_label] for label, of_label in by_label.items()}
+        own = [max(run.guide_returns.values()) for run in by_label[self.labels[0]] if run.guide_returns]
+        guide = float(np.mean(own)) if own else None
+        rows, table = [], []
+        for label, of_label in curves.items():
+            curve = mean_curve(of_label, TRAINING)
+            rows += [
+                {"label": label, "frames": frames, "mean": mean, "low": low, "high": high}
+                for frames, mean, low, high in zip(*curve, strict=True)
+            ]
+            frames, mean, low, high = curve
+            line: dict[str, Any] = {"label": label, "runs": len(of_label)}
+            for fraction in FRACTIONS:
+                line[str(fraction)] = None
+                if len(frames):
+                    at = int(np.abs(frames - fraction * frames[-1]).argmin())
+                    ends = (low[at], high[at]) if len(of_label) > 1 else (np.nan, np.nan)
+                    line[str(fraction)] = with_interval(mean[at], *ends)
+            reached = frames[mean >= guide] if guide is not None else frames[:0]
+            table.append(line | {"reached": reached[0] if len(reached) else None})
+        write_csv(rows, stem.with_suffix(".csv"))
+        draw_learning_curves(
+            curves, stem.with_suffix(".png"), guides={} if guide is None else {GUIDE: guide},
+            title="Figure 22: the return in training",
+        )  # fmt: skip
+        columns = {"label": ("method", ""), "runs": ("runs", "d")}
+        columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
+        columns |= {"reached": ("frames up to the guide", ",.0f")}
+        notes = FIGURE_22_NOTES.strip().format(guide="an unknown return" if guide is None else f"{guide:.1f}")
+        return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"
+
+
+def training_returns(run: Run) -> dict[str, Any]:
+    """Return the best and final training return of a run and its guide's return; NaN where unknown."""
+    curve = points(run.curve, TRAINING)
+    best_at, best = curve[curve[:, 1].argmax()] if len(curve) else (math.nan, math.nan)
+    return {
+        "label": run.label, "seed": run.seed, "frames": run.curve[-1]["frames"], "best": best, "best_at": best_at,
+        "final": curve[-1, 1] if len(curve) else math.nan, "guide": max(run.guide_returns.values(), default=math.nan),
+    }  # fmt: skip
+
+
+def _paper_table(table: Sequence[Row]) -> str:
+    """Return the table of COIL and PPO next to the paper."""
+    by_label = {line["label"]: line for line in table}
+    rows: list[dict[str, Any]] = [{"source": "paper, best", **PAPER_RETURNS}]
+    for key in ("best", "final"):
+        rows.append({"source": f"ours, {key}"} | {label: by_label.get(label, {}).get(key) for label in PAPER_RETURNS})
+    for row in rows:
+        coil, ppo = row["coil"], row["ppo"]
+        row["ratio"] = coil / ppo - 1 if coil is not None and ppo is not None and ppo > 0 else None
+    return markdown_table(rows, {
+        "source": ("mean over runs", ""), "coil": ("COIL", ".1f"), "ppo": ("RL (PPO)", ".1f"),
+        "ratio": ("COIL over RL", "+.1%"),
+    })  # fmt: skip
+
+
+def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path: Path) -> None:
+    # One guide for all: guides with placebo advice would only stretch the axis.
+    guide = next((line["guide"] for line in table if line["label"] == against and math.isfinite(line["guide"])), None)
+    panels = {
+        key: [
+            Interval(
+                line["label"], line[key], line[f"{key}_low"], line[f"{key}_high"], guide=guide,
+                points=[row[key] for row in rows if row["label"] == line["label"]] if line["runs"] > 1 else [],
+            )
+            for line in table
+        ]
+        for key in ("best", "final")
+    }  # fmt: skip
+    draw_intervals(panels, path, measure="return (mean of the runs)", title="Table 4: the return in training")
