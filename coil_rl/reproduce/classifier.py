@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +29,15 @@ PAPER_ACCURACY = Share(240, 243)
 DRAW_EVERY = 4  # scans
 
 COLUMNS = {
-    "of": ("", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"), "high": ("to", ".4f"),
-    "wrong": ("wrong", "d"), "total": ("of", "d"),
+    "measure": ("measure", ""), "of": ("of", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"),
+    "high": ("to", ".4f"), "wrong": ("wrong", "d"), "total": ("total", "d"),
 }  # fmt: skip
+
+NOTES = """
+Shares of clusters within 1 m. Cross-validation leaves out pairs of drives ({folds}). Accuracy: on drives past both
+sides, not used in training. Recall: cones within 1 m and hit by a beam, detected and classified correctly. The
+intervals (Wilson) assume independent clusters; those of neighbouring scans are correlated. The picture shows clusters
+of {kind} drives."""
 
 
 class Figure25(Result):
@@ -110,24 +116,8 @@ class Figure25(Result):
         rows = [{"measure": name, **_row(of, share)} for name in shares for of, share in shares[name].items()]
         write_csv(rows, stem.with_suffix(".csv"))
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
-        return _page(shares, folds, suffix)
-
-
-def _page(shares: Mapping[str, Mapping[str, Share]], folds: str, suffix: str) -> str:
-    tables = {name: [_row(of, share) for of, share in of_name.items()] for name, of_name in shares.items()}
-    overall = [{**tables.pop(name)[0], "of": name} for name in ("paper, its own robot", "cross-validation")]
-    parts = [
-        f"## Figure 25: thin cones and thick ones{suffix}",
-        f"Accuracy{suffix}, clusters within 1 m; cross-validation leaves out pairs of drives ({folds}):",
-        markdown_table(overall, COLUMNS),
-    ]
-    for name, rows in tables.items():
-        heading = f"{name.capitalize()}{suffix}: cones within 1 m and hit by a beam, detected and classified correctly:"
-        if name == "accuracy":
-            heading = f"On drives past both sides, not used in training{suffix}:"
-        parts += [heading, markdown_table(rows, COLUMNS)]
-    parts.append("The intervals (Wilson) assume independent clusters; those of neighbouring scans are correlated.")
-    return "\n\n".join(parts)
+        notes = NOTES.strip().format(folds=folds, kind=kind)
+        return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
 
 
 def _row(of: str, share: Share) -> dict[str, Any]:

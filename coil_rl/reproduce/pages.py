@@ -1,14 +1,17 @@
-"""Markdown pages of reproduced results, and RESULTS.md with all of them."""
+"""Markdown pages of reproduced results: verdicts on the paper's claims, pages, and RESULTS.md with all pages."""
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+from coil_rl.report import markdown_table
 from coil_rl.report.runs import Run
-from coil_rl.reproduce.result import CLAIMS_HEADING
 
+CLAIMS_HEADING = "### What held up"
 FOOTER = "<sub>"  # begins the origin of a page
 
 INTRODUCTION = """
@@ -21,14 +24,44 @@ Each claim of the paper with our number and its 95 % interval: held up if the wh
 not hold up if it is on the other side, undecided otherwise."""
 
 
-def page(text: str, name: str, note: str | None, origin: str) -> str:
-    """Return the page of a result: heading, note, picture, text, origin.
+def with_interval(value: float, low: float, high: float, spec: str = ".1f") -> str | None:
+    """Format a number with its 95 % interval: None if the number is NaN, no interval if that is NaN."""
+    if math.isnan(value):
+        return None
+    return f"{value:{spec}}" if math.isnan(low) else f"{value:{spec}} ({low:{spec}} to {high:{spec}})"
 
-    Args:
-        text: of the result, the heading first.
-        name: stem of its files.
-        note: a warning to the reader, if any.
-        origin: see `origin`.
+
+def verdict(value: float, low: float, high: float, spec: str = ".1f", sign: int = 1) -> str | None:
+    """Return the verdict on the claim that a number is positive (negative for sign -1), as a table cell.
+
+    `low` and `high` are its 95 % interval; without one (NaN) the claim is undecided. None if the number is NaN.
+    """
+    number = with_interval(value, low, high, spec)
+    lower, upper = sorted((sign * low, sign * high))
+    word = "held up" if lower > 0 else "did not hold up" if upper < 0 else "undecided"
+    return None if number is None else f"**{word}**: {number}"
+
+
+def certain_verdict(holds: bool, details: str) -> str:
+    """Return the verdict on a claim without an interval, as a table cell."""
+    return f"**{'held up' if holds else 'did not hold up'}**: {details}"
+
+
+def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
+    """Return the last section of a page: rows with the paper's `claim`, and further columns by key with headings."""
+    headings = {key: (heading, "") for key, heading in {"claim": "the paper says", **columns}.items()}
+    return f"{CLAIMS_HEADING}\n\n{markdown_table(claims, headings)}"
+
+
+def world_heading(world: str) -> list[str]:
+    """Return the heading of a world's part of a page as a list; empty for the main world, which has no name."""
+    return [f"### {world[:1].upper()}{world[1:]}"] if world else []
+
+
+def page(text: str, name: str, note: str | None, origin: str) -> str:
+    """Return the page of a result: heading, warning, picture, text, origin.
+
+    `text` begins with the heading; `name` is the stem of the result's files.
     """
     heading, _, rest = text.partition("\n")
     parts = [
@@ -42,13 +75,7 @@ def page(text: str, name: str, note: str | None, origin: str) -> str:
 
 
 def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
-    """Return one line on the origin of a result.
-
-    Args:
-        command: the command that makes it.
-        commit: the code's commit, by `git describe`.
-        runs: its training runs.
-    """
+    """Return one line on the origin of a result: its command, the code's commit by `git describe`, training runs."""
     made = f"Made by `{command}` at commit {_commit(commit)}."
     if not runs:
         return made
@@ -71,7 +98,7 @@ def all_results(
     command: str,
     note: str | None,
     known_problems: Iterable[str],
-    limits: Iterable[str],
+    not_reproduced: Iterable[str],
 ) -> str:
     """Return RESULTS.md.
 
@@ -80,19 +107,17 @@ def all_results(
         commands: command of each result by name.
         command: the command that makes all results.
         note: a warning to the reader, if any.
-        known_problems: sentences on problems of the paper's numbers.
-        limits: sentences on parts of the paper that are not reproduced.
+        known_problems: sentences on the paper's numbers.
+        not_reproduced: sentences on parts of the paper that are not reproduced.
     """
-    split = {name: _split_claims(text) for name, text in pages.items() if text is not None}
+    split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), INTRODUCTION.strip().format(command=command)]
-    if claims := [
-        f"**{text.partition(chr(10))[0].lstrip('# ')}**\n\n{table}" for text, table in split.values() if table
-    ]:
+    if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:
         parts += ["## What held up, and what did not", VERDICTS.strip(), *claims]
-    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split.values()]
+    parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
     if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(missing)]
-    lists = {"What is known about the paper's numbers": known_problems, "What cannot be shown here": limits}
+    lists = {"What is known about the paper's numbers": known_problems, "What cannot be shown here": not_reproduced}
     for heading, sentences in lists.items():
         parts += [f"## {heading}", "\n".join(f"- {' '.join(sentence.split())}" for sentence in sentences)]
     return "\n\n".join(parts) + "\n"

@@ -51,11 +51,9 @@ class RecordedDrive:
 
 
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
-    """Measure a drive, except for its smoothness.
+    """Measure a recorded drive, except for its smoothness.
 
-    Args:
-        recording: of one drive.
-        method: display name of the driver; by default the `policy` in the recording's notes, or the file name.
+    `method` is the driver's display name; by default the `policy` in the recording's notes, or the file name.
 
     Raises:
         RecordingError: if the recording's notes contain an invalid track.
@@ -113,13 +111,7 @@ def means(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None:
-    """Draw the lines of each driver in a panel, with the cones of known tracks.
-
-    Args:
-        drives: at least one.
-        path: of the picture.
-        title: above it.
-    """
+    """Draw the lines of each driver in a panel, with the cones of known tracks."""
     methods = list(dict.fromkeys(drive.method for drive in drives))
     strokes = style.strokes(methods)
     handles: list[Artist] = []

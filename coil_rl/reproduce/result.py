@@ -1,14 +1,12 @@
-"""Base classes of reproduced results, and the verdict on the paper's claims."""
+"""Base classes of reproduced results."""
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -18,12 +16,11 @@ from matplotlib.figure import Figure
 
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
-from coil_rl.report import markdown_table, style
+from coil_rl.report import style
 from coil_rl.report.runs import Run
 
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
-CLAIMS_HEADING = "### What held up"
 
 
 class Result(ABC):
@@ -75,11 +72,6 @@ class WorldsResult(Result):
         self.against, self.resamples, self.seed = against, resamples, seed
 
 
-def world_heading(world: str) -> list[str]:
-    """Return the heading of a world's part of a page as a list; empty for the main world."""
-    return [f"### {world[:1].upper()}{world[1:]}"] if world else []
-
-
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
     """Return the runs of each label.
 
@@ -93,45 +85,6 @@ def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
             existing = ", ".join(dict.fromkeys(run.label for run in available)) or "none"
             raise UserError(f"no run of {', '.join(runs)} has the label {label}; available: {existing}")
     return selected
-
-
-def with_interval(value: float, low: float, high: float, spec: str = ".1f") -> str | None:
-    """Format a number with its 95 % interval: None if the number is NaN, no interval if that is NaN."""
-    if math.isnan(value):
-        return None
-    return f"{value:{spec}}" if math.isnan(low) else f"{value:{spec}} ({low:{spec}} to {high:{spec}})"
-
-
-def verdict(value: float, low: float, high: float, spec: str = ".1f", sign: int = 1) -> str | None:
-    """Return the verdict on the claim that a number is positive, as a table cell.
-
-    Args:
-        value: our number; the verdict is None if it is NaN.
-        low: lower end of its 95 % interval; NaN if there is none, then the claim is undecided.
-        high: upper end.
-        spec: number format.
-        sign: -1 if the claim is that the number is negative.
-    """
-    number = with_interval(value, low, high, spec)
-    lower, upper = sorted((sign * low, sign * high))
-    word = "held up" if lower > 0 else "did not hold up" if upper < 0 else "undecided"
-    return None if number is None else f"**{word}**: {number}"
-
-
-def certain_verdict(holds: bool, details: str) -> str:
-    """Return the verdict on a claim that needs no interval, as a table cell."""
-    return f"**{'held up' if holds else 'did not hold up'}**: {details}"
-
-
-def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Return the last section of a page.
-
-    Args:
-        claims: table rows with the paper's `claim` and our numbers.
-        columns: headings of the numbers by key.
-    """
-    headings = {key: (heading, "") for key, heading in {"claim": "the paper says", **columns}.items()}
-    return f"{CLAIMS_HEADING}\n\n{markdown_table(claims, headings)}"
 
 
 @contextmanager

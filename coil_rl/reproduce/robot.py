@@ -16,16 +16,9 @@ from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.statistics import stratified_bootstrap
+from coil_rl.reproduce import pages
 from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
-from coil_rl.reproduce.result import (
-    NO_RUNS,
-    Result,
-    Runs,
-    certain_verdict,
-    claims_section,
-    runs_by_label,
-    verdict,
-)
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
 from coil_rl.robot.drives import Driver, agent_of, record
 from coil_rl.train.build import build_guides
 from coil_rl.train.guide_drives import driver_names
@@ -168,15 +161,7 @@ class Table6(Result):
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples: int, seed: int) -> str:
-    """Return the page of Tables 6 and 7.
-
-    Args:
-        rows: measures of the drives.
-        suffix: of the headings, such as " (simulated)".
-        max_steering: degrees of an action of 1.
-        resamples: number of bootstrap resamples.
-        seed: of the bootstrap.
-    """
+    """Return the page of Tables 6 and 7, given the measures of the drives and a suffix of the headings."""
     by_method: dict[str, dict[str | None, list[Row]]] = {}
     for row in rows:
         by_method.setdefault(row["method"], {}).setdefault(row["seed"], []).append(row)
@@ -196,9 +181,9 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples:
         return "\n\n".join([*parts, notes])
     crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
     details = ", ".join(f"{line['method']} {line['crashes']} of {line['drives']} drives" for line in crashes)
-    ours = certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
+    ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
     claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
-    section = claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
+    section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
     return "\n\n".join([*parts, notes + CLAIM_NOTES.format(resamples=resamples), section])
 
 
@@ -225,7 +210,7 @@ def _claim(
         line["paper"] = f"{PAPER_ROBOT[driver][key] - PAPER_ROBOT[other][key]:{spec}}"
     if len(differences):
         ends = stratified_bootstrap(differences[:, None], np.mean, resamples=resamples, seed=seed)
-        line["ours"] = verdict(float(differences.mean()), *ends, spec, sign)
+        line["ours"] = pages.verdict(float(differences.mean()), *ends, spec, sign)
     return line
 
 

@@ -20,8 +20,18 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, certain_verdict, claims_section, lighten, picture
-from coil_rl.tabular import MDP, garnet, observations_with_advice, q_learning, solve, value_iteration, with_advice
+from coil_rl.reproduce import pages
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
+from coil_rl.tabular import (
+    MDP,
+    garnet,
+    observations_with_advice,
+    q_learning,
+    solve,
+    toymaker,
+    value_iteration,
+    with_advice,
+)
 from coil_rl.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
 from coil_rl.tabular.mdp import Array, Integers
 
@@ -65,24 +75,19 @@ class TabularCoil(Result):
         episode_steps: int = 50,
         steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000),
     ) -> None:
-        counts = {"worlds": worlds, "actions": actions, "classes": classes, "episode_steps": episode_steps}
-        for name, value in counts.items():
+        for name, value in {"worlds": worlds, "actions": actions, "classes": classes}.items():
             if value < 1:
                 raise ValueError(f"{name}={value} must be at least 1")
         if states < max(3, classes):
             raise ValueError(f"states={states} must be at least 3, and at least classes={classes}")
-        if not 0 <= noise <= 1 or not 0 < epsilon <= 1 or not 0.5 < power <= 1:
-            raise ValueError(
-                f"noise={noise} must be between 0 and 1, epsilon={epsilon} more than 0 and at most 1, "
-                f"and power={power} more than 0.5 and at most 1"
-            )
+        if not 0 <= noise <= 1:
+            raise ValueError(f"noise={noise} must be between 0 and 1")
         if not steps or list(steps) != sorted(set(steps)) or steps[0] < 1:
             raise ValueError(f"steps={list(steps)} must be increasing integers from 1")
         self.worlds, self.states, self.actions, self.classes = worlds, states, actions, classes
         self.steps = tuple(steps)
-        self.learn = partial(
-            q_learning, epsilon=epsilon, power=power, episode_steps=episode_steps, snapshots=self.steps
-        )
+        self.learn = partial(q_learning, epsilon=epsilon, power=power, episode_steps=episode_steps)
+        self.learn(toymaker(), 0, np.random.default_rng(0))  # checks its options
         self.guides: Mapping[str, Callable[[MDP], Array]] = {
             "optimal": optimal_guide,
             f"noisy ({noise:.0%})": partial(noisy_guide, noise=noise),
@@ -105,9 +110,9 @@ class TabularCoil(Result):
             "plain_share": ("plain ≥ guide", ".0%"),
         })  # fmt: skip
         reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)
-        ours = certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
+        ours = pages.certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
         claims = [{"claim": "COIL ends at least as good as its guide, guaranteed", "ours": ours}]
-        section = claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
+        section = pages.claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
         notes = NOTES.format(worlds=self.worlds)
         return f"## COIL at least as good as its guide\n\n{table}\n{notes}\n\n{section}"
 
@@ -132,7 +137,8 @@ class TabularCoil(Result):
 
     def _learned_values(self, mdp: MDP, observations: Integers, seed: int) -> Array:
         """Return the value of the greedy policy after each number of steps."""
-        learned = self.learn(mdp, self.steps[-1], np.random.default_rng(seed), observations=observations)
+        rng = np.random.default_rng(seed)
+        learned = self.learn(mdp, self.steps[-1], rng, observations=observations, snapshots=self.steps)
         return np.array([_value(mdp, Q.argmax(axis=1)[observations]) for Q in learned.history])
 
     def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:

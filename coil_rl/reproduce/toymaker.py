@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, certain_verdict, claims_section, lighten, picture
+from coil_rl.reproduce import pages
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
 from coil_rl.tabular import policy_iteration, toymaker, value_iteration
 from coil_rl.tabular.mdp import Array
 
@@ -60,12 +61,14 @@ class Table1(Result):
         gain = Q[:, 1] - Q[:, 0]
         details = f"{equal} of {len(difference)} values, off by {largest:.4f} at most"
         claims = {
-            "Advertising is worth more in both states": certain_verdict(
+            "Advertising is worth more in both states": pages.certain_verdict(
                 bool((gain > 0).all()), "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
             ),
-            "Q to two decimals": certain_verdict(equal == len(difference), details),
+            "Q to two decimals": pages.certain_verdict(equal == len(difference), details),
         }
-        section = claims_section([{"claim": claim, "ours": ours} for claim, ours in claims.items()], {"ours": "ours"})
+        section = pages.claims_section(
+            [{"claim": claim, "ours": ours} for claim, ours in claims.items()], {"ours": "ours"}
+        )
         return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
 
 

@@ -13,17 +13,8 @@ from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markd
 from coil_rl.report.curve import TRAINING, mean_curve, points
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
-from coil_rl.reproduce.result import (
-    NO_RUNS,
-    Result,
-    Runs,
-    WorldsResult,
-    claims_section,
-    runs_by_label,
-    verdict,
-    with_interval,
-    world_heading,
-)
+from coil_rl.reproduce import pages
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs, WorldsResult, runs_by_label
 
 Row = Mapping[str, Any]
 
@@ -64,7 +55,7 @@ class Table4(WorldsResult):
         }  # fmt: skip
         parts = ["## Table 4: the return in training", _paper_table(tables[""])]
         for world, table in tables.items():
-            parts += [*world_heading(world), markdown_table(table, columns)]
+            parts += [*pages.world_heading(world), markdown_table(table, columns)]
         parts += [TABLE_4_NOTES.strip().format(against=self.against, resamples=self.resamples)]
         claims = []
         for world, table in tables.items():
@@ -72,10 +63,10 @@ class Table4(WorldsResult):
                 if line["label"] == "coil" and self.against == "ppo":
                     claim = ", ".join(filter(None, ("COIL's best return in training is above PPO's", world)))
                     paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
-                    ours = verdict(line["difference"], line["difference_low"], line["difference_high"], "+.1f")
+                    ours = pages.verdict(line["difference"], line["difference_low"], line["difference_high"], "+.1f")
                     claims.append({"claim": claim, "paper": paper, "ours": ours})
         if claims:
-            parts.append(claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
+            parts.append(pages.claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
         return "\n\n".join(parts)
 
     def _table(self, rows: Sequence[Row]) -> list[dict[str, Any]]:
@@ -104,7 +95,7 @@ class Table4(WorldsResult):
                     low, high = stratified_bootstrap(
                         values[:, None], statistic, resamples=self.resamples, seed=self.seed
                     )
-                cell = with_interval(value, low, high, "+.1f" if name == "difference" else ".1f")
+                cell = pages.with_interval(value, low, high, "+.1f" if name == "difference" else ".1f")
                 line |= {name: value, f"{name}_low": low, f"{name}_high": high, f"{name} cell": cell}
             table.append(line)
         return sorted(table, key=lambda line: -line["best"] if math.isfinite(line["best"]) else math.inf)
@@ -144,7 +135,7 @@ class Figure22(Result):
                 if len(frames):
                     at = int(np.abs(frames - fraction * frames[-1]).argmin())
                     ends = (low[at], high[at]) if len(of_label) > 1 else (np.nan, np.nan)
-                    line[str(fraction)] = with_interval(mean[at], *ends)
+                    line[str(fraction)] = pages.with_interval(mean[at], *ends)
             reached = frames[mean >= guide] if guide is not None else frames[:0]
             table.append(line | {"reached": reached[0] if len(reached) else None})
         write_csv(rows, stem.with_suffix(".csv"))

@@ -11,19 +11,11 @@ import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
 from coil_rl.report.comparison import Group, compare
-from coil_rl.report.paired import paired
+from coil_rl.report.paired import Paired, paired
 from coil_rl.report.runs import GUIDE, MEASURES, Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap
-from coil_rl.reproduce.result import (
-    NO_RUNS,
-    Runs,
-    WorldsResult,
-    certain_verdict,
-    claims_section,
-    verdict,
-    with_interval,
-    world_heading,
-)
+from coil_rl.reproduce import pages
+from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
 
 Row = Mapping[str, Any]
 
@@ -69,7 +61,7 @@ class Table5(WorldsResult):
             episodes += [{"world": world} | row for run in of_world for row in _episodes(run)]
             groups = worlds[world] = {actions: self._drivers(of_world, actions) for actions in ACTIONS}
             rows = {actions: [self._row(group, groups[actions]) for group in groups[actions]] for actions in ACTIONS}
-            parts += world_heading(world)
+            parts += pages.world_heading(world)
             if not world:
                 parts.append(_paper_table(rows))
                 panels = {f"{actions} actions": _intervals(groups[actions], rows[actions]) for actions in ACTIONS}
@@ -99,18 +91,18 @@ class Table5(WorldsResult):
         statistics: dict[str, Any] = {"reward": np.mean, "iqm": iqm}
         for name, statistic in statistics.items():
             low, high = stratified_bootstrap(group.scores, statistic, resamples=self.resamples, seed=self.seed)
-            row |= {f"{name}_low": low, f"{name}_high": high, f"{name} cell": with_interval(row[name], low, high)}
+            row |= {f"{name}_low": low, f"{name}_high": high, f"{name} cell": pages.with_interval(row[name], low, high)}
         others = {other.name: other for other in groups if other.name != group.name}
         row |= {"difference": None, "better": None, "over_guide": None}
         if group.is_guide:
             return row
         if self.against in others and (pairs := self._paired(group, others[self.against])):
-            row |= {"difference": with_interval(*pairs.difference, spec="+.1f"), "better": pairs.better[0]}
+            row |= {"difference": pages.with_interval(*pairs.difference, "+.1f"), "better": pairs.better[0]}
         if pairs := self._paired(group, others[GUIDE]):
             row["over_guide"] = pairs.better[0]
         return row
 
-    def _paired(self, group: Group, other: Group, measure: str = "reward") -> Any:
+    def _paired(self, group: Group, other: Group, measure: str = "reward") -> Paired | None:
         return paired(group, other, measure, resamples=self.resamples, seed=self.seed)
 
     def _driver_table(self, rows: Sequence[Row]) -> str:
@@ -133,7 +125,7 @@ class Table5(WorldsResult):
                     if driver in by_name and other in by_name and (measure == "reward" or not world):
                         pairs = self._paired(by_name[driver], by_name[other], measure)
                         spec = f"+{MEASURE_COLUMNS[measure][1]}"
-                        cells[actions] = verdict(*pairs.difference, spec=spec, sign=sign) if pairs else None
+                        cells[actions] = pages.verdict(*pairs.difference, spec, sign) if pairs else None
                 if cells:
                     paper = _paper_difference(measure, driver, other)
                     rows.append({"claim": f"{claim}, {world}" if world else claim, "paper": paper} | cells)
@@ -141,9 +133,9 @@ class Table5(WorldsResult):
         for actions, groups in worlds[""].items():
             shares = {group.name: group.means()["crashed"] for group in groups if group.name in PAPER_UNSEEN}
             details = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-            crashes[actions] = certain_verdict(not any(shares.values()), details)
+            crashes[actions] = pages.certain_verdict(not any(shares.values()), details)
         headings = {"paper": "paper"} | {actions: f"ours, {actions} actions (95 %)" for actions in ACTIONS}
-        return claims_section([*rows, crashes], headings)
+        return pages.claims_section([*rows, crashes], headings)
 
 
 def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:

@@ -1,0 +1,168 @@
+"""Draw the last lap of the guide and of trained agents on test tracks straightened along the middle line.
+
+Below each track is the smoothness of the steering, |a - weighted mean of the last 20 actions|. The agents of the runs
+drive once more, in their own environments; the guide is that of the first run.
+
+    python docs/figures/lines.py RUN [RUN ...] [--output FOLDER] [--tracks 3] [--policy last]
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from ego_view import Array, marker
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial import cKDTree
+
+from coil_rl.envs.track import SIDES, Track
+from coil_rl.listening.places import LEFT, RIGHT, kinds, smooth_line
+from coil_rl.report import markdown_table, style
+from coil_rl.reproduce.result import lighten, picture
+from coil_rl.train import load
+from coil_rl.train.build import build, build_env
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.guide_drives import drive_guides
+
+INSIDE_COLOUR = "#eceff2"
+HALF_WIDTH = 1.5  # m, of the straightened track
+SPACING = 0.05  # m, of the middle line
+CONE = {"ms": 3, "mec": style.INK, "mew": 0.3}
+
+
+class StraightTrack:
+    """Coordinates along and across the middle line of a track."""
+
+    def __init__(self, track: Track) -> None:
+        self.track = track
+        self.line = smooth_line(track, SPACING, 0.3)
+        edges = np.roll(self.line, -1, axis=0) - self.line
+        lengths = np.linalg.norm(edges, axis=1)
+        self.along, self.length = np.cumsum(lengths) - lengths, float(lengths.sum())
+        self.kinds = kinds(smooth_line(track, SPACING))
+        headings = edges + np.roll(edges, 1, axis=0)
+        self._headings = headings / np.linalg.norm(headings, axis=1, keepdims=True)
+        self._tree = cKDTree(self.line)
+
+    def __call__(self, points: Array) -> tuple[Array, Array]:
+        """Return the distance along the middle line and to its left, m, of points [N, 2]."""
+        nearest = self._tree.query(points)[1]
+        offset, heading = points - self.line[nearest], self._headings[nearest]
+        along = (self.along[nearest] + (offset * heading).sum(1)) % self.length
+        return along, heading[:, 0] * offset[:, 1] - heading[:, 1] * offset[:, 0]
+
+    def last_lap(self, line: Array, smoothness: Array) -> list[Array]:
+        """Return along, left and the smoothed smoothness of the last lap; NaN separates the ends of the picture."""
+        along, left = self(line)
+        distance = np.unwrap(along, period=self.length)
+        step = float(np.median(np.linalg.norm(np.diff(line, axis=0), axis=1)))
+        values = [along, left, gaussian_filter1d(smoothness, 1.0 / step)]
+        shown = [array[distance > distance[-1] - self.length] for array in values]
+        jumps = np.flatnonzero(np.abs(np.diff(shown[0])) > self.length / 2) + 1
+        return [np.insert(array, jumps, np.nan) for array in shown]
+
+    def path_ratio(self, line: Array) -> float:
+        """Return the driven distance per distance along the centre line."""
+        passed = np.diff(np.unwrap(self(line)[0], period=self.length)).sum() / self.length * self.track.length
+        return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / passed)
+
+
+def drive(runs: Sequence[Path], count: int, policy: str) -> tuple[list[Track], dict[str, EvaluationResult]]:
+    """Return the first test tracks of the first run, and the drives of its guide and of every agent there."""
+    configs = [load.read_config(run, "run", {"device": "cpu"}) for run in runs]
+    tracks: list[Track] = build(configs[0].track.test, "track.test")[:count]
+    names = [track.name for track in tracks]
+    drives = drive_guides(configs[0], configs[0].evaluation.env, names)
+    for run, config in zip(runs, configs, strict=True):
+        env = build_env(config, {**config.evaluation.env, "num_cars": count})
+        name = config.label if config.label not in drives else f"{config.label}, seed {config.seed}"
+        drives[name] = evaluate_policy(env, load.load_policy(run, config, env, policy), names=names)
+    return tracks, drives
+
+
+def draw_map(axes: Axes, straight: StraightTrack) -> None:
+    """Draw the boundaries of a track, with the distance along the middle every 20 m."""
+    axes.set_title(straight.track.name, size=9, color=style.QUIET)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    for side in SIDES:
+        ring = straight.track.boundary(side, 0.2)
+        axes.plot(*np.vstack([ring, ring[:1]]).T, color=style.KERB, lw=0.8)
+    for distance in np.arange(0, straight.length - 10, 20):
+        point = straight.line[np.searchsorted(straight.along, distance)]
+        axes.plot(*point, "o", ms=2.5, color=style.INK)
+        axes.annotate(f"{distance:.0f}", point, (3, 3), textcoords="offset points", size=7)
+
+
+def draw_straight(axes: Axes, straight: StraightTrack) -> None:
+    """Draw the cones of a straightened track and the insides of its turns."""
+    for kind, edge in ((LEFT, HALF_WIDTH), (RIGHT, -HALF_WIDTH)):
+        axes.fill_between(straight.along, 0, edge, where=straight.kinds == kind, color=INSIDE_COLOUR, lw=0, zorder=1)
+    axes.axhline(0, color=style.KERB, lw=0.6, zorder=2)
+    for cones, colour in ((straight.track.left, style.LEFT_CONE), (straight.track.right, style.RIGHT_CONE)):
+        axes.plot(*straight(cones), "o", mfc=colour, zorder=3, **CONE)
+    axes.set(xlim=(0, straight.length), ylim=(-HALF_WIDTH, HALF_WIDTH), yticks=(-1, 0, 1))
+    axes.set_ylabel("left (m)", size=8)
+
+
+def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, EvaluationResult]) -> None:
+    """Draw all tracks and drives."""
+    strokes = style.strokes(drives)
+    handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=name) for name, s in strokes.items()]
+    cones = zip(SIDES, (style.LEFT_CONE, style.RIGHT_CONE), strict=True)
+    handles += [marker("o", f"{side} cones", 5, mfc=colour, mec=style.INK) for side, colour in cones]
+    handles += [Patch(fc=INSIDE_COLOUR, label="inside of a turn"), marker("X", "crash", 5, color=style.INK)]
+    with picture(path, "Driven lines on test tracks", handles, 0.75 + 2.3 * len(tracks)) as figure:
+        ratios = [1.8, 0.8] * len(tracks)
+        grid = figure.add_gridspec(2 * len(tracks), 2, width_ratios=(1.0, 3.2), height_ratios=ratios)
+        for index, straight in enumerate(tracks):
+            draw_map(figure.add_subplot(grid[2 * index : 2 * index + 2, 0]), straight)
+            above = figure.add_subplot(grid[2 * index, 1])
+            below = figure.add_subplot(grid[2 * index + 1, 1], sharex=above)
+            draw_straight(above, straight)
+            for name, result in drives.items():
+                line = {"color": strokes[name].colour, "ls": strokes[name].linestyle}
+                along, left, rough = straight.last_lap(result.lines[index], result.smoothness[index])
+                above.plot(along, left, lw=1.2, zorder=4, **line)
+                below.plot(along, rough, lw=1.0, **line)
+                if result.episodes[index]["crashed"]:
+                    above.plot(along[-1], left[-1], "X", ms=7, mfc=line["color"], mec=style.PAPER, zorder=5)
+            for axes in (above, below):
+                lighten(axes)
+                axes.tick_params(length=0, labelsize=7, labelbottom=axes is below)
+            below.set_ylim(bottom=0)
+            below.set_ylabel("smoothness", size=8)
+        below.set_xlabel("along the middle (m)", size=8)
+
+
+def main() -> None:
+    """Draw lines.png and print the measures of each drive."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+", help="folders of finished runs")
+    parser.add_argument("--output", type=Path, default=Path("outputs/figures"), help="output folder")
+    parser.add_argument("--tracks", type=int, default=3, help="number of test tracks")
+    parser.add_argument("--policy", choices=("last", "best"), default="last")
+    options = parser.parse_args()
+    options.output.mkdir(parents=True, exist_ok=True)
+    tracks, drives = drive(options.runs, options.tracks, options.policy)
+    straight = [StraightTrack(track) for track in tracks]
+    draw(options.output / "lines.png", straight, drives)
+    rows = [
+        {"driver": name, **episode, "path": of_track.path_ratio(line) if episode["laps"] else None}
+        for name, result in drives.items()
+        for episode, line, of_track in zip(result.episodes, result.lines, straight, strict=True)
+    ]
+    columns = {
+        "driver": ("driver", ""), "track": ("track", ""), "reward": ("reward", ".1f"), "lap_time": ("lap (s)", ".2f"),
+        "smoothness": ("smoothness", ".3f"), "path": ("path / centre line", ".3f"), "crashed": ("crashed", ""),
+    }  # fmt: skip
+    print(f"{markdown_table(rows, columns)}\n{options.output / 'lines.png'}")
+
+
+if __name__ == "__main__":
+    main()
