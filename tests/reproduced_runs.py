@@ -1,4 +1,6 @@
-"""Finished runs as the results of the paper take them, made in no time."""
+"""Finished runs of reproduced results, with invented numbers, and readers of the results."""
+
+import csv
 
 import numpy as np
 from run_folders import driven, make_run
@@ -10,7 +12,7 @@ GUIDE = {"a": 500.0, "b": 600.0}
 
 
 def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
-    """Runs of labels that earn so much more than the guide, and a seed's number besides; by label the runs."""
+    """Return runs by label whose rewards exceed the guide's by the label's gain plus the seed."""
     for label, gain in gains.items():
         for seed in range(seeds):
             rewards = {track: reward + gain + seed for track, reward in GUIDE.items()}
@@ -24,3 +26,18 @@ def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
             if curve:
                 write_csv(points, run / "metrics.csv")
     return read_runs([folder])
+
+
+def read_csv(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def cells(line):
+    """Return the cells of a line of a Markdown table."""
+    return [cell.strip() for cell in line.split("|")[1:-1]]
+
+
+def row(page, start, which=0):
+    """Return the cells of a page's table row by the start of its text."""
+    return cells([line for line in page.splitlines() if line.startswith(f"| {start}")][which])

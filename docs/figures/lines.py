@@ -79,7 +79,7 @@ def drive(runs: Sequence[Path], count: int, policy: str) -> tuple[list[Track], d
     names = [track.name for track in tracks]
     drives = drive_guides(configs[0], configs[0].evaluation.env, names)
     for run, config in zip(runs, configs, strict=True):
-        env = build_env(config, {**config.evaluation.env, "num_cars": count})
+        env = build_env(config, {**config.evaluation.env, "num_cars": len(names)})
         name = config.label if config.label not in drives else f"{config.label}, seed {config.seed}"
         drives[name] = evaluate_policy(env, load.load_policy(run, config, env, policy), names=names)
     return tracks, drives

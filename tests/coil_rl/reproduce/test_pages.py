@@ -3,10 +3,10 @@ import json
 from reproduced_runs import make_runs
 
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.verdict import verdict, with_interval
+from coil_rl.reproduce.pages import verdict, with_interval
 
 
-def test_a_page_says_what_to_know_shows_its_picture_and_where_it_comes_from():
+def test_a_page_has_heading_warning_picture_text_and_origin():
     text = pages.page("## Table 9: something\n\ntext", "table_9", "A smoke test.", "Made by hand.")
     assert text == (
         "## Table 9: something\n\n> **A smoke test.**\n\n![Table 9: something](table_9.png)\n\ntext\n\n"
@@ -21,16 +21,16 @@ def test_the_origin_has_command_commits_seeds_and_frames(tmp_path):
     for run, commit in zip(runs, ["abc", "abc", "abc-dirty", "abc"], strict=False):
         (run.folder / "versions.json").write_text(json.dumps({"commit": commit}))
     assert pages.origin("coil-reproduce table=4", "def-dirty", runs) == (
-        "Made by `coil-reproduce table=4` at commit `def` with local changes. 5 runs with the seeds 0, 1, done at "
-        "commit `abc`, `abc` with local changes, `unknown`. Frames of training: 4,000 (coil, ppo)."
+        "Made by `coil-reproduce table=4` at commit `def` with local changes. 5 runs with the seeds 0, 1, made at "
+        "commit `abc`, `abc` with local changes, `unknown`. Training frames: 4,000 (coil, ppo)."
     )
     assert pages.origin("coil-reproduce table=1", "def") == "Made by `coil-reproduce table=1` at commit `def`."
 
 
-def test_all_results_are_in_one_file_what_held_up_first_and_what_is_missing_named():
+def test_results_md_has_the_claims_the_pages_and_the_missing_results():
     body = "## Table 9: something\n\ntable\n\n### What held up\n\n| more |"
     made = pages.page(body, "table_9", "A note.", "Made.")
-    text = pages.results(
+    text = pages.all_results(
         {"table_9": made, "figure_3": None}, {"table_9": "make table=9", "figure_3": "make figure=3"},
         "make all=true", "A note.", ["One\n  problem."], ["One limit."],
     )  # fmt: skip
@@ -45,7 +45,7 @@ def test_all_results_are_in_one_file_what_held_up_first_and_what_is_missing_name
     assert text.count("A note.") == text.count("| more |") == 1
 
 
-def test_a_claim_is_undecided_where_its_interval_has_both_signs_or_is_not_known():
+def test_a_verdict_needs_the_whole_interval_on_one_side():
     assert verdict(1.5, 1.0, 2.0) == "**held up**: 1.5 (1.0 to 2.0)"
     assert verdict(-1.5, -2.0, -1.0) == "**did not hold up**: -1.5 (-2.0 to -1.0)"
     assert verdict(-1.5, -2.0, -1.0, "+.2f", -1) == "**held up**: -1.50 (-2.00 to -1.00)"
@@ -53,7 +53,4 @@ def test_a_claim_is_undecided_where_its_interval_has_both_signs_or_is_not_known(
     words = [verdict(0.5, *ends).split("**")[1] for ends in [(-1, 1), (0, 1), (nan, nan)]]
     assert words == ["undecided"] * 3
     assert verdict(nan, nan, nan) is None
-
-
-def test_a_number_stands_without_an_interval_where_there_is_none():
     assert with_interval(2.0, float("nan"), float("nan"), "+.1f") == "+2.0"

@@ -7,34 +7,34 @@ P = np.array([[[0.5, 0.5], [1.0, 0.0]], [[0.0, 1.0], [0.3, 0.7]]])
 R = np.array([[[1.0, 2.0], [3.0, 4.0]], [[0.0, 0.0], [5.0, 6.0]]])
 
 
-def changed(array, where, value):
+def changed(array, index, value):
     copy = array.copy()
-    copy[where] = value
+    copy[index] = value
     return copy
 
 
-def test_mean_reward_weighs_each_reward_by_its_probability():
+def test_expected_reward_weighs_rewards_by_probability():
     np.testing.assert_allclose(MDP(P, R, 0.9).r, [[1.5, 3.0], [0.0, 5.7]])
     np.testing.assert_allclose(toymaker().r, [[6, 4], [-3, -5]])
 
 
-def test_q_adds_what_is_to_come():
+def test_q_adds_the_discounted_next_values():
     np.testing.assert_allclose(MDP(P, R, 0.5).q(np.array([10.0, 20.0])), [[1.5 + 7.5, 3 + 5], [10, 5.7 + 8.5]])
 
 
-def test_a_state_that_no_action_leaves_and_that_pays_nothing_is_terminal():
-    still, paid = np.array([[[0.0, 1.0]], [[0.0, 1.0]]]), np.zeros((2, 1, 2))
-    assert MDP(still, paid, 0.9).terminal.tolist() == [False, True]
-    assert not MDP(still, changed(paid, (1, 0, 1), 1.0), 0.9).terminal.any()
+def test_a_state_without_exit_and_reward_is_terminal():
+    loop, reward = np.array([[[0.0, 1.0]], [[0.0, 1.0]]]), np.zeros((2, 1, 2))
+    assert MDP(loop, reward, 0.9).terminal.tolist() == [False, True]
+    assert not MDP(loop, changed(reward, (1, 0, 1), 1.0), 0.9).terminal.any()
     assert not MDP(P, R, 0.9).terminal.any()
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
-        ({"P": changed(P, (1, 0), [0.1, 0.8])}, r"P\[1, 0\]=.* \(state low, action go\); they add up to 0.9"),
+        ({"P": changed(P, (1, 0), [0.1, 0.8])}, r"P\[1, 0\]=.* \(state low, action go\); they sum to 0.9"),
         ({"P": changed(P, (0, 1), [1.5, -0.5])}, r"P\[0, 1\]=.* \(state high, action stay\)"),
-        ({"P": changed(P, (0, 1, 0), np.nan)}, "they add up to nan"),
+        ({"P": changed(P, (0, 1, 0), np.nan)}, "they sum to nan"),
         ({"P": P[0]}, r"P must have the shape \[S, A, S\]"),
         ({"P": P[:, :, :1]}, r"P must have the shape \[S, A, S\]"),
         ({"R": R[0]}, r"R must have the shape of P, \(2, 2, 2\); it has \(2, 2\)"),
@@ -46,22 +46,22 @@ def test_a_state_that_no_action_leaves_and_that_pays_nothing_is_terminal():
         ({"states": ("high",)}, "states has 1 names, but P has 2 states"),
     ],
 )
-def test_what_is_no_markov_decision_process_is_refused(arguments, words):
+def test_invalid_arrays_are_rejected(arguments, message):
     named = {"states": ("high", "low"), "actions": ("go", "stay")}
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=message):
         MDP(**({"P": P, "R": R, "gamma": 0.9} | named | arguments))
 
 
-def test_policies_are_actions_or_their_probabilities():
+def test_a_policy_is_given_as_actions_or_probabilities():
     mdp = MDP(P, R, 0.9, states=("high", "low"))
     np.testing.assert_array_equal(mdp.probabilities([1, 0]), [[0, 1], [1, 0]])
     np.testing.assert_array_equal(mdp.probabilities([[0.5, 0.5], [1, 0]]), [[0.5, 0.5], [1, 0]])
-    for policy, words in {
+    for policy, message in {
         (1, 2): r"policy\[1\]=2 is no action in state low; actions are 0 to 1",
         (-1, 0): r"policy\[0\]=-1 is no action in state high",
         (0.5, 0.5): "A policy is",
         (0, 0, 0): "A policy is",
         ((0.5, 0.5), (0.5, 0.6)): r"policy\[1\]=.* state low",
     }.items():
-        with pytest.raises(ValueError, match=words):
+        with pytest.raises(ValueError, match=message):
             mdp.probabilities(policy)

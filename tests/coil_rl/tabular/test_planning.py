@@ -10,9 +10,9 @@ from coil_rl.tabular import garnet, policy_evaluation, policy_iteration, solve, 
 
 # The toymaker always advertises: V = r + gamma P V for that policy, by hand, with gamma = 19/20.
 GAMMA = Fraction(19, 20)
-APART = 9 / (1 - GAMMA / 10)
-FIRST = (4 - GAMMA / 5 * APART) / (1 - GAMMA)
-SECOND = FIRST - APART
+DIFFERENCE = 9 / (1 - GAMMA / 10)
+FIRST = (4 - GAMMA / 5 * DIFFERENCE) / (1 - GAMMA)
+SECOND = FIRST - DIFFERENCE
 EXACT = [
     [6 + GAMMA * (FIRST + SECOND) / 2, FIRST],
     [-3 + GAMMA * (2 * FIRST + 3 * SECOND) / 5, SECOND],
@@ -27,7 +27,7 @@ def world(seed, states=6, actions=3, gamma=0.9):
 
 
 @pytest.mark.parametrize("method", [value_iteration, policy_iteration])
-def test_the_toymaker_advertises_and_its_values_are_those_by_hand(method):
+def test_values_of_the_toymaker_equal_the_solution_by_hand(method):
     plan = method(toymaker())
     assert plan.policy.tolist() == [1, 1]
     np.testing.assert_allclose(plan.Q, np.array(EXACT, dtype=float), rtol=0, atol=1e-8)
@@ -35,7 +35,7 @@ def test_the_toymaker_advertises_and_its_values_are_those_by_hand(method):
 
 
 @pytest.mark.parametrize(("gamma", "advertises"), [(0.68, 0), (0.70, 1)])
-def test_a_toymaker_who_looks_less_far_ahead_does_not_advertise(gamma, advertises):
+def test_the_toymaker_does_not_advertise_at_a_low_discount_factor(gamma, advertises):
     assert value_iteration(toymaker(gamma)).policy.tolist() == [advertises] * 2
 
 
@@ -51,7 +51,7 @@ def test_value_and_policy_iteration_find_the_best_of_all_policies(seed):
 
 
 @given(seeds, st.floats(0, 0.99))
-def test_evaluation_is_the_solution_of_the_linear_equations(seed, gamma):
+def test_policy_evaluation_solves_the_linear_equations(seed, gamma):
     mdp, rng = world(seed, gamma=gamma), np.random.default_rng(seed)
     policy = rng.dirichlet(np.ones(3), size=6)
     np.testing.assert_allclose(policy_evaluation(mdp, policy, 1e-7), solve(mdp, policy), rtol=0, atol=1e-7)
@@ -59,14 +59,14 @@ def test_evaluation_is_the_solution_of_the_linear_equations(seed, gamma):
 
 @FEW
 @given(seeds)
-def test_each_policy_of_policy_iteration_is_at_least_as_good_everywhere_as_the_one_before(seed):
+def test_policy_iteration_improves_monotonically(seed):
     history = policy_iteration(world(seed)).history
     assert (np.diff(history, axis=0) >= -1e-8).all()
 
 
 @FEW
 @given(seeds)
-def test_each_iteration_brings_values_nearer_by_the_factor_gamma(seed):
+def test_value_iteration_contracts_by_gamma(seed):
     mdp = world(seed)
     best = policy_iteration(mdp).V
     errors = np.abs(value_iteration(mdp, 1e-3).history - best).max(axis=1)
@@ -74,17 +74,17 @@ def test_each_iteration_brings_values_nearer_by_the_factor_gamma(seed):
     assert errors[-1] <= 1e-3
 
 
-def test_policy_iteration_ends_where_actions_are_equally_good():
+def test_policy_iteration_ends_when_actions_are_tied():
     mdp = world(0)
     mdp.P[:, 1], mdp.r[:, 1] = mdp.P[:, 0], mdp.r[:, 0]
     for first in range(3):
         np.testing.assert_allclose(policy_iteration(mdp, np.full(6, first)).V, value_iteration(mdp).V, atol=1e-8)
 
 
-def test_a_tolerance_below_rounding_ends_as_well():
+def test_a_tolerance_below_rounding_ends():
     assert np.abs(value_iteration(toymaker(0.99), 1e-300).V).max() < 1e6
 
 
-def test_a_tolerance_of_nothing_is_refused():
+def test_a_tolerance_of_zero_is_rejected():
     with pytest.raises(ValueError, match="tolerance=0 must be more than 0"):
         value_iteration(toymaker(), 0)

@@ -1,0 +1,88 @@
+import pytest
+from reproduced_runs import make_runs, read_csv, row
+
+from coil_rl.errors import UserError
+from coil_rl.reproduce import Figure22, Table4
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The table, its page and folder, for small runs in two worlds."""
+    folder = tmp_path_factory.mktemp("table_4")
+    runs = {
+        "main": make_runs(folder / "main", {"coil": 90.0, "ppo": 20.0}),
+        "other": make_runs(folder / "other", {"coil": -10.0, "ppo": 20.0}),
+        "single": make_runs(folder / "single", {"alone": 0.0}, seeds=1),
+    }
+    table = Table4(["main", "single"], {"another world": "other"}, resamples=200)
+    return table, table.make(folder / "t", runs), folder, runs
+
+
+def test_the_csv_has_the_best_and_the_final_return_of_each_run(made):
+    numbers = read_csv(made[2] / "t.csv")
+    (coil,) = (run for run in numbers if (run["label"], run["seed"], run["world"]) == ("coil", "2", ""))
+    assert [float(coil[key]) for key in ("best", "best_at", "final", "frames", "guide")] == [432, 3000, 412, 4000, 300]
+    assert len(numbers) == 6 + 1 + 6
+
+
+def test_coil_and_ppo_are_next_to_the_paper(made):
+    _, page, _, _ = made
+    assert row(page, "paper, best") == ["paper, best", "477.6", "414.2", "+15.3%"]
+    assert row(page, "ours, best") == ["ours, best", "431.0", "361.0", "+19.4%"]
+    assert row(page, "ours, final") == ["ours, final", "411.0", "341.0", "+20.5%"]
+
+
+def test_methods_are_compared_seed_by_seed(made):
+    _, page, _, _ = made
+    assert row(page, "coil ")[:2] == ["coil", "3"]
+    assert row(page, "coil ")[2].startswith("431.0 (430.0 to 43")
+    assert row(page, "coil ")[-2:] == ["+70.0 (+70.0 to +70.0)", "100%"]
+    assert row(page, "ppo ")[-2:] == ["-", "-"]
+    assert row(page, "alone ")[2] == "340.0", "one seed has no interval"
+
+
+def test_the_claim_has_a_verdict_in_each_world(made):
+    _, page, _, _ = made
+    claim = "COIL's best return in training is above PPO's"
+    assert row(page, f"{claim} ")[1:] == ["+63.4", "**held up**: +70.0 (+70.0 to +70.0)"]
+    assert row(page, f"{claim}, another world")[2] == "**did not hold up**: -30.0 (-30.0 to -30.0)"
+
+
+def test_the_table_is_deterministic_and_has_a_picture(made, tmp_path):
+    table, page, folder, runs = made
+    assert table.make(tmp_path / "t", runs) == page
+    assert (tmp_path / "t.csv").read_text() == (folder / "t.csv").read_text()
+    assert (tmp_path / "t.png").exists()
+
+
+def test_runs_without_a_finished_episode_have_no_numbers(tmp_path):
+    runs = make_runs(tmp_path / "runs", {"coil": 0.0, "ppo": 0.0}, seeds=2)
+    for run in runs:
+        for point in run.curve:
+            point["train/return"] = float("nan")
+    page = Table4(["main"]).make(tmp_path / "t", {"main": runs})
+    assert row(page, "coil ")[2:5] == ["-", "-", "-"]
+    assert row(page, "COIL's best")[2] == "-"
+
+
+def test_curves_are_means_of_runs_with_the_guides_return(tmp_path):
+    runs = {"main": make_runs(tmp_path / "main", {"coil": 0.0, "ppo": -10.0, "other": 0.0})}
+    page = Figure22(["main"]).make(tmp_path / "f", runs)
+    rows = {(point["label"], float(point["frames"])): point for point in read_csv(tmp_path / "f.csv")}
+    assert set(rows) == {(label, frames) for label in ("coil", "ppo") for frames in (2000, 3000, 4000)}
+    assert float(rows["coil", 3000]["mean"]) == 341
+    assert float(rows["coil", 3000]["low"]) <= 341 <= float(rows["coil", 3000]["high"])
+    coil, ppo = row(page, "coil"), row(page, "ppo")
+    assert [line[4].split(" (")[0] for line in (coil, ppo)] == ["321.0", "311.0"]
+    assert [coil[-1], ppo[-1]] == ["2,000", "3,000"], "291 is below the guide, 331 is not"
+    assert "The guide alone earns 300.0 there." in page
+    assert (tmp_path / "f.png").exists()
+
+
+def test_mistakes_are_rejected(made):
+    with pytest.raises(UserError, match="no run of single has the label ppo; available: alone"):
+        Figure22(["single"], ["ppo"]).make(made[2] / "f", made[3])
+    with pytest.raises(ValueError, match="labels=\\[\\] draws nothing"):
+        Figure22(["main"], labels=[])
+    with pytest.raises(ValueError, match="resamples=0 must be at least 1"):
+        Table4(["main"], resamples=0)

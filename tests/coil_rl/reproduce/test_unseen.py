@@ -1,0 +1,94 @@
+import pytest
+from reproduced_runs import cells, make_runs, read_csv
+
+from coil_rl.report.runs import Drive
+from coil_rl.reproduce import Table5
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The page and the rows of the CSV, for small runs in two worlds."""
+    folder = tmp_path_factory.mktemp("table_5")
+    runs = {
+        "main": make_runs(folder / "main", {"coil": 30.0, "ppo": 60.0, "coil_shuffled": 10.0}),
+        "imitation": make_runs(folder / "imitation", {"oil": 5.0}, sampled=False, completed=0.5, crashed=0.5),
+        "other": make_runs(folder / "other", {"coil": 80.0, "ppo": 60.0}),
+    }
+    page = Table5(["main", "imitation"], {"another world": "other"}, resamples=200).make(folder / "t", runs)
+    assert (folder / "t.png").exists()
+    return page, read_csv(folder / "t.csv")
+
+
+def drivers(page, heading, world=0):
+    """Return the rows of the table of drivers below a heading, by driver."""
+    table = page.split(f"**{heading}**")[1 + world].strip().split("\n\n")[0].splitlines()
+    columns, _, *rows = map(cells, table)
+    return {row[0]: dict(zip(columns, row, strict=True)) for row in rows}
+
+
+def test_drivers_are_the_guide_and_then_the_agents_by_reward(made):
+    deterministic = drivers(made[0], "Deterministic actions")
+    assert list(deterministic) == ["guide", "ppo", "coil", "coil_shuffled", "oil"]
+    assert (deterministic["oil"]["completed"], deterministic["oil"]["crashed"]) == ("50%", "50%")
+    assert deterministic["coil"]["reward: mean (95 %)"].startswith("581.0 (580.0 to 58")
+
+
+def test_drivers_with_one_kind_of_actions_are_in_both_tables(made):
+    sampled = drivers(made[0], "Sampled actions")
+    assert list(sampled) == ["guide", "ppo", "oil", "coil", "coil_shuffled"]
+    assert sampled["oil"]["reward: mean (95 %)"].startswith("556.0 (")
+    assert sampled["coil"]["reward: mean (95 %)"].startswith("531.0 (")
+
+
+def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
+    coil = drivers(made[0], "Deterministic actions")["coil"]
+    assert coil["reward - ppo's (95 %)"] == "-30.0 (-30.0 to -30.0)"
+    assert (coil["better than ppo"], coil["better than the guide"]) == ("0%", "100%")
+    other = drivers(made[0], "Deterministic actions", world=1)["coil"]
+    assert other["reward - ppo's (95 %)"] == "+20.0 (+20.0 to +20.0)"
+
+
+def test_the_papers_drivers_are_next_to_the_paper(made):
+    table = [cells(line) for line in made[0].splitlines() if "| 609.4 |" in line or "| 632.9 |" in line]
+    assert [line[:2] for line in table] == [["guide", "the same"], ["coil", "sampled"], ["coil", "deterministic"]]
+    assert table[2] == [
+        "coil", "deterministic", "50.00", "48.48", "0.100", "0.606", "581.0", "632.9", "1.056", "1.039", "0%", "0%",
+    ]  # fmt: skip
+
+
+def test_tracks_have_rewards_and_incomplete_shares(made):
+    table = [cells(line) for line in made[0].splitlines()]
+    assert ["coil", "531.0", "631.0"] in table
+    assert ["oil", "506.0 (50% completed)", "606.0 (50% completed)"] in table
+
+
+def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made):
+    table = made[0].split("### What held up\n\n")[1].splitlines()[2:]
+    claims = {row[0]: row[1:] for row in map(cells, table)}
+    paper, sampled, deterministic = claims["COIL earns more than its guide"]
+    assert paper == "+23.5"
+    assert sampled.startswith("**did not hold up**: -19.0 (-20.0 to")
+    assert deterministic.startswith("**held up**: +31.0 (+30.0 to")
+    assert claims["COIL earns more than PPO"][1] == "**did not hold up**: -30.0 (-30.0 to -30.0)"
+    assert claims["COIL earns more than PPO, another world"][1] == "**held up**: +20.0 (+20.0 to +20.0)"
+    assert claims["COIL's laps take less time than PPO's"][:2] == ["-0.10", "**undecided**: +0.00 (+0.00 to +0.00)"]
+    assert claims["COIL earns more with its guide's advice than with another car's"][0] == "-"
+    crashes = "**did not hold up**: guide 0%, ppo 0%, oil 50%, coil 0%"
+    assert claims["Nobody crashes"][:2] == ["0%", crashes]
+    assert len(claims) == 7 + 3 + 1
+
+
+def test_the_csv_has_every_drive(made):
+    _, numbers = made
+    assert len(numbers) == 2 * (3 * 3 * 3 + 3 * 2 + 2 * 3 * 3)
+    drive = next(row for row in numbers if (row["label"], row["actions"], row["seed"]) == ("coil", "sampled", "2"))
+    assert (drive["track"], float(drive["reward"]), float(drive["lap_time"])) == ("a", 482, 50)
+
+
+def test_many_tracks_are_in_the_csv_only(tmp_path):
+    runs = make_runs(tmp_path / "main", {"coil": 30.0, "ppo": 60.0}, seeds=2)
+    for run in runs:
+        wide = [Drive(d.driver, d.advice, d.actions, tuple("abcdefghi"), d.values[[0] * 9]) for d in run.drives]
+        object.__setattr__(run, "drives", tuple(wide))
+    page = Table5(["main"]).make(tmp_path / "t", {"main": runs})
+    assert page.count("The numbers of each of the 9 tracks are in t.csv.") == 2
