@@ -10,6 +10,7 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+import coil_rl.train.config  # noqa: F401 registers the configuration schema
 from coil_rl.report import write_csv
 from coil_rl.train import checkpoint
 from coil_rl.train.build import build_env, build_learner
