@@ -100,16 +100,7 @@ def all_results(
     known_problems: Iterable[str],
     not_reproduced: Iterable[str],
 ) -> str:
-    """Return RESULTS.md.
-
-    Args:
-        pages: page of each result by name; None for a missing one.
-        commands: command of each result by name.
-        command: the command that makes all results.
-        note: a warning to the reader, if any.
-        known_problems: sentences on the paper's numbers.
-        not_reproduced: sentences on parts of the paper that are not reproduced.
-    """
+    """Return RESULTS.md, given the page (None if missing) and the command of each result, and the command of all."""
     split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), INTRODUCTION.strip().format(command=command)]
     if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.report import style
 from coil_rl.report.runs import Run
+from coil_rl.report.statistics import stratified_bootstrap
+from coil_rl.reproduce.pages import with_interval
 
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
@@ -70,6 +76,19 @@ class WorldsResult(Result):
         self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}
         self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]
         self.against, self.resamples, self.seed = against, resamples, seed
+
+    def estimate(self, name: str, scores: NDArray[np.float64], statistic: Any, spec: str = ".1f") -> dict[str, Any]:
+        """Return a statistic of scores [seeds, tracks], the ends of its 95 % interval, and the table cell of all."""
+        value = low = high = math.nan
+        if scores.size and np.isfinite(scores).all():
+            value = float(statistic(scores))
+            low, high = stratified_bootstrap(scores, statistic, resamples=self.resamples, seed=self.seed)
+        return {
+            name: value,
+            f"{name}_low": low,
+            f"{name}_high": high,
+            f"{name} cell": with_interval(value, low, high, spec),
+        }
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:

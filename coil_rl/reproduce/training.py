@@ -12,7 +12,7 @@ import numpy as np
 from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
 from coil_rl.report.curve import TRAINING, mean_curve, points
 from coil_rl.report.runs import GUIDE, Run
-from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
+from coil_rl.report.statistics import iqm, wins
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, WorldsResult, runs_by_label
 
@@ -84,19 +84,9 @@ class Table4(WorldsResult):
             ours, theirs = (np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference))
             line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
             line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
-            statistics: dict[str, Any] = {
-                "best": (best, np.mean), "best_iqm": (best, iqm), "final": (final, np.mean),
-                "difference": (ours - theirs, np.mean),
-            }  # fmt: skip
-            for name, (values, statistic) in statistics.items():
-                value = low = high = math.nan
-                if values.size and np.isfinite(values).all():
-                    value = float(statistic(values))
-                    low, high = stratified_bootstrap(
-                        values[:, None], statistic, resamples=self.resamples, seed=self.seed
-                    )
-                cell = pages.with_interval(value, low, high, "+.1f" if name == "difference" else ".1f")
-                line |= {name: value, f"{name}_low": low, f"{name}_high": high, f"{name} cell": cell}
+            line |= self.estimate("best", best[:, None], np.mean) | self.estimate("best_iqm", best[:, None], iqm)
+            line |= self.estimate("final", final[:, None], np.mean)
+            line |= self.estimate("difference", (ours - theirs)[:, None], np.mean, "+.1f")
             table.append(line)
         return sorted(table, key=lambda line: -line["best"] if math.isfinite(line["best"]) else math.inf)
 

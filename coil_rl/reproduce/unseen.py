@@ -13,7 +13,7 @@ from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
 from coil_rl.report.comparison import Group, compare
 from coil_rl.report.paired import Paired, paired
 from coil_rl.report.runs import GUIDE, MEASURES, Run
-from coil_rl.report.statistics import iqm, stratified_bootstrap
+from coil_rl.report.statistics import iqm
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
 
@@ -87,11 +87,8 @@ class Table5(WorldsResult):
 
     def _row(self, group: Group, groups: Sequence[Group]) -> dict[str, Any]:
         """Return the measures of a driver, and its comparison with the guide and with `against`."""
-        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means(), "iqm": group.iqm}
-        statistics: dict[str, Any] = {"reward": np.mean, "iqm": iqm}
-        for name, statistic in statistics.items():
-            low, high = stratified_bootstrap(group.scores, statistic, resamples=self.resamples, seed=self.seed)
-            row |= {f"{name}_low": low, f"{name}_high": high, f"{name} cell": pages.with_interval(row[name], low, high)}
+        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means()}
+        row |= self.estimate("reward", group.scores, np.mean) | self.estimate("iqm", group.scores, iqm)
         others = {other.name: other for other in groups if other.name != group.name}
         row |= {"difference": None, "better": None, "over_guide": None}
         if group.is_guide:

@@ -107,17 +107,15 @@ class MDP:
         return array.astype(np.float64)
 
     def _check_model(self) -> None:
-        for s, state in enumerate(self.states):
-            for a, action in enumerate(self.actions):
-                if not np.isfinite(self.R[s, a]).all():
-                    raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite (state {state}, action {action})")
-                # A sum with NaN in it is never close to 1.
-                total = self.P[s, a].sum()
-                if not np.isclose(total, 1, rtol=0, atol=1e-9) or (self.P[s, a] < 0).any():
-                    raise ValueError(
-                        f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 "
-                        f"(state {state}, action {action}); they sum to {total:g}"
-                    )
+        total = self.P.sum(axis=2)
+        valid = np.isclose(total, 1, rtol=0, atol=1e-9) & (self.P >= 0).all(axis=2)
+        for s, a in np.argwhere(~valid | ~np.isfinite(self.R).all(axis=2)):
+            where = f"state {self.states[s]}, action {self.actions[a]}"
+            if valid[s, a]:
+                raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
+            raise ValueError(
+                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where}); they sum to {total[s, a]:g}"
+            )
 
 
 def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:
