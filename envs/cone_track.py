@@ -61,7 +61,6 @@ class ConeTrackEnv(SeededEnv):
     `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
     laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `clearance` m (distance to a crash),
     `smoothness` |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
-    All state is in buffers and the generator, so `state_dict()` is complete.
 
     Args:
         tracks: the tracks.
@@ -69,8 +68,7 @@ class ConeTrackEnv(SeededEnv):
         rate: control steps per second.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
         smoothing: lambda of the cubic smoothing spline, m^3.
-        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it was not visible one step
-            before.
+        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes into sight.
         reward: weights, see `RewardWeights`.
         laps: completed laps that end an episode.
         time_limit: s, after which an episode is truncated.
@@ -139,16 +137,14 @@ class ConeTrackEnv(SeededEnv):
             raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
-        self.dtype_ = dtype
-        self.rate, self.laps, self.held_steps, self.assignment = rate, laps, held_steps, assignment
-        self.info = info
+        self.dtype_, self.generator = dtype, torch.Generator()
+        self.rate, self.laps, self.held_steps, self.assignment, self.info = rate, laps, held_steps, assignment, info
         self.max_steps = round(time_limit * rate)
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
         self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
         self.map = TrackMap(tracks, dtype=dtype).to(self.device)
-        self.generator = torch.Generator()
         weights = torch.tensor(RewardWeights(**(reward or {})), dtype=dtype, device=self.device)
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()

@@ -93,8 +93,8 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
 
     def action(self, actions: Floats) -> TensorDict:
         """Return actions as the input of `env`."""
-        action = torch.as_tensor(actions, dtype=self.env.dtype_, device=self.env.device).reshape(-1, 1)
-        return TensorDict({"action": action}, self.env.batch_size)
+        tensor = torch.as_tensor(actions, dtype=self.env.dtype_, device=self.env.device)
+        return TensorDict({"action": tensor.reshape(-1, 1)}, self.env.batch_size)
 
     def observe(self, state: TensorDictBase) -> Floats:
         """Return the observations of a state, with the advice appended."""
@@ -105,9 +105,7 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
 
 
 class ConeTrackGym(gymnasium.Env[Floats, Floats]):
-    """One car as a `gymnasium.Env`; for several cars, `ConeTrackVectorGym` is many times faster.
-
-    `info` holds that of `ConeTrackEnv`. Arguments are those of `ConeTrackVectorGym` without `num_envs`.
+    """One car as a `gymnasium.Env`, with the arguments of `ConeTrackVectorGym` except `num_envs`.
 
     Example:
         >>> import gymnasium

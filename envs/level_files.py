@@ -63,13 +63,9 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
 
 def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> list[Track]:
     """Read a level file, or all *.csv of a folder in natural order, with one `start` for all; see `load_track`."""
-    path = Path(path)
-    try:
-        if not path.is_dir():
-            return [load_track(path, start)]
-        files = [file for file in path.iterdir() if file.suffix.lower() == ".csv" and not file.name.startswith(".")]
-    except OSError as error:
-        raise TrackError(f"{path} cannot be read ({error.strerror}); give a level file or a folder of some.") from None
+    if not os.path.isdir(path):
+        return [load_track(path, start)]
+    files = [file for file in Path(path).glob("*") if file.suffix.lower() == ".csv" and not file.name.startswith(".")]
     if not files:
         raise TrackError(f"The folder {path} holds no level files (*.csv); give a folder with some, or one file.")
     # MAP_2 comes before MAP_10: every second part of the split is a number.
@@ -138,8 +134,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         columns = [name.casefold() for name in header]
         for column in COLUMNS:
             if column.casefold() not in columns:
-                names = ", ".join(filter(None, header)) or "none"
-                raise TrackError(f"{path} has no column {column}; the columns of its first line are: {names}.")
+                raise TrackError(f"{path} has no column {column}; the columns of its first line are {header}.")
         order = [columns.index(column.casefold()) for column in COLUMNS]
         for row in reader:
             if any(cell.strip() for cell in row):

@@ -33,11 +33,7 @@ class View:
 
 
 class Frame:
-    """The coordinate frames of cars: x ahead, y to the left.
-
-    Args:
-        pose: of the cars, [3, B]: m, m, radians.
-    """
+    """The coordinate frames of cars at poses [3, B] (m, m, radians): x ahead, y to the left."""
 
     def __init__(self, pose: Tensor) -> None:
         self.position, heading = pose[:2], pose[2]
@@ -67,12 +63,7 @@ def field_of_view_margin(x: Tensor, square: Tensor) -> Tensor:
 
 
 def view(local: Tensor, limit: int) -> View:
-    """Select the visible cones, at most the `limit` nearest ones per side.
-
-    Args:
-        local: candidate cones in the car's frame, [2, candidates, 2, B] m.
-        limit: maximum of K.
-    """
+    """Select the visible cones of candidates [2, N, 2, B] m in the car's frame, at most the nearest `limit` a side."""
     x, y = local.unbind(0)
     square = torch.addcmul(x * x, y, y)
     margin = torch.minimum(constant(SIGHT**2, x) - square, field_of_view_margin(x, square))

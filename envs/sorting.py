@@ -19,9 +19,8 @@ _TOPK_LIMIT = 16_384  # entries; up to this size `topk` is faster than the netwo
 def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     """Return the rows of the k smallest unmasked entries of each column, smallest first.
 
-    Non-negative floating-point numbers order like the integers with the same bits. The lowest bits of each entry are
-    replaced by its row, so the network moves one integer instead of two numbers. Entries that differ in those bits
-    only (for 64 rows, a relative difference of 8e-6 in float32) count as equal. Equal entries keep their order.
+    Non-negative floats order like the integers with the same bits. The lowest bits of each entry are replaced by its
+    row, so entries that differ in those bits only (for 64 rows, 8e-6 in float32) count as equal and keep their order.
 
     Args:
         values: [N, *batch], from 0 to 1e12.

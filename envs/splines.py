@@ -27,14 +27,7 @@ from coil_rl.envs.constants import constant, flat_index
 
 @dataclass(frozen=True)
 class Spline:
-    """A batch of parametric splines; padding slots repeat the last real entry.
-
-    Example:
-        >>> corner = torch.tensor([[0.0, 1.0, 1.0], [0.0, 0.0, 1.0]]).unsqueeze(-1)
-        >>> spline = smoothing_spline(corner, torch.tensor([3]), smoothing=0.1)
-        >>> spline.equidistant(5).shape
-        torch.Size([2, 5, 1])
-    """
+    """A batch of parametric splines; padding slots repeat the last real entry."""
 
     knots: Tensor  # [K, *batch], m, chord length up to each point
     values: Tensor  # [D, K, *batch], m, positions at the knots

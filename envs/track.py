@@ -19,8 +19,7 @@ AS_COMPLEX = np.array([1, 1j])
 # in millimetres would fill the memory.
 MIN_CONES, MAX_CONES = 4, 1000
 MAX_COORDINATE = 10_000.0  # m
-MAX_EXTENT = 500.0  # m
-MAX_LENGTH = 5000.0  # m, of a side
+MAX_EXTENT, MAX_LENGTH = 500.0, 5000.0  # m, of a side
 MAX_PAIRS = 2 * 10**7  # of boundary segments tested for crossings
 
 
@@ -71,17 +70,16 @@ class Track:
         default = (*start, np.arctan2(forward[1], forward[0]))
         pose = tuple(float(value) for value in (default if self.start is None else self.start))
         if len(pose) != 3 or not (np.abs(pose) <= MAX_COORDINATE).all():
-            raise TrackError(
-                f"The start of track {self.name!r} is {self.start}; give three finite numbers x, y, heading, "
-                f"of at most {MAX_COORDINATE:.0f}."
-            )
+            remedy = f"give three finite numbers x, y, heading, of at most {MAX_COORDINATE:.0f}"
+            raise TrackError(f"The start of track {self.name!r} is {self.start}; {remedy}.")
         object.__setattr__(self, "start", pose)
         for name, point in (("start", np.array(pose[:2])), ("finish", self.finish)):
             if _encloses(rings["left"], point) == _encloses(rings["right"], point):
-                raise TrackError(
-                    f"The {name} of track {self.name!r} at {np.round(point, 2).tolist()} is not between its two sides; "
-                    "give a start on the track, y pointing up, and list both sides from the same place on."
+                fault = (
+                    f"The {name} of track {self.name!r} at {np.round(point, 2).tolist()} is not between its two sides"
                 )
+                remedy = "give a start on the track, y pointing up, and list both sides from the same place on"
+                raise TrackError(f"{fault}; {remedy}.")
 
     @property
     def finish(self) -> Array:
@@ -115,26 +113,20 @@ class Track:
     def _check_boundaries(self, rings: dict[Side, Array]) -> None:
         for side, ring in rings.items():
             if not np.isfinite(ring).all() or np.ptp(ring, axis=0).max() > 2 * MAX_EXTENT:
-                raise TrackError(
-                    f"The {side} boundary of track {self.name!r} swings far out between its cones; space them evenly, "
-                    "in driving order."
-                )
+                fault = f"The {side} boundary of track {self.name!r} swings far out between its cones"
+                raise TrackError(f"{fault}; space them evenly, in driving order.")
         crossing = _first_crossing(rings)
         if crossing is not None:
             sides, point = crossing
             fault = "two sides cross each other" if len(sides) == 2 else f"{sides.pop()} side crosses itself"
-            raise TrackError(
-                f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; "
-                "list each side's cones in driving order and keep the two sides apart."
-            )
+            remedy = "list each side's cones in driving order and keep the two sides apart"
+            raise TrackError(f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; {remedy}.")
         anticlockwise = [_area(rings[side]) > 0 for side in SIDES]
         # The left ring is the inner one of a track driven anticlockwise.
         inner, outer = SIDES if anticlockwise[0] else SIDES[::-1]
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
-            raise TrackError(
-                f"The left side of track {self.name!r} is not on the left of its driving direction; list both sides in "
-                "driving order, or swap LEFT and RIGHT."
-            )
+            fault = f"The left side of track {self.name!r} is not on the left of its driving direction"
+            raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
 
 
 def resample(ring: Array, spacing: float) -> Array:
@@ -147,16 +139,12 @@ def resample(ring: Array, spacing: float) -> Array:
 
 def _check_cones(side: str, cones: Array) -> None:
     if cones.ndim != 2 or cones.shape[1] != 2 or not MIN_CONES <= len(cones) <= MAX_CONES:
-        raise TrackError(
-            f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; "
-            f"give {MIN_CONES} to {MAX_CONES}, of shape [N, 2]."
-        )
+        remedy = f"give {MIN_CONES} to {MAX_CONES}, of shape [N, 2]"
+        raise TrackError(f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; {remedy}.")
     outside = np.flatnonzero(~(np.abs(cones) <= MAX_COORDINATE).all(axis=1))
     if len(outside):
-        raise TrackError(
-            f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; give finite coordinates in m, "
-            f"at most {MAX_COORDINATE:.0f} from the origin."
-        )
+        remedy = f"give finite coordinates in m, at most {MAX_COORDINATE:.0f} from the origin"
+        raise TrackError(f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; {remedy}.")
     lengths = np.linalg.norm(_edges(cones), axis=1)
     if np.ptp(cones, axis=0).max() > MAX_EXTENT or lengths.sum() > MAX_LENGTH:
         raise TrackError(
@@ -165,10 +153,8 @@ def _check_cones(side: str, cones: Array) -> None:
     coincident = np.flatnonzero(lengths < 1e-6)
     if len(coincident):
         first, second = coincident[0], (coincident[0] + 1) % len(cones)
-        raise TrackError(
-            f"Cones {first} and {second} of the {side} lie on the same spot; remove one of them "
-            "(the ring closes by itself, its first cone is not repeated)."
-        )
+        remedy = "remove one of them (the ring closes by itself, its first cone is not repeated)"
+        raise TrackError(f"Cones {first} and {second} of the {side} lie on the same spot; {remedy}.")
 
 
 def _edges(ring: Array) -> Array:

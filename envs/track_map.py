@@ -1,8 +1,7 @@
 """Lookup tables of tracks: candidate cones for sight, and the distance to a crash.
 
-A step of thousands of cars cannot test every cone of their tracks. All static geometry is therefore computed once: for
-each square metre and each of 12 heading sectors the cones that may be visible, and on a fine grid the distance to each
-boundary. A step reads a few numbers per car.
+All static geometry is computed once: for each square metre and each of 12 heading sectors the cones that may be
+visible, and on a fine grid the distance to each boundary. A step of thousands of cars then reads a few numbers per car.
 """
 
 from __future__ import annotations
