@@ -1,4 +1,4 @@
-"""The worlds: batched TorchRL envs and what they are made of."""
+"""Batched TorchRL environments, tracks, recordings and the parts they share."""
 
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv
@@ -13,7 +13,6 @@ from coil_rl.envs.robot.perception import Perception
 from coil_rl.envs.robot.simulated_drives import SimulatedDrive, labelling_drives, simulated_drive
 from coil_rl.envs.robot.simulated_recordings import record_drives, save_drive
 from coil_rl.envs.robot.simulated_robot import SimulatedRobotEnv
-from coil_rl.envs.tabular_env import TabularEnv
 from coil_rl.envs.track import Track, TrackError
 from coil_rl.envs.track_generator import random_track, random_tracks
 
@@ -29,7 +28,6 @@ __all__ = [
     "SimulatedDrive",
     "SimulatedLidar",
     "SimulatedRobotEnv",
-    "TabularEnv",
     "Track",
     "TrackError",
     "labelling_drives",

@@ -1,7 +1,7 @@
-"""Constant tensors, made once.
+"""Cached constant tensors.
 
-On a small batch an operation with a Python number takes twice as long as one with a tensor, because PyTorch makes a
-tensor of the number every time; and to make the numbers 0, 1, 2, ... takes as long as two operations.
+On a small batch an operation with a Python number takes twice as long as one with a tensor, because PyTorch converts
+the number on every call. Creating the numbers 0, 1, 2, ... takes as long as two operations.
 """
 
 from __future__ import annotations
@@ -14,40 +14,36 @@ from torch import Tensor
 
 
 def constant(value: float | Sequence[float], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """A number, or a column of numbers, for an operation with another tensor. It is not to be changed.
+    """Return a read-only number, or column of numbers, that broadcasts against another tensor.
 
     Args:
-        value: a number, or as many as the column has rows: a tuple or a range.
-        like: what it goes with, [any, *batch], on whose device it is.
-        dtype: that of `like` by default.
+        value: a number, or one number per row as a tuple or a range.
+        like: [any, *batch], the other tensor, whose device and, by default, dtype are used.
+        dtype: of the result.
 
     Returns:
-        A tensor without dimensions, or [rows, 1, ...] of as many dimensions as `like`.
-
-    Example:
-        >>> constant(range(3), torch.zeros(8, 2)).tolist()
-        [[0.0], [1.0], [2.0]]
+        A tensor without dimensions, or [rows, 1, ...] with as many dimensions as `like`.
     """
-    make = _made if torch.compiler.is_compiling() else _kept
+    make = _new if torch.compiler.is_compiling() else _cached
     return make(value, like.ndim - 1, dtype or like.dtype, like.device)
 
 
-def flat_index(place: Tensor) -> Tensor:
-    """Rows [K, *batch] of a tensor [N, *batch] as places in it once it is flattened, [K * batch]."""
-    rows = place.view(len(place), -1)
+def flat_index(rows: Tensor) -> Tensor:
+    """Return row indices [K, *batch] into a tensor [N, *batch] as indices into its flattened form, [K * batch]."""
+    rows = rows.view(len(rows), -1)
     columns = rows.shape[1]
-    make = _made if torch.compiler.is_compiling() else _kept
-    return torch.add(make(range(columns), 0, place.dtype, place.device), rows, alpha=columns).flatten()
+    make = _new if torch.compiler.is_compiling() else _cached
+    return torch.add(make(range(columns), 0, rows.dtype, rows.device), rows, alpha=columns).flatten()
 
 
-def _made(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _new(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     if isinstance(value, int | float):
         return torch.tensor(value, dtype=dtype, device=device)
     return torch.tensor(list(value), dtype=dtype, device=device).view(-1, *[1] * dims)
 
 
 @lru_cache(maxsize=1024)
-def _kept(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # Nothing could be differentiated with tensors made in inference mode, which may be on at the first call.
+def _cached(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    # Autograd rejects tensors created in inference mode, which may be active at the first call.
     with torch.inference_mode(False):
-        return _made(value, dims, dtype, device)
+        return _new(value, dims, dtype, device)

@@ -1,8 +1,8 @@
-"""The cone world with several ways to drive it: what is paid changes within the episode, and the agent is told.
+"""The cone world with driving tasks: the weights of the reward change within the episode.
 
-Every car has a task, such as to keep to the left. A task is a set of weights of the reward. Which one holds is part of
-what the car sees and changes at random moments, so that one agent has to learn them all, as in the puppeteer example
-of Dynamic COIL: a guide for each task, and an agent that learns from all of them.
+Each car has a task, such as keeping to the left, which is a set of weights of the reward. The task is observed and
+changes at random, so one agent has to learn all tasks, as in the puppeteer example of Dynamic COIL: one guide per task,
+and one agent that learns from all guides.
 """
 
 from __future__ import annotations
@@ -12,52 +12,43 @@ from typing import Any, ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Composite, OneHot
 
 from coil_rl.envs.cone_track import ConeTrackEnv
-from coil_rl.envs.reward import REWARD_TERMS, Outcome, Reward, check_weights, pay
+from coil_rl.envs.reward import REWARD_TERMS, Outcome, RewardWeights, check_weights, weighted_terms
 from coil_rl.envs.track import Track
 
 
-class Place(NamedTuple):
-    """Weights of where the car is across the track: 1 is the left boundary, 0 the middle, -1 the right one.
+class PositionWeights(NamedTuple):
+    """Weights of the lateral position: 1 at the left boundary, 0 in the middle, -1 at the right boundary."""
 
-    Attributes:
-        centre: paid every step per unit of |place|.
-        left: paid every step per unit of place.
-        inside: paid every step per unit of place times action, which is more than 0 on the inner side of a bend. It
-            pays nobody to weave: what the steering to one side brings, the steering back costs, and more.
-    """
-
-    centre: float = 0.0
-    left: float = 0.0
-    inside: float = 0.0
+    centre: float = 0.0  # per step and unit of |position|
+    left: float = 0.0  # per step and unit of position
+    inside: float = 0.0  # per step and unit of position times action, positive on the inner side of a bend
 
 
-WEIGHTS = (*Reward._fields, *Place._fields)
+WEIGHTS = (*RewardWeights._fields, *PositionWeights._fields)
 
 
 class DrivingTasksEnv(ConeTrackEnv):
     """Cars on tracks between cones, each with a task that changes.
 
-    Writes besides all that `ConeTrackEnv` does: `task` [B, tasks], 1 at the task that the next step is paid by and else
-    0; and under `info`: `task`, with one entry [B, 1] a task, whether the step was paid by it, and in `reward` the
-    terms of `Place`.
+    Writes in addition to `ConeTrackEnv`: `task` [B, tasks], one-hot, the task of the next step; and under `info`:
+    `task`, with one entry [B, 1] per task, whether the step was rewarded by it, and in `reward` the terms of
+    `PositionWeights`.
 
     Args:
-        tracks: where to drive.
+        tracks: the tracks.
         num_cars: B.
-        tasks: name to weights, of `Reward` and `Place`; what a task does not mention is as in `reward`.
-        only: the one task that all cars have all the time; None for all of them in turn. The others still have their
-            place in `task`.
-        duration: s, mean time until a task gives way to another one, all alike probable. Whether it does is drawn
-            every step, so that nothing tells how long it will last.
-        reward: weights that all tasks have, see `Reward` and `Place`.
-        world: all else that `ConeTrackEnv` takes.
+        tasks: name to weights, of `RewardWeights` and `PositionWeights`.
+        only: a task that all cars keep; by default they change between all tasks.
+        duration: s, mean time until a task changes to another one, drawn every step with equal probabilities.
+        reward: weights that a task does not set, see `RewardWeights` and `PositionWeights`.
+        world: other arguments of `ConeTrackEnv`.
 
     Raises:
-        ValueError: as `ConeTrackEnv`, and for tasks and weights that do not exist.
+        ValueError: as `ConeTrackEnv`, and for unknown tasks and weights.
 
     Example:
         >>> from coil_rl.envs import DrivingTasksEnv, shipped_tracks
@@ -67,11 +58,7 @@ class DrivingTasksEnv(ConeTrackEnv):
         torch.Size([8, 3, 3])
     """
 
-    reward_terms: ClassVar[tuple[str, ...]] = (*REWARD_TERMS, *Place._fields)
-
-    task: Tensor
-    task_weights: Tensor
-    one_hot: Tensor
+    reward_terms: ClassVar[tuple[str, ...]] = (*REWARD_TERMS, *PositionWeights._fields)
 
     def __init__(
         self,
@@ -95,60 +82,56 @@ class DrivingTasksEnv(ConeTrackEnv):
         super().__init__(tracks, num_cars, **world)
         if not duration * self.rate >= 1:
             raise ValueError(f"duration={duration} must be at least one step of 1/{self.rate} s")
-        self.tasks = tuple(tasks)
-        self.only = None if only is None else self.tasks.index(only)
-        self.duration = duration
-        usual = Reward()._asdict() | Place()._asdict() | dict(reward)
-        table = [[(usual | dict(weights))[key] for weights in tasks.values()] for key in WEIGHTS]
-        fixed = {"dtype": self.dtype_, "device": self.device}
-        self.register_buffer("task_weights", torch.tensor(table, **fixed), persistent=False)
-        self.register_buffer("one_hot", torch.eye(len(self.tasks), **fixed), persistent=False)
-        self.register_buffer("task", torch.full(self.batch_size, self.only or 0, device=self.device))
-        shape = (*self.batch_size, len(self.tasks))
-        self.observation_spec["task"] = OneHot(len(self.tasks), shape, dtype=self.dtype_, device=self.device)
+        self.tasks, self.duration = tuple(tasks), duration
+        self.changing = only is None and len(tasks) > 1
+        common = RewardWeights()._asdict() | PositionWeights()._asdict() | dict(reward)
+        table = [[(common | dict(weights))[key] for weights in tasks.values()] for key in WEIGHTS]
+        options = {"dtype": self.dtype_, "device": self.device}
+        self.task_weights: Tensor = nn.Buffer(torch.tensor(table, **options), persistent=False)
+        self.one_hot: Tensor = nn.Buffer(torch.eye(len(tasks), **options), persistent=False)
+        first = 0 if only is None else self.tasks.index(only)
+        self.task: Tensor = nn.Buffer(torch.full(self.batch_size, first, device=self.device))
+        self.observation_spec["task"] = OneHot(len(tasks), (*self.batch_size, len(tasks)), **options)
         if self.info:
             flag = Binary(1, (*self.batch_size, 1), dtype=torch.bool, device=self.device)
             self.observation_spec["info", "task"] = Composite(dict.fromkeys(self.tasks, flag), shape=self.batch_size)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         out = super()._reset(tensordict, **kwargs)
-        if self._changes():
-            # All cars draw, reset or not, as the base class does for the tracks.
+        if self.changing:
+            # One draw per car, reset or not, as for the tracks.
             drawn = torch.randint(len(self.tasks), self.batch_size, generator=self.generator)
             drawn = drawn.to(self.device, non_blocking=True)
             mask = None if tensordict is None else tensordict.get("_reset", None)
             self.task = drawn if mask is None else torch.where(mask.view(-1), drawn, self.task)
-        return self._tell(out, self.task)
+        return self._add_task(out, self.task)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out = super()._step(tensordict)
-        paid = self.task
-        if self._changes():
-            self.task = self._next()
-        return self._tell(out, paid)
+        out, rewarded = super()._step(tensordict), self.task
+        if self.changing:
+            self.task = self._next_task()
+        return self._add_task(out, rewarded)
 
-    def _changes(self) -> bool:
-        return self.only is None and len(self.tasks) > 1
-
-    def _next(self) -> Tensor:
-        """The tasks [B] of the next step: another one once in `duration`, by a single draw a car."""
+    def _next_task(self) -> Tensor:
+        """Return the tasks of the next step [B]; one draw per car decides about the change and the new task."""
         drawn = torch.rand(self.batch_size, generator=self.generator).to(self.device, non_blocking=True)
         others = len(self.tasks) - 1
-        on = (drawn * (self.duration * self.rate * others)).floor_().to(self.task.dtype) + 1
-        return torch.where(on <= others, (self.task + on) % len(self.tasks), self.task)
+        shift = (drawn * (self.duration * self.rate * others)).floor_().to(self.task.dtype) + 1
+        return torch.where(shift <= others, (self.task + shift) % len(self.tasks), self.task)
 
-    def _pay(self, outcome: Outcome) -> dict[str, Tensor]:
+    def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
         weights = dict(zip(WEIGHTS, self.task_weights.index_select(1, self.task).unbind(0), strict=True))
         to_left, to_right = outcome.to_boundaries
-        place = (to_right - to_left) / (to_right + to_left)
-        paid = {"centre": place.abs(), "left": place, "inside": place * outcome.action}
-        return pay(outcome, weights) | {term: value * weights[term] * outcome.alive for term, value in paid.items()}
+        position = (to_right - to_left) / (to_right + to_left)
+        terms = {"centre": position.abs(), "left": position, "inside": position * outcome.action}
+        weighted = {term: value * weights[term] * outcome.alive for term, value in terms.items()}
+        return weighted_terms(outcome, weights) | weighted
 
-    def _tell(self, out: TensorDictBase, paid: Tensor) -> TensorDictBase:
-        """Add the task that holds now to what the agent sees, and the one that was paid to `info`."""
+    def _add_task(self, out: TensorDictBase, rewarded: Tensor) -> TensorDictBase:
+        """Add the task of the next step to the observations, and the rewarded task to `info`."""
         out["task"] = self.one_hot.index_select(0, self.task)
         if self.info:
-            was = self.one_hot.index_select(0, paid).bool().split(1, -1)
-            entries = dict(zip(self.tasks, was, strict=True))
+            flags = self.one_hot.index_select(0, rewarded).bool().split(1, -1)
+            entries = dict(zip(self.tasks, flags, strict=True))
             out["info", "task"] = TensorDict(entries, self.batch_size, device=self.device)
         return out

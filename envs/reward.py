@@ -1,4 +1,4 @@
-"""What a step is worth by the paper's reward (4.1.1), in every world with cones."""
+"""The reward of the cone worlds (paper 4.1.1)."""
 
 from __future__ import annotations
 
@@ -16,57 +16,32 @@ HISTORY = 20
 REWARD_TERMS = ("finish", "crash", "cone", "smooth", "alive")
 
 
-class Reward(NamedTuple):
-    """Weights of the reward (paper 4.1.1).
+class RewardWeights(NamedTuple):
+    """Weights of the reward (paper 4.1.1)."""
 
-    Attributes:
-        finish: paid for a completed lap.
-        second: paid per second of its lap time.
-        crash: paid instead of everything else in the step of a crash.
-        cone: paid for each side on which a cone comes into sight.
-        smooth: paid per unit of |a - mean of the last 20 actions|.
-        alive: paid every step.
-    """
-
-    finish: float = 70.0
-    second: float = -0.8
-    crash: float = -100.0
-    cone: float = 2.5
-    smooth: float = -0.1
-    alive: float = 0.001
+    finish: float = 70.0  # for a completed lap
+    second: float = -0.8  # per second of its lap time
+    crash: float = -100.0  # in the step of a crash, instead of all other terms
+    cone: float = 2.5  # for each side with a newly visible cone
+    smooth: float = -0.1  # per unit of roughness
+    alive: float = 0.001  # for each step
 
 
 class Outcome(NamedTuple):
-    """What a step brought each car, [B] unless said otherwise.
-
-    Attributes:
-        action: that was taken.
-        roughness: |a - mean of the last 20 actions|.
-        lap_time: s, of the lap just completed, else 0.
-        finished: whether one was.
-        discovered: on how many sides a cone came into sight.
-        to_boundaries: [2, B] m, to the left and to the right one.
-        crashed: whether it did.
-        alive: 1 unless it did.
-    """
+    """Quantities of a step that the reward depends on, [B] unless noted."""
 
     action: Tensor
-    roughness: Tensor
-    lap_time: Tensor
-    finished: Tensor
-    discovered: Tensor
-    to_boundaries: Tensor
+    roughness: Tensor  # |a - mean of the last 20 actions|
+    lap_time: Tensor  # s, of the lap just completed, else 0
+    finished: Tensor  # whether a lap was completed
+    discovered: Tensor  # number of sides with a newly visible cone
+    to_boundaries: Tensor  # [2, B] m, distances to the left and the right boundary
     crashed: Tensor
-    alive: Tensor
+    alive: Tensor  # 0 after a crash, else 1
 
 
-def pay(outcome: Outcome, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The terms of the paper's reward (4.1.1), [B] each.
-
-    Args:
-        outcome: of the step.
-        weights: see `Reward`; each a number, or [B].
-    """
+def weighted_terms(outcome: Outcome, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the terms of the paper's reward (4.1.1), [B] each, for weights that are scalars or [B]."""
     alive = outcome.alive
     return {
         "finish": torch.addcmul(outcome.finished * weights["finish"], outcome.lap_time, weights["second"]) * alive,
@@ -78,11 +53,7 @@ def pay(outcome: Outcome, weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str]) -> None:
-    """Refuse weights of a reward that do not exist or are no numbers to learn from.
-
-    Raises:
-        ValueError: naming the weight.
-    """
+    """Raise ValueError for unknown weights and for values outside [-1e6, 1e6]."""
     unknown = set(weights) - set(known)
     if unknown:
         raise ValueError(f"{name} has no weight {sorted(unknown)}; it has {', '.join(known)}")
@@ -92,7 +63,7 @@ def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str])
 
 
 def recent_mean(history: Tensor) -> Tensor:
-    """Mean of the last actions [20, B], newest first, weighted exp(-0.1 k), in a fixed order of summation."""
+    """Return the mean of the last actions [20, B], newest first, weighted by exp(-0.1 k); fixed summation order."""
     weights = [math.exp(-0.1 * k) for k in range(HISTORY)]
     fours = (history * constant(tuple(weight / sum(weights) for weight in weights), history)).view(2, 2, 5, -1)
     pairs = torch.add(*fours.unbind(0))

@@ -1,7 +1,7 @@
-"""The smallest few entries of each column.
+"""Batched selection of the smallest entries of each column.
 
-PyTorch picks them column by column, which takes it up to a microsecond each. A network of minima and maxima is the same
-operations for all columns at once, whatever is in them: dozens of them, which pays where columns are many.
+`Tensor.topk` processes one column after another, up to a microsecond each. A sorting network of minima and maxima
+applies a few dozen operations to all columns at once, which is faster for many columns.
 """
 
 from __future__ import annotations
@@ -12,70 +12,67 @@ from torch import Tensor
 from coil_rl.envs.constants import constant
 
 _BITS = {torch.float32: torch.int32, torch.float64: torch.int64}
-_BEHIND = 1e12
-_FEW = 16_384  # entries, up to which the network is the slower way
+_MASKED = 1e12
+_TOPK_LIMIT = 16_384  # entries; up to this size `topk` is faster than the network
 
 
-def smallest(values: Tensor, unwanted: Tensor, kept: int) -> Tensor:
-    """Where the smallest wanted entries of each column are, smallest first.
+def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
+    """Return the rows of the k smallest unmasked entries of each column, smallest first.
 
-    Non-negative floating-point numbers order like the integers that their bits spell, so each entry's row is put in
-    place of its lowest bits and the network moves one integer instead of two numbers. Entries that agree but for those
-    bits (for 64 rows, a relative difference of 8e-6 in float32) count as equal, and of equal ones the upper row comes
-    first.
+    Non-negative floats order like the integers with the same bits. The lowest bits of each entry are replaced by its
+    row, so entries that differ in those bits only (for 64 rows, 8e-6 in float32) count as equal and keep their order.
 
     Args:
         values: [N, *batch], from 0 to 1e12.
-        unwanted: [N, *batch], 1 or 0.
-        kept: how many to return, at most N.
+        masked: [N, *batch], 1 for entries to skip, else 0.
+        k: number of rows to return, at most N.
 
     Returns:
-        Rows, [kept, *batch] int32 (int64 for float64). Where fewer are wanted, the others follow in no order.
+        Rows, [k, *batch], int32 (int64 for float64). Masked entries fill up columns with fewer than k, in any order.
     """
-    wires = 1 << max(1, (len(values) - 1).bit_length())
+    rows_padded = 1 << max(1, (len(values) - 1).bit_length())
     integer = _BITS[values.dtype]
     rows = constant(range(len(values)), values, integer)
-    keys = torch.add(values, unwanted, alpha=_BEHIND).view(integer)
-    keys = keys.bitwise_and_(constant(-wires, rows)).bitwise_or_(rows)
-    if kept == 1:
+    keys = torch.add(values, masked, alpha=_MASKED).view(integer)
+    keys = keys.bitwise_and_(constant(-rows_padded, rows)).bitwise_or_(rows)
+    if k == 1:
         first = keys.amin(0, keepdim=True)
-    elif keys.device.type == "cpu" and keys.numel() <= _FEW and not torch.compiler.is_compiling():
-        first = keys.topk(kept, 0, largest=False).values
+    elif keys.device.type == "cpu" and keys.numel() <= _TOPK_LIMIT and not torch.compiler.is_compiling():
+        first = keys.topk(k, 0, largest=False).values
     else:
-        first = _sorted(keys, wires, kept)
-    return first.bitwise_and_(constant(wires - 1, rows))
+        first = _bitonic_sort(keys, rows_padded, k)
+    return first.bitwise_and_(constant(rows_padded - 1, rows))
 
 
-def _sorted(keys: Tensor, wires: int, kept: int) -> Tensor:
-    """The first `kept` rows of [N, *batch] sorted by Batcher's bitonic merges of `wires` rows, a power of two.
+def _bitonic_sort(keys: Tensor, rows_padded: int, k: int) -> Tensor:
+    """Return the first k rows of [N, *batch], sorted by Batcher's bitonic network of a power of two of rows.
 
-    Two neighbouring sorted runs become one by comparing the first with the reversed second, which parts them into a
-    smaller and a larger half, and by parting each half likewise down to single wires. A larger half that lies beyond
-    `kept` is dropped.
+    A pair of sorted runs is merged by comparing the first run with the reversed second one, which separates the smaller
+    from the larger half, and by splitting each half in the same way down to single rows. Rows beyond k are dropped.
     """
     batch = keys.shape[1:]
-    if wires > len(keys):
-        keys = torch.cat([keys, keys.new_full((wires - len(keys), *batch), torch.iinfo(keys.dtype).max)])
-    keys = keys.view(wires, -1)
+    if rows_padded > len(keys):
+        keys = torch.cat([keys, keys.new_full((rows_padded - len(keys), *batch), torch.iinfo(keys.dtype).max)])
+    keys = keys.view(rows_padded, -1)
     run = 1
     while run < len(keys):
         first, second = keys.view(-1, 2, run, keys.shape[1]).unbind(1)
-        part = run // 2
-        if run < kept:
-            keys = _parted(first, second.flip(1))
+        half = run // 2
+        if run < k:
+            keys = _compare(first, second.flip(1))
             run *= 2
         else:
             keys = torch.minimum(first, second.flip(1)).flatten(0, 1)
-        while part:
-            keys = _parted(*keys.view(-1, 2, part, keys.shape[1]).unbind(1))
-            part //= 2
-    return keys[:kept].view(kept, *batch)
+        while half:
+            keys = _compare(*keys.view(-1, 2, half, keys.shape[1]).unbind(1))
+            half //= 2
+    return keys[:k].view(k, *batch)
 
 
-def _parted(first: Tensor, second: Tensor) -> Tensor:
-    """The smaller ones of two [runs, wires, N], then the larger ones, run by run: [runs * 2 * wires, N]."""
-    runs, wires, columns = first.shape
-    both = first.new_empty(runs, 2, wires, columns)
+def _compare(first: Tensor, second: Tensor) -> Tensor:
+    """Return minima followed by maxima of two [runs, rows, N], run by run: [runs * 2 * rows, N]."""
+    runs, rows, columns = first.shape
+    both = first.new_empty(runs, 2, rows, columns)
     torch.minimum(first, second, out=both[:, 0])
     torch.maximum(first, second, out=both[:, 1])
     return both.view(-1, columns)

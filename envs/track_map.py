@@ -1,227 +1,235 @@
-"""Tracks as lookup tables: what a car at a pose could see, and how far it is from a crash.
+"""Lookup tables of tracks: candidate cones for sight, and the distance to a crash.
 
-A step of thousands of cars cannot look at every cone of their tracks. Everything that does not move is therefore
-worked out once: for each square metre and each twelfth of a turn the cones that a car there may see, and on a fine grid
-the distance to the nearest boundary. A step then reads a few numbers per car.
+All static geometry is computed once: for each square metre and each of 12 heading sectors the cones that may be
+visible, and on a fine grid the distance to each boundary. A step of thousands of cars then reads a few numbers per car.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from coil_rl.envs.constants import constant
+from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SIGHT
 from coil_rl.envs.splines import slots_in_use
-from coil_rl.envs.track import Track
-from coil_rl.envs.track_tables import SECTORS, Grid, Nearby, boundary_distances, nearby
+from coil_rl.envs.track import SIDES, Track
 
-EXACT = 1.0  # m: a clearance up to this counts every cone, a larger one perhaps only the boundaries
+CONE_RADIUS = 0.4  # m, crash distance between a car's centre and a cone
+BOUNDARY_MARGIN = 0.25  # m, crash distance between a car's centre and a boundary
+EXACT = 1.0  # m, clearances up to this include all cones
+SECTORS = 12
+MAX_DISTANCE = 3.0  # m, limit of the distance field, wider than any track
+CELL = 1.0  # m, edge of a cell of candidate cones
+FIELD_CELL = 0.1  # m, edge of a cell of the distance field; the interpolation error is below 2 mm
+MARGIN = 2.0  # m, around the cones and the start
+FAR = 1e4  # m, coordinates of padding
+
+Numbers = NDArray[np.int16]
 
 
-class Place(NamedTuple):
-    """Where cars are on their tracks, in the tables of a `TrackMap`.
+class Location(NamedTuple):
+    """The positions of cars in the tables of a `TrackMap`."""
 
-    Attributes:
-        track: [B], the cars' tracks.
-        position: [2, B] m.
-        finish: [2, B] m, the middle of the finish line of the car's track.
-        cell: [B], the cell of candidate cones that the car is in.
-        nodes: [2, B], the nodes of the distance field to its lower and to its upper left.
-        share: [2, B], how far the car is from there towards the nodes to the right and above, 0 to 1.
-    """
-
-    track: Tensor
-    position: Tensor
-    finish: Tensor
-    cell: Tensor
-    nodes: Tensor
-    share: Tensor
+    track: Tensor  # [B], index
+    position: Tensor  # [2, B] m
+    finish: Tensor  # [2, B] m, the middle of the finish line of the car's track
+    cell: Tensor  # [B], of candidate cones
+    nodes: Tensor  # [2, B], the lower left and the upper left node of the distance field
+    fraction: Tensor  # [2, B], from 0 at the lower left node to 1 at the upper right one
 
 
 class TrackMap(nn.Module):
-    """The static geometry of several tracks, on one device, for a batch of cars.
+    """The static geometry of several tracks on one device, for a batch of cars that refer to tracks by index."""
 
-    Args:
-        tracks: the tracks; a car names its own by its place in this list.
-        sight: how far a car sees, in m.
-        half_field_of_view: how far to either side of its heading it sees, in radians.
-        cone_radius: a car's centre this close to a cone has crashed, in m.
-        boundary_margin: a car's centre this close to a boundary has crashed, in m.
-        cell: edge of the cells that hold candidate cones, in m.
-        field_cell: edge of the cells of the distance field, in m. Interpolation between its nodes is off by less than
-            field_cell^2 / 4 times the boundary's curvature: 2 mm at the tightest bends.
-        dtype: of all coordinates.
-    """
-
-    cones: Tensor
-    starts: Tensor
-    points: Tensor
-    counts: Tensor
-    candidate: Tensor
-    listed: Tensor
-    block: Tensor
-    near: Tensor
-    field: Tensor
-
-    def __init__(
-        self,
-        tracks: Sequence[Track],
-        *,
-        sight: float = 7.0,
-        half_field_of_view: float = float(np.deg2rad(60)),
-        cone_radius: float = 0.4,
-        boundary_margin: float = 0.25,
-        cell: float = 1.0,
-        field_cell: float = 0.1,
-        dtype: torch.dtype = torch.float32,
-    ) -> None:
+    def __init__(self, tracks: Sequence[Track], *, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         if not tracks:
             raise ValueError("a track map needs at least one track, none was given")
-        self.names = [track.name for track in tracks]
-        self.cone_radius, self.boundary_margin = cone_radius, boundary_margin
-        rings = [(track.left, track.right) for track in tracks]
-        everything = [np.vstack([*pair, [track.start[:2]]]) for pair, track in zip(rings, tracks, strict=True)]
-        lows = np.stack([points.min(axis=0) for points in everything]) - 2
-        highs = np.stack([points.max(axis=0) for points in everything]) + 2
-
-        self.slots = max(len(ring) for pair in rings for ring in pair) + 1
-        cones = np.full((2, len(tracks), 2, self.slots), 1e4)
-        for index, pair in enumerate(rings):
-            for side, ring in enumerate(pair):
+        self.tracks = list(tracks)
+        self.slots = max(len(ring) for track in tracks for ring in (track.left, track.right)) + 1
+        cones = np.full((2, len(tracks), 2, self.slots), FAR)
+        for index, track in enumerate(tracks):
+            for side, ring in enumerate((track.left, track.right)):
                 cones[:, index, side, : len(ring)] = ring.T
-        self._keep("cones", cones.reshape(2, -1), dtype)
-        self._keep("starts", np.array([track.start for track in tracks]).T, dtype)
+        self.cones: Tensor = _buffer(cones.reshape(2, -1), dtype)
+        self.starts: Tensor = _buffer(np.array([track.start for track in tracks]).T, dtype)
+        self._register_nearby(tracks, dtype)
+        field = [boundary_distances(track, dtype) for track in tracks]
+        self.field: Tensor = _buffer(np.concatenate(field).ravel(), dtype)
 
-        areas = [(tuple(low.tolist()), tuple(high.tolist())) for low, high in zip(lows, highs, strict=True)]
-        self._keep_nearby(
-            [
-                nearby(track, *area, cell, dtype, sight, half_field_of_view, cone_radius + EXACT)
-                for track, area in zip(tracks, areas, strict=True)
-            ],
-            [len(left) for left, _ in rings],
-        )
-        field = [boundary_distances(track, *area, field_cell, dtype) for track, area in zip(tracks, areas, strict=True)]
-        self._keep("field", np.concatenate(field).ravel(), dtype)
-
-        # What a step needs to know of a car's track, one column a track: points in m, and whole numbers.
-        grids = [Grid(lows, highs, edge, dtype) for edge in (cell, field_cell)]
-        self.edges = (cell, field_cell)
+        # Numbers of each track, one column per track: points in m, and integers.
+        grids = [[Grid(track, edge, dtype) for track in tracks] for edge in (CELL, FIELD_CELL)]
         finish = np.stack([track.finish for track in tracks], axis=1)
-        self._keep("points", np.vstack([finish, grids[0].low, *[grid.last for grid in grids]]), dtype)
-        counts = [*[grid.columns for grid in grids], *[grid.offset for grid in grids]]
-        self._keep("counts", np.stack(counts), torch.int64)
+        low = np.stack([grid.low for grid in grids[0]], axis=1)
+        shapes = [np.array([grid.shape for grid in row]).T for row in grids]
+        self.points: Tensor = _buffer(np.vstack([finish, low, *[shape - 2 for shape in shapes]]), dtype)
+        offsets = [np.cumsum(shape.prod(axis=0)) - shape.prod(axis=0) for shape in shapes]
+        self.counts: Tensor = _buffer(np.stack([*[shape[0] for shape in shapes], *offsets]), torch.int64)
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.tracks)
 
-    def _keep(self, name: str, values: NDArray[np.generic], dtype: torch.dtype) -> None:
-        self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values), dtype=dtype), persistent=False)
+    def _register_nearby(self, tracks: Sequence[Track], dtype: torch.dtype) -> None:
+        """Register `candidate` [blocks * SECTORS, most * 2], `candidate_count`, `block` [cells] and `near`.
 
-    def _keep_nearby(self, found: list[Nearby], lefts: list[int]) -> None:
-        """Fill `candidate` [blocks * SECTORS, most * 2], `listed`, `block` (its block for each cell) and `near`.
-
-        `listed` says how many candidates the side that has more of them really has.
+        A block holds the candidates of one cell in all sectors; cells without candidates share block 0. The count is
+        that of the side with more candidates.
         """
         missing = self.slots - 1
         padding = np.array([[missing], [self.slots + missing]])
-        seen, blocks, nears = [padding * np.ones((SECTORS, 1, 1), dtype=np.int64)], [], []
+        candidates, blocks, nears = [padding * np.ones((SECTORS, 1, 1), dtype=np.int64)], [], []
         filled = 1
-        for (used, visible, near), left in zip(found, lefts, strict=True):
+        for track in tracks:
+            (used, visible, near), left = nearby_cones(track, dtype), len(track.left)
             blocks.append(np.where(used, filled + np.cumsum(used) - 1, 0))
             filled += int(used.sum())
-            places = np.where(visible < 0, missing, visible) + np.array([[0], [self.slots]])
-            seen.append(places.reshape(-1, 2, places.shape[-1]))
+            slots = np.where(visible < 0, missing, visible) + np.array([[0], [self.slots]])
+            candidates.append(slots.reshape(-1, 2, slots.shape[-1]))
             nears.append(np.where(near < 0, missing, np.where(near < left, near, near - left + self.slots)))
-        candidate = _stack(seen, padding)
+        candidate = _stack(candidates, padding)
         self.most = candidate.shape[-1]
-        self._keep("candidate", candidate.swapaxes(-1, -2).reshape(-1, 2 * self.most), torch.int16)
-        self._keep("listed", (candidate != padding).sum(-1).max(-1).reshape(-1), torch.int16)
-        self._keep("block", np.concatenate(blocks), torch.int64)
-        self._keep("near", _stack(nears, np.array([missing])), torch.int32)
+        self.candidate: Tensor = _buffer(candidate.swapaxes(-1, -2).reshape(-1, 2 * self.most), torch.int16)
+        self.candidate_count: Tensor = _buffer((candidate != padding).sum(-1).max(-1).reshape(-1), torch.int16)
+        self.block: Tensor = _buffer(np.concatenate(blocks), torch.int64)
+        self.near: Tensor = _buffer(_stack(nears, np.array([missing])), torch.int32)
 
-    def locate(self, track: Tensor, position: Tensor) -> Place:
-        """Look up where cars on these tracks [B] at these positions [2, B] m are.
-
-        A position off the map counts as the nearest one on it.
-        """
+    def locate(self, track: Tensor, position: Tensor) -> Location:
+        """Locate positions [2, B] m on tracks [B]; positions off the map are moved to its edge."""
         points = self.points.index_select(1, track).view(4, 2, -1)
         finish, low, last = points[0], points[1], points[2:]
         columns, offset = self.counts.index_select(1, track).view(2, 2, -1).unbind(0)
         at = (position - low).unsqueeze(0)
-        at = at / constant(self.edges, at)
+        at = at / constant((CELL, FIELD_CELL), at)
         corner = torch.minimum(at.floor().clamp_(min=0), last)
         column, row = corner.long().unbind(1)
         cell, node = torch.addcmul(offset + column, row, columns).unbind(0)
-        share = (at[1] - corner[1]).clamp_(0, 1)
+        fraction = (at[1] - corner[1]).clamp_(0, 1)
         nodes = torch.stack([node, node + columns[1]])
-        return Place(track.int(), position, finish, cell, nodes, share)
+        return Location(track.int(), position, finish, cell, nodes, fraction)
 
-    def candidates(self, place: Place, heading: Tensor) -> tuple[Tensor, Tensor]:
-        """The cones a car may see, never fewer than it does.
-
-        Args:
-            place: where cars are.
-            heading: [B], radians.
+    def candidates(self, location: Location, heading: Tensor) -> tuple[Tensor, Tensor]:
+        """Return a superset of the cones visible to cars with headings [B], in radians.
 
         Returns:
-            Slot of each candidate among its track's cones [N, 2, B] (left then right, rings padded to `slots`),
-            ascending, and its position [2, N, 2, B] in m; padding lies 10 km away.
+            Slot of each candidate among its track's cones [N, 2, B], ascending, the right side from `slots` on, and its
+            position [2, N, 2, B] in m; padding is 10 km away.
         """
         sector = (heading * constant(SECTORS / (2 * np.pi), heading)).floor_().remainder_(constant(SECTORS, heading))
-        row = torch.add(sector.long(), self.block.index_select(0, place.cell), alpha=SECTORS)
-        most = slots_in_use(self.listed.index_select(0, row), self.most)
-        slot = _cars_last(self.candidate.index_select(0, row)[:, : 2 * most]).view(most, 2, -1)
-        return slot, self._positions(place.track, slot)
+        row = torch.add(sector.long(), self.block.index_select(0, location.cell), alpha=SECTORS)
+        most = slots_in_use(self.candidate_count.index_select(0, row), self.most)
+        slot = _batch_last(self.candidate.index_select(0, row)[:, : 2 * most]).view(most, 2, -1)
+        return slot, self._positions(location.track, slot)
 
-    def to_boundaries(self, place: Place) -> Tensor:
-        """How far cars are from the left and the right boundary.
-
-        Returns:
-            [2, B] in m, at most 3.
-        """
-        nodes = place.nodes.unsqueeze(0)
-        # A node's two distances, and those of the node to its right, follow one another.
+    def to_boundaries(self, location: Location) -> Tensor:
+        """Return the distances to the left and the right boundary: [2, B] m, at most 3."""
+        nodes = location.nodes.unsqueeze(0)
+        # The two distances of a node are followed by those of the node to its right.
         index = torch.add(constant(range(4), nodes), nodes, alpha=2).flatten()
         left, right = self.field.index_select(0, index).view(2, 2, 2, -1).unbind(0)
-        low, high = torch.lerp(left, right, place.share[0]).unbind(1)
-        # Each side by itself: half-way between the two the nearer one changes, and no interpolation can follow that.
-        return torch.lerp(low, high, place.share[1])
+        low, high = torch.lerp(left, right, location.fraction[0]).unbind(1)
+        # The sides are interpolated separately, because the minimum of both has a kink in the middle of the track.
+        return torch.lerp(low, high, location.fraction[1])
 
-    def clearance(self, place: Place, to_boundaries: Tensor) -> Tensor:
-        """How far cars are from a crash: the nearer of cones and boundaries, less the distance that counts as one.
+    def clearance(self, location: Location, to_boundaries: Tensor) -> Tensor:
+        """Return the distance to a crash [B] in m; zero or less is a crash.
 
-        Args:
-            place: where cars are.
-            to_boundaries: [2, B] in m.
-
-        Returns:
-            [B] in m; zero or less is a crash. Exact up to 1 m, beyond that a cone may have been overlooked.
+        Exact up to 1 m; beyond that, cones may be missing from the table.
         """
-        cones = self._positions(place.track, _cars_last(self.near.index_select(0, place.cell)))
-        to_cone = (cones - place.position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
+        cones = self._positions(location.track, _batch_last(self.near.index_select(0, location.cell)))
+        to_cone = (cones - location.position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
         nearer = to_boundaries.amin(0)
-        return torch.minimum(
-            to_cone - constant(self.cone_radius, to_cone), nearer - constant(self.boundary_margin, nearer)
-        )
+        return torch.minimum(to_cone - constant(CONE_RADIUS, to_cone), nearer - constant(BOUNDARY_MARGIN, nearer))
 
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
         index = torch.add(slot, track, alpha=2 * self.slots).flatten()
         return self.cones.index_select(1, index).view(2, *slot.shape)
 
 
-def _cars_last(rows: Tensor) -> Tensor:
-    """Rows of small integers [B, N] as columns of int32 [N, B]."""
+class Grid:
+    """Square cells over the area of a track, numbered row by row from the corner `low` on, in columns and rows."""
+
+    def __init__(self, track: Track, cell: float, dtype: torch.dtype) -> None:
+        points = np.vstack([track.left, track.right, [track.start[:2]]])
+        low, high = points.min(axis=0) - MARGIN, points.max(axis=0) + MARGIN
+        self.cell, self.shape = cell, np.ceil((high - low) / cell).astype(np.int64) + 1
+        self.low = torch.as_tensor(low, dtype=dtype).double().numpy()
+
+    def nodes(self) -> NDArray[np.float64]:
+        """Return the lower left corners of the cells, [cells, 2] m."""
+        x, y = (low + self.cell * np.arange(count) for low, count in zip(self.low, self.shape, strict=True))
+        return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+# Cached, because programs build several envs with the same tracks and these functions dominate the time of building.
+@lru_cache(maxsize=64)
+def nearby_cones(track: Track, dtype: torch.dtype) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
+    """Return the relevant cones of each cell of a track, by number, ascending, then -1.
+
+    Returns:
+        Whether any cone may be visible, [cells]; the cones of the left and of the right side that may be visible,
+        [cells with any, SECTORS, 2, most]; and the cones that may decide the clearance, the right ones numbered after
+        the left ones, [cells, most].
+    """
+    centre = Grid(track, CELL, dtype).nodes() + CELL / 2
+    # The car is anywhere in its cell, its heading anywhere in its sector.
+    half_diagonal = CELL * np.sqrt(0.5)
+    heading = (np.arange(SECTORS) + 0.5) * 2 * np.pi / SECTORS
+    rings = (track.left, track.right)
+    visible = np.zeros((len(centre), SECTORS, 2, max(map(len, rings))), dtype=bool)
+    near = []
+    for side, ring in enumerate(rings):
+        offset = ring - centre[:, None]
+        distance = np.linalg.norm(offset, axis=-1)
+        near.append(distance <= CONE_RADIUS + EXACT + half_diagonal + 1e-3)
+        cell, cone = np.nonzero(distance <= SIGHT + half_diagonal + 1e-3)
+        offset, distance = offset[cell, cone], distance[cell, cone]
+        bearing = np.arctan2(offset[:, 1], offset[:, 0])[:, None] - heading
+        bearing = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
+        slack = np.arcsin(np.minimum(1, half_diagonal / np.maximum(distance, 1e-9)))[:, None]
+        ahead = (bearing <= HALF_FIELD_OF_VIEW + np.pi / SECTORS + slack + 1e-3) | (slack >= np.pi / 2)
+        visible[cell, :, side, cone] = ahead
+    used = np.asarray(visible.any(axis=(1, 2, 3)))
+    return used, _true_columns(visible[used]), _true_columns(np.concatenate(near, axis=1))
+
+
+@lru_cache(maxsize=64)
+def boundary_distances(track: Track, dtype: torch.dtype) -> NDArray[np.float64]:
+    """Return the distances of the grid nodes from the left and the right boundary: [nodes, 2] m, at most 3."""
+    nodes = Grid(track, FIELD_CELL, dtype).nodes()
+    # For points this dense along a line, a plain tree is twice as fast as a compact and balanced one.
+    trees = [cKDTree(track.boundary(side, 0.02), compact_nodes=False, balanced_tree=False) for side in SIDES]
+    distances = [tree.query(nodes, distance_upper_bound=MAX_DISTANCE, workers=-1)[0] for tree in trees]
+    return np.minimum(np.stack(distances, axis=1), MAX_DISTANCE)
+
+
+def _true_columns(mask: NDArray[np.bool_]) -> Numbers:
+    """Return the columns of the True entries of each row [..., N], ascending, padded with -1: [..., most]."""
+    counts = mask.sum(axis=-1)
+    columns = np.full((*mask.shape[:-1], max(1, int(counts.max()))), -1, dtype=np.int16)
+    *row, column = np.nonzero(mask)
+    first = np.cumsum(counts) - counts.ravel()
+    columns[(*row, np.arange(len(column)) - np.repeat(first, counts.ravel()))] = column
+    return columns
+
+
+def _buffer(values: NDArray[np.generic], dtype: torch.dtype) -> nn.Buffer:
+    return nn.Buffer(torch.as_tensor(np.ascontiguousarray(values), dtype=dtype), persistent=False)
+
+
+def _batch_last(rows: Tensor) -> Tensor:
+    """Transpose small integers [B, N] to int32 [N, B]."""
     return rows.t().to(torch.int32, memory_format=torch.contiguous_format)
 
 
 def _stack(tables: list[NDArray[np.int64]], padding: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Tables [rows, ..., most] of several tracks on one another, the narrower ones filled up with padding [..., 1]."""
+    """Concatenate tables [rows, ..., N], the narrower ones filled up with padding [..., 1]."""
     most = max(table.shape[-1] for table in tables)
     wide = [padding * np.ones((*table.shape[:-1], most), dtype=np.int64) for table in tables]
     for filled, table in zip(wide, tables, strict=True):

@@ -4,7 +4,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 
-from coil_rl.envs.seeded import SeededEnv
+from coil_rl.envs.cone_track import SeededEnv
 
 LIMIT = 500
 

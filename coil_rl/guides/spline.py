@@ -14,7 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
-from coil_rl.envs.sight import room_ahead
+from coil_rl.envs.sight import field_of_view_margin
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
 
@@ -127,7 +127,7 @@ class SplineGuide(TensorDictModuleBase):
         targets = slots_in_use(steps, self.targets - 1) + 1
         x, y = found = path.along((constant(range(targets), points[0]) / steps).clamp_(max=1))
         square = torch.addcmul(x * x, y, y)
-        room = torch.minimum(square - constant(TARGET_REACHED**2, square), room_ahead(x, square))
+        room = torch.minimum(square - constant(TARGET_REACHED**2, square), field_of_view_margin(x, square))
         # One midpoint is no path.
         room = torch.minimum(room, count - constant(2, count))
         return Plan(points, count, path, found, square, room.lt_(constant(0, room)))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from torch import Tensor
 
-from coil_rl.envs.track import AS_COMPLEX, Track, evenly
+from coil_rl.envs.track import AS_COMPLEX, Track, resample
 
 Array = NDArray[np.float64]
 
@@ -30,7 +30,7 @@ def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHIN
     Returns:
         [P, 2] m, a closed line in driving order from the first cones; the first point is not repeated.
     """
-    return np.asarray(gaussian_filter1d(evenly(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"))
+    return np.asarray(gaussian_filter1d(resample(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"))
 
 
 def curvature(line: Array) -> Array:

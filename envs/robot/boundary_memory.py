@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from coil_rl.envs.sight import SAMPLES, SIGHT, boundary_samples, encode
+from coil_rl.envs.sight import SAMPLES, SIGHT, encode
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 
 
@@ -83,7 +83,7 @@ class BoundaryMemory(nn.Module):
         Returns:
             The samples of the boundary [2, 5, 2, B] m, and which sides are valid [2, B].
         """
-        samples = boundary_samples(cones.permute(3, 2, 1, 0), count.t(), self.fit)
+        samples = self.fit(cones.permute(3, 2, 1, 0), count.t()).equidistant(SAMPLES)
         distance = samples.square().sum(0).sqrt()
         plausible = (distance >= self.nearest) & (distance <= self.sight * self.farthest)
         return samples, (count.t() >= 2) & plausible.all(0)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.envs.sight import Frame
-from coil_rl.envs.track import SIDES, Track, TrackError, evenly
+from coil_rl.envs.track import SIDES, Track, TrackError, resample
 
 Array = NDArray[np.float64]
 
@@ -122,7 +122,7 @@ def middle_line(track: Track, spacing: float) -> Array:
     """Points half-way between the boundaries of a track, evenly spaced, from the start on: [T, 2] m."""
     middle = track.middle(STEP)
     middle = np.roll(middle, -int(((middle - np.array(track.start[:2])) ** 2).sum(1).argmin()), axis=0)
-    return evenly(middle, spacing)
+    return resample(middle, spacing)
 
 
 def _centre_line() -> tuple[Array, Array]:
@@ -146,7 +146,7 @@ def _centre_line() -> tuple[Array, Array]:
 
 def _cones(ring: Array) -> Array:
     length = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum()
-    return evenly(ring, length / round(length / CONE_GAP))
+    return resample(ring, length / round(length / CONE_GAP))
 
 
 def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:

@@ -18,13 +18,21 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 
-from coil_rl.envs.reward import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
+from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.reward import (
+    HISTORY,
+    REWARD_TERMS,
+    Outcome,
+    RewardWeights,
+    check_weights,
+    recent_mean,
+    weighted_terms,
+)
 from coil_rl.envs.robot.boundary_memory import BoundaryMemory
 from coil_rl.envs.robot.cone_classifier import simulated_cone_classifier
 from coil_rl.envs.robot.course import RobotCourse, robot_track
 from coil_rl.envs.robot.lidar import SimulatedLidar, driven
 from coil_rl.envs.robot.perception import Perception
-from coil_rl.envs.seeded import SeededEnv
 from coil_rl.envs.sight import SAMPLES
 from coil_rl.envs.track import Track
 
@@ -50,7 +58,7 @@ class SimulatedRobotEnv(SeededEnv):
         lidar: None for an RPLIDAR A1M8; its turns a second are the control steps.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
         smoothing: lambda of the cubic smoothing spline, m^3.
-        reward: weights, see `Reward`.
+        reward: weights, see `RewardWeights`.
         laps: completed laps that end an episode.
         time_limit: s, then an episode is truncated.
         speed: m/s.
@@ -108,7 +116,7 @@ class SimulatedRobotEnv(SeededEnv):
             raise ValueError(f"assignment={assignment!r} must be one of random, cyclic")
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
-        check_weights("reward", reward or {}, Reward._fields)
+        check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_cars]))
         self.tracks = [robot_track()] if tracks is None else list(tracks)
         self.assignment = assignment
@@ -117,7 +125,7 @@ class SimulatedRobotEnv(SeededEnv):
         self.laps, self.max_steps = laps, round(time_limit * self.lidar.rate)
         self.step_length, self.car_length = speed / self.lidar.rate, car_length
         self.max_steering = math.radians(max_steering)
-        self.weights = {key: torch.tensor(float(x)) for key, x in Reward(**(reward or {}))._asdict().items()}
+        self.weights = {key: torch.tensor(float(x)) for key, x in RewardWeights(**(reward or {}))._asdict().items()}
         self.memory = BoundaryMemory(
             num_cars, spline, smoothing, sight=self.perception.range_max * self.perception.scale
         )
@@ -196,7 +204,7 @@ class SimulatedRobotEnv(SeededEnv):
         crashed = clearance <= 0
         nothing, alive = torch.zeros_like(action), (~crashed).float()
         outcome = Outcome(action, roughness, lap_time, finished, nothing, to_boundaries, crashed, alive)
-        terms = pay(outcome, self.weights)
+        terms = weighted_terms(outcome, self.weights)
         terminated = crashed | (self.lap >= self.laps)
         truncated = (self.steps >= self.max_steps) & ~terminated
         out = self._tensordict(seen, lap_time, crashed, clearance, roughness, terms)

@@ -24,7 +24,7 @@ def tracks() -> list[Track]:
 
 @pytest.fixture(scope="module")
 def rings(ring: Track) -> list[Track]:
-    """Three small tracks, whose maps are quick to make."""
+    """Three small tracks with maps that are fast to build."""
     return [Track(f"ring_{size}", size * ring.left, size * ring.right) for size in (1.0, 1.1, 1.2)]
 
 
@@ -35,7 +35,7 @@ def no_gradients() -> Iterator[None]:
 
 
 def steering(steps: int, cars: int, seed: int) -> Tensor:
-    """Smooth random actions [steps, cars, 1], calm for the first cars and wild for the last."""
+    """Smooth random actions [steps, cars, 1], small for the first cars and large for the last."""
     draw = torch.Generator().manual_seed(seed)
     actions = [torch.zeros(cars, 1)]
     for _ in range(steps):
@@ -45,7 +45,7 @@ def steering(steps: int, cars: int, seed: int) -> Tensor:
 
 
 def advance(env: ConeTrackEnv, state: TensorDictBase, action: Tensor) -> tuple[TensorDictBase, TensorDictBase]:
-    """One step, and a reset of the cars whose episode ended: what the step emitted and the state to go on from."""
+    """Step and reset finished cars; return the output of the step and the next state."""
     state["action"] = action.to(env.dtype_)
     emitted, state = env.step_and_maybe_reset(state)
     return emitted["next"], state
@@ -67,11 +67,11 @@ def buffers(env: ConeTrackEnv) -> dict[str, Tensor]:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("assignment", ["random", "cyclic"])
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
-def test_specs_hold(rings: list[Track], preset: dict, assignment: str, dtype: torch.dtype) -> None:
+def test_specs_match_the_data(rings: list[Track], preset: dict, assignment: str, dtype: torch.dtype) -> None:
     check_env_specs(ConeTrackEnv(rings, 3, assignment=assignment, dtype=dtype, **preset))
 
 
-def test_everything_emitted_lies_within_its_spec(rings: list[Track]) -> None:
+def test_outputs_are_within_their_specs(rings: list[Track]) -> None:
     env = ConeTrackEnv(rings, 64)
     state = env.reset()
     assert env.observation_spec.is_in(state.select(*env.observation_spec.keys()))
@@ -81,14 +81,14 @@ def test_everything_emitted_lies_within_its_spec(rings: list[Track]) -> None:
         assert emitted["cones"].square().sum(-1).max() <= 49 + 1e-4
 
 
-def test_a_car_of_thousands_drives_as_if_alone(tracks: list[Track]) -> None:
+def test_env_is_batch_invariant(tracks: list[Track]) -> None:
     cars, chosen = 4096, (1731, 4095)
     env = ConeTrackEnv(tracks, cars, assignment="cyclic")
     actions = steering(150, cars, seed=3)
     state = env.reset()
     for action in actions[:50]:
         _, state = advance(env, state, action)
-    # A fresh env of one car is on the first track, where every third car of the batch is, too.
+    # A new env of one car is on the first track, like the chosen cars of the batch.
     alone = {car: ConeTrackEnv(tracks, 1, assignment="cyclic") for car in chosen}
     states = {}
     for car, single in alone.items():
@@ -110,15 +110,15 @@ def test_a_car_of_thousands_drives_as_if_alone(tracks: list[Track]) -> None:
         )
 
 
-def test_without_info_the_rest_is_the_same(tracks: list[Track]) -> None:
-    whole, bare = ConeTrackEnv(tracks, 8), ConeTrackEnv(tracks, 8, info=False)
+def test_info_does_not_change_the_other_outputs(tracks: list[Track]) -> None:
+    full, bare = ConeTrackEnv(tracks, 8), ConeTrackEnv(tracks, 8, info=False)
     check_env_specs(bare)
-    whole.set_seed(3)
+    full.set_seed(3)
     bare.set_seed(3)
-    states = [whole.reset(), bare.reset()]
+    states = [full.reset(), bare.reset()]
     for action in steering(60, 8, seed=3):
         emitted = []
-        for i, env in enumerate((whole, bare)):
+        for i, env in enumerate((full, bare)):
             after, states[i] = advance(env, states[i], action)
             emitted.append(after)
         assert "info" not in emitted[1]
@@ -126,7 +126,7 @@ def test_without_info_the_rest_is_the_same(tracks: list[Track]) -> None:
 
 
 @pytest.mark.parametrize("assignment", ["random", "cyclic"])
-def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track], assignment: str) -> None:
+def test_partial_reset_changes_only_the_masked_cars(rings: list[Track], assignment: str) -> None:
     env = ConeTrackEnv(rings, 12, assignment=assignment)
     state = env.reset()
     for action in steering(20, 12, seed=4):
@@ -139,12 +139,12 @@ def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track], assig
     for name, value in before.items():
         assert torch.equal(after[name][..., ~mask], value[..., ~mask]), name
     assert torch.equal(env.pose[:, mask], env.map.starts[:, env.track[mask]])
-    for name in ("history", "steps", "lap", "on_line"):
+    for name in ("history", "steps", "lap", "in_finish"):
         assert not after[name][..., mask].any(), name
     assert fresh["observation"][mask].ne(state["observation"][mask]).any(dim=-1).all()
 
 
-def test_a_car_that_goes_on_keeps_what_it_saw_when_others_are_reset(tracks: list[Track]) -> None:
+def test_partial_reset_keeps_the_observations_of_other_cars(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 64)
     state = env.reset()
     for action in steering(150, 64, seed=5):
@@ -156,37 +156,32 @@ def test_a_car_that_goes_on_keeps_what_it_saw_when_others_are_reset(tracks: list
         assert not state["done"].any()
 
 
-def visited(env: ConeTrackEnv) -> Tensor:
+def drawn_tracks(env: ConeTrackEnv) -> Tensor:
     return torch.cat([env.reset()["info", "track"] for _ in range(5)])
 
 
-def test_a_seed_fixes_the_tracks(rings: list[Track]) -> None:
-    seen = visited(ConeTrackEnv(rings, 20, seed=7))
-    assert torch.equal(visited(ConeTrackEnv(rings, 20, seed=7)), seen)
-    assert not torch.equal(visited(ConeTrackEnv(rings, 20, seed=8)), seen)
-    assert seen.unique().tolist() == [0, 1, 2]
-    env = ConeTrackEnv(rings, 20, seed=8)
-    env.set_seed(7)
-    assert torch.equal(visited(env), seen)
-
-
-def test_the_global_seed_does_not_matter(rings: list[Track]) -> None:
+def test_seed_determines_the_tracks_without_the_global_random_state(rings: list[Track]) -> None:
     torch.manual_seed(1)
-    seen = visited(ConeTrackEnv(rings, 20, seed=7))
+    tracks = drawn_tracks(ConeTrackEnv(rings, 20, seed=7))
     torch.manual_seed(2)
     state = torch.get_rng_state()
-    assert torch.equal(visited(ConeTrackEnv(rings, 20, seed=7)), seen)
+    assert torch.equal(drawn_tracks(ConeTrackEnv(rings, 20, seed=7)), tracks)
     assert torch.equal(torch.get_rng_state(), state)
+    assert not torch.equal(drawn_tracks(ConeTrackEnv(rings, 20, seed=8)), tracks)
+    assert tracks.unique().tolist() == [0, 1, 2]
+    env = ConeTrackEnv(rings, 20, seed=8)
+    env.set_seed(7)
+    assert torch.equal(drawn_tracks(env), tracks)
 
 
-def test_cyclic_assignment_keeps_every_car_on_its_track(rings: list[Track]) -> None:
+def test_cyclic_assignment_keeps_cars_on_their_tracks(rings: list[Track]) -> None:
     env = ConeTrackEnv(rings, 7, assignment="cyclic")
     for _ in range(3):
         assert env.reset()["info", "track"].flatten().tolist() == [0, 1, 2, 0, 1, 2, 0]
 
 
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
-def test_a_restored_env_goes_on_bit_for_bit(tracks: list[Track], preset: dict) -> None:
+def test_restored_env_continues_bit_for_bit(tracks: list[Track], preset: dict) -> None:
     env = ConeTrackEnv(tracks, 16, seed=3, **preset)
     actions = steering(280, 16, seed=6)
     state = env.reset()
@@ -197,7 +192,7 @@ def test_a_restored_env_goes_on_bit_for_bit(tracks: list[Track], preset: dict) -
     for action in actions[100:]:
         emitted, state = advance(env, state, action)
         trace.append((emitted, state.clone()))
-    # Future tracks count as state, so episodes have to end on the way.
+    # The draws of future tracks are part of the state, so some episodes have to end.
     assert sum(int(emitted["done"].sum()) for emitted, _ in trace) > 10
 
     restored = ConeTrackEnv(tracks, 16, seed=99, **preset)
@@ -208,7 +203,7 @@ def test_a_restored_env_goes_on_bit_for_bit(tracks: list[Track], preset: dict) -
         assert same(saved_state, after)
 
 
-def test_time_runs_out_as_truncation(rings: list[Track]) -> None:
+def test_time_limit_truncates(rings: list[Track]) -> None:
     env = ConeTrackEnv(rings, 4, time_limit=0.5)
     rollout = env.rollout(20, SplineGuide(), break_when_any_done=True)["next"]
     assert rollout.shape == (4, 12)
@@ -218,7 +213,7 @@ def test_time_runs_out_as_truncation(rings: list[Track]) -> None:
     assert not rollout["terminated"].any()
 
 
-def test_a_crash_costs_its_price_and_nothing_else(tracks: list[Track]) -> None:
+def test_crash_replaces_all_other_reward_terms(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 32)
     state = env.reset()
     crashes = 0
@@ -237,7 +232,7 @@ def test_a_crash_costs_its_price_and_nothing_else(tracks: list[Track]) -> None:
     assert crashes > 10
 
 
-def test_the_reward_is_the_sum_of_its_terms(ring: Track) -> None:
+def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
     weights = {"finish": 3.0, "second": -0.1, "cone": 0.5, "smooth": -7.0, "alive": 0.25, "crash": -9.0}
     env = ConeTrackEnv([ring], 8, rate=12, laps=1, reward=weights)
     guide = SplineGuide()
@@ -245,19 +240,18 @@ def test_the_reward_is_the_sum_of_its_terms(ring: Track) -> None:
     finished = 0
     for action in steering(240, 8, seed=8):
         emitted, state = advance(env, state, guide(state)["action"] + 0.2 * action)
-        terms = emitted["info", "reward"]
-        assert torch.allclose(emitted["reward"], sum(terms[term] for term in REWARD_TERMS), rtol=0, atol=1e-6)
-        kept = ~emitted["info", "crashed"]
+        terms, alive = emitted["info", "reward"], ~emitted["info", "crashed"]
         lap_time = emitted["info", "lap_time"]
-        assert torch.allclose(terms["smooth"], -7 * emitted["info", "smoothness"] * kept, rtol=0, atol=1e-6)
-        assert torch.allclose(terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * kept, rtol=0, atol=1e-5)
-        assert torch.equal(terms["alive"], 0.25 * kept)
-        assert torch.equal(terms["crash"], -9.0 * ~kept)
+        assert torch.allclose(emitted["reward"], sum(terms[term] for term in REWARD_TERMS), rtol=0, atol=1e-6)
+        assert torch.allclose(terms["smooth"], -7 * emitted["info", "smoothness"] * alive, rtol=0, atol=1e-6)
+        assert torch.allclose(terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * alive, rtol=0, atol=1e-5)
+        assert torch.equal(terms["alive"], 0.25 * alive)
+        assert torch.equal(terms["crash"], -9.0 * ~alive)
         finished += int((lap_time > 0).sum())
     assert finished > 0
 
 
-def test_held_steps_keep_the_wheel_straight(rings: list[Track]) -> None:
+def test_held_steps_keep_the_steering_at_zero(rings: list[Track]) -> None:
     env = ConeTrackEnv(rings, 3, held_steps=2)
     state = env.reset()
     heading = state["info", "pose"][:, 2]
@@ -270,8 +264,8 @@ def test_held_steps_keep_the_wheel_straight(rings: list[Track]) -> None:
         state = env.step_mdp(state)
 
 
-def lap_after_lap(track: Track, weave: float = 0.0, **kwargs: Any) -> TensorDictBase:
-    """One car behind the guide that swings its nose, until its episode ends: [steps, ...]."""
+def drive_episode(track: Track, weave: float = 0.0, **kwargs: Any) -> TensorDictBase:
+    """Drive one car by the guide, weaving, until its episode ends: [steps, ...]."""
     env = ConeTrackEnv([track], 1, rate=12, **kwargs)
     guide = SplineGuide()
 
@@ -284,33 +278,33 @@ def lap_after_lap(track: Track, weave: float = 0.0, **kwargs: Any) -> TensorDict
 
 
 def test_an_episode_ends_after_its_laps(ring: Track) -> None:
-    episode = lap_after_lap(ring, laps=1)
+    episode = drive_episode(ring, laps=1)
     assert episode["terminated"][-1]
     assert not episode["truncated"][-1]
     assert not episode["info", "crashed"].any()
     assert episode["info", "lap"].flatten().tolist() == [0] * (len(episode) - 1) + [1]
     times = episode["info", "lap_time"]
     assert times[:-1].eq(0).all()
-    # The first entry of the finish area, not the start, starts the clock.
+    # Lap time counts from the first entry of the finish circle instead of the start.
     assert 0.9 * ring.length / 2 < times[-1].item() < len(episode) / 12
 
 
-def test_a_cone_is_paid_once_a_lap_on_first_sighting_and_again_on_every_sighting(ring: Track) -> None:
+def test_cone_bonus_is_paid_once_a_lap_or_at_every_sighting(ring: Track) -> None:
     cones = len(ring.left) + len(ring.right)
-    once = lap_after_lap(ring, 0.5, cone_bonus="first_sighting")
-    again = lap_after_lap(ring, 0.5, cone_bonus="every_sighting", laps=1)
+    once = drive_episode(ring, 0.5, cone_bonus="first_sighting")
+    again = drive_episode(ring, 0.5, cone_bonus="every_sighting", laps=1)
     assert torch.equal(once["info", "pose"][: len(again)], again["info", "pose"])
     assert once["info", "lap"][-1] == 2
     paid = [episode["info", "reward", "cone"] / 2.5 for episode in (once, again)]
     assert all(set(sightings.flatten().tolist()) <= {0, 1, 2} for sightings in paid)
-    # The cones ahead are new again in the step that completes a lap.
+    # The visible cones are new again in the step that completes a lap.
     first_lap = once["info", "lap"] == 0
     assert cones / 2 < paid[0][first_lap].sum() <= cones
     assert paid[0][~first_lap].sum() <= cones + 2
     assert paid[1].sum() > paid[0][: len(again)].sum()
 
 
-def test_what_was_emitted_never_changes(tracks: list[Track]) -> None:
+def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 24)
     state = env.reset()
     kept = [(state, state.clone())]
@@ -329,25 +323,23 @@ def assert_finite(data: TensorDictBase) -> None:
         assert value.isfinite().all(), key
 
 
-def assert_all_finite_under_random_steering(steps: int, **kwargs: Any) -> None:
-    env = ConeTrackEnv(shipped_tracks("train"), 256, **kwargs)
+@pytest.mark.parametrize(
+    ("steps", "preset"),
+    [
+        (150, {}),
+        pytest.param(2000, {}, marks=pytest.mark.slow, id="long-paper"),
+        pytest.param(2000, AUTHORS, marks=pytest.mark.slow, id="long-authors"),
+    ],
+)
+def test_outputs_are_finite_under_random_steering(steps: int, preset: dict) -> None:
+    env = ConeTrackEnv(shipped_tracks("train"), 256, **preset)
     state = env.reset()
     for action in steering(steps, 256, seed=10):
         emitted, state = advance(env, state, action)
         assert_finite(emitted)
 
 
-def test_everything_stays_finite_under_random_steering() -> None:
-    assert_all_finite_under_random_steering(150)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
-def test_everything_stays_finite_under_long_random_steering(preset: dict) -> None:
-    assert_all_finite_under_random_steering(2000, **preset)
-
-
-def test_everything_stays_finite_far_off_the_track(tracks: list[Track]) -> None:
+def test_outputs_are_finite_far_off_the_track(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 16)
     state = env.reset()
     for action in steering(400, 16, seed=11):
@@ -377,19 +369,15 @@ def test_everything_stays_finite_far_off_the_track(tracks: list[Track]) -> None:
         ({"reward": {"finish": 1e300}}, "reward.finish=1e[+]300 must be between -1e6 and 1e6"),
         ({"reward": {"cone": 1.0, "speed": 1.0}}, r"reward has no weight \['speed'\]; it has finish, second, crash"),
         ({"smoothing": -0.1}, "smoothing=-0.1 must be"),
+        ({"tracks": []}, "at least one track"),
     ],
 )
-def test_wrong_values_are_named(rings: list[Track], wrong: dict, message: str) -> None:
+def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ConeTrackEnv(rings, **({"num_cars": 2} | wrong))
+        ConeTrackEnv(**({"tracks": rings, "num_cars": 2} | wrong))
 
 
-def test_an_env_without_tracks_is_refused() -> None:
-    with pytest.raises(ValueError, match="at least one track"):
-        ConeTrackEnv([])
-
-
-def test_actions_beyond_the_limits_count_as_the_limit(rings: list[Track]) -> None:
+def test_actions_are_clamped(rings: list[Track]) -> None:
     wild, tame = (ConeTrackEnv(rings, 4, assignment="cyclic") for _ in range(2))
     states = [wild.reset(), tame.reset()]
     for value in ([[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]):
@@ -401,8 +389,8 @@ def test_actions_beyond_the_limits_count_as_the_limit(rings: list[Track]) -> Non
         states = [env.step_mdp(state) for env, state in zip((wild, tame), states, strict=True)]
 
 
-def test_few_kept_cones_change_nothing_but_the_room(rings: list[Track]) -> None:
-    # Sixteen a side are more than a car ever sees on such a track.
+def test_number_of_kept_cones_changes_only_the_padding(rings: list[Track]) -> None:
+    # On these tracks a car never sees sixteen cones of a side.
     few, many = (ConeTrackEnv(rings, 8, kept_cones=kept, assignment="cyclic") for kept in (16, 30))
     states = [few.reset(), many.reset()]
     for action in steering(60, 8, seed=12):
@@ -416,13 +404,12 @@ def test_few_kept_cones_change_nothing_but_the_room(rings: list[Track]) -> None:
 
 
 @pytest.mark.slow
-def test_a_hundred_million_random_steps_stay_finite_in_the_same_memory() -> None:
+def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
     cars = 16_384
     env = ConeTrackEnv(shipped_tracks("all"), cars)
     draw = torch.Generator().manual_seed(0)
     state, driven, resident = env.reset(), 0, []
     while driven < 100_000_000:
-        # What a car was told before decides where it drives, so the steering wanders instead of trembling.
         noise = torch.randn(cars, 1, generator=draw)
         state["action"] = (0.9 * state["steering"] + 0.3 * noise).clamp(-1, 1)
         step, state = env.step_and_maybe_reset(state)
@@ -434,7 +421,7 @@ def test_a_hundred_million_random_steps_stay_finite_in_the_same_memory() -> None
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_env_runs_on_a_gpu(tracks: list[Track]) -> None:
+def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
     envs = [ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")]
     check_env_specs(envs[1])
     states = [env.reset() for env in envs]

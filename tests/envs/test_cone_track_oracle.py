@@ -1,4 +1,4 @@
-"""The batched env against the oracle, an implementation of the same page that shares no code with it."""
+"""Comparison of the batched env with the oracle, an independent implementation."""
 
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -28,19 +28,17 @@ PRESETS = {
         {"spline": "quadratic", "gain": 80 / 120},
     ),
 }
-# Fewer steps to the lap.
 HALF_RATE = Preset({"rate": 12.0}, {})
 LAP = Preset(PRESETS["authors"].env | {"laps": 1, "rate": 20.0}, PRESETS["authors"].guide)
-# Level, reward and lap time in s that the authors' own program earned with its guide (shared/tracks/README.md).
+# Level, reward and lap time in s of the authors' program with its guide (shared/tracks/README.md).
 AUTHORS = [("MAP_1", 835.4, 69.58), ("MAP_2", 776.7, 63.55), ("MAP_3", 536.1, 41.13)]
 
-# Summation orders differ; a float64 trajectory of 9,000 steps stays within 1e-13 of the oracle's.
+# Summation orders differ; float64 trajectories of 9,000 steps agree within 1e-13.
 CLOSE = 1e-6
 # The env interpolates the distance to a boundary on a grid of 10 cm.
 FIELD = 3e-3
-# Where two midpoints coincide the oracle has one point of weight two, and the env two points that its floor on chord
-# lengths, 6 um or a little more, holds apart. A tridiagonal solve loses as many digits there as the gap is small; the
-# parabola loses none, and moves by some of that floor.
+# The oracle merges coincident midpoints to one point of weight two; the env keeps two points that its floor on chord
+# lengths, about 6 um, separates. The tridiagonal solve loses precision there, the parabola moves by some of the floor.
 COINCIDENT = {"cubic": 1e-3, "quadratic": 5e-5}
 
 
@@ -53,7 +51,7 @@ def drive(
     seed: int = 0,
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Array]:
-    """One episode per track, all at once: what was emitted, [steps, cars, ...] each, until the last one ends."""
+    """Drive one episode per track in one batch; return the outputs, [steps, cars, ...] each."""
     env = ConeTrackEnv(tracks, len(tracks), assignment="cyclic", dtype=dtype, **preset.env)
     guide = SplineGuide(**preset.guide)
     rng = np.random.default_rng(seed)
@@ -81,7 +79,7 @@ def drive(
 
 
 def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[float, float, Outcome]]:
-    """The oracle under the same actions: its guide's advice, the smallest gap between midpoints, and the outcome."""
+    """Yield the oracle's advice, its smallest gap between midpoints and its outcome under the same actions."""
     car = OneCar(track.left, track.right, track.start, **preset.env)
     for action in actions:
         cones = car.cones()
@@ -94,30 +92,33 @@ def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[floa
 
 
 def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> Outcome:
-    """Compare one car's episode, trace [steps, ...], with the oracle's; returns how it ended there."""
+    """Compare one car's episode, trace [steps, ...], with the oracle's; return the oracle's last outcome."""
     advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
-    said = {key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in Outcome._fields if key != "terms"}
-    said |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in REWARD_TERMS}
-    said["reward"] = np.array([outcome.reward for outcome in outcomes])
+    expected = {
+        key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in Outcome._fields if key != "terms"
+    }
+    expected |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in REWARD_TERMS}
+    expected["reward"] = np.array([outcome.reward for outcome in outcomes])
 
-    # A car that comes as close to a crash as the field is coarse may crash in one of the two and not in the other;
-    # from there on they have nothing in common.
+    # Within the error of the distance field, a car may crash in one of the two only; later steps are not compared.
     together = len(outcomes)
-    for k in np.flatnonzero(trace["crashed"][:together, 0] != said["crashed"])[:1]:
-        assert abs(said["clearance"][k]) < FIELD, f"step {k}: one crashes, {said['clearance'][k]} m from a crash"
+    for k in np.flatnonzero(trace["crashed"][:together, 0] != expected["crashed"])[:1]:
+        assert abs(expected["clearance"][k]) < FIELD, (
+            f"step {k}: one crashes, {expected['clearance'][k]} m from a crash"
+        )
         together = k
     ours = {key: value[:together, 0] if key != "observation" else value[:together] for key, value in trace.items()}
-    said = {key: value[:together] for key, value in said.items()}
+    expected = {key: value[:together] for key, value in expected.items()}
 
     tolerance = np.where(np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE)[:together]
     difference = np.abs(ours["advice"] - np.array(advice)[:together])
     assert (difference <= tolerance).all(), f"advice differs by {difference.max()} at step {difference.argmax()}"
     for key in ("observation", "reward", "lap_time", "smoothness", *REWARD_TERMS):
-        np.testing.assert_allclose(ours[key], said[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}")
+        np.testing.assert_allclose(ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}")
     for key in ("lap", "crashed", "terminated", "truncated"):
-        np.testing.assert_array_equal(ours[key], said[key], err_msg=f"{key}, track {track.name}")
-    near = said["clearance"] < 1
-    np.testing.assert_allclose(ours["clearance"][near], said["clearance"][near], rtol=0, atol=FIELD)
+        np.testing.assert_array_equal(ours[key], expected[key], err_msg=f"{key}, track {track.name}")
+    near = expected["clearance"] < 1
+    np.testing.assert_allclose(ours["clearance"][near], expected["clearance"][near], rtol=0, atol=FIELD)
     held = np.where(np.arange(together) < preset.env.get("held_steps", 0), 0, ours["action"])
     np.testing.assert_array_equal(ours["steering"], held)
     return outcomes[-1]
@@ -144,7 +145,7 @@ def third_level(levels: list[Track]) -> dict[str, Array]:
     return drive(levels[2:], LAP, "guide", 1000)
 
 
-def test_guide_drives_the_shipped_tracks_without_a_crash(shipped: dict[str, Array]) -> None:
+def test_guide_drives_the_shipped_tracks_without_crashing(shipped: dict[str, Array]) -> None:
     assert not shipped["crashed"].any()
     assert (shipped["lap"].max(axis=0) >= 1).all()
     assert (shipped["lap"].max(axis=0) == 2).any()
@@ -161,22 +162,22 @@ def test_env_agrees_with_the_oracle_on_an_authors_level(levels: list[Track], thi
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["random", "disturbed"])
-def test_env_agrees_with_the_oracle_on_any_steering(preset: str, driver: str) -> None:
+def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: str) -> None:
     tracks = random_tracks(2, seed=5) * (2 if driver == "random" else 1)
     trace = drive(tracks, PRESETS[preset], driver, 150, seed=1)
     for car, track in enumerate(tracks):
         assert_agreement(track, PRESETS[preset], column(trace, car))
 
 
-def test_coincident_midpoints_cost_the_guide_little(levels: list[Track]) -> None:
-    # The authors' cones lie on a grid, so that different pairs have the same midpoint.
+def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Track]) -> None:
+    # The authors' cones are on a grid, so different pairs have the same midpoint.
     trace = drive(levels[:1], PRESETS["paper"], "guide", 60)
     assert min(gap for _, gap, _ in retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0])) < 1e-9
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 
-def race_alone(track: Track, **kwargs: Any) -> tuple[float, Outcome]:
-    """The oracle with its own guide: total reward of an episode and how it ended."""
+def oracle_episode(track: Track, **kwargs: Any) -> tuple[float, Outcome]:
+    """Drive the oracle by its own guide; return the total reward and the last outcome."""
     car = OneCar(track.left, track.right, track.start, **kwargs)
     total = 0.0
     while True:
@@ -186,22 +187,22 @@ def race_alone(track: Track, **kwargs: Any) -> tuple[float, Outcome]:
             return total, outcome
 
 
-def assert_float32_earns_the_same(tracks: list[Track], laps: int, **kwargs: Any) -> None:
+def assert_float32_agrees(tracks: list[Track], laps: int, **kwargs: Any) -> None:
     trace = drive(tracks, Preset({"laps": laps, **kwargs}, {}), "guide", 5000, dtype=torch.float32)
     for car, track in enumerate(tracks):
-        total, outcome = race_alone(track, laps=laps, **kwargs)
+        total, outcome = oracle_episode(track, laps=laps, **kwargs)
         end = int(trace["terminated"][:, car, 0].argmax())
         assert trace["lap"][end, car, 0] == outcome.lap == laps
         assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(total, rel=1e-3)
 
 
-def test_float32_earns_what_the_oracle_earns(ring: Track) -> None:
-    assert_float32_earns_the_same([ring], laps=1, rate=12)
+def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
+    assert_float32_agrees([ring], laps=1, rate=12)
 
 
 @pytest.mark.slow
-def test_float32_earns_what_the_oracle_earns_on_all_test_tracks() -> None:
-    assert_float32_earns_the_same(shipped_tracks("test"), laps=2)
+def test_float32_reward_agrees_with_the_oracle_on_all_test_tracks() -> None:
+    assert_float32_agrees(shipped_tracks("test"), laps=2)
 
 
 def assert_fidelity(trace: dict[str, Array], car: int, reward: float, lap_time: float, within: float = 0.03) -> None:
@@ -211,14 +212,14 @@ def assert_fidelity(trace: dict[str, Array], car: int, reward: float, lap_time: 
     assert lap_times(trace, car)[:2] == pytest.approx(lap_time, rel=0.01)
 
 
-def test_authors_preset_earns_what_their_program_earns(third_level: dict[str, Array]) -> None:
+def test_authors_preset_earns_the_reward_of_their_program(third_level: dict[str, Array]) -> None:
     _, reward, lap_time = AUTHORS[2]
-    # Theirs is of two laps. At a third of the rate sightings are paid a little differently.
+    # The reward is of two laps. At a third of the rate, cone bonuses differ slightly.
     assert_fidelity(third_level, 0, reward / 2, lap_time, within=0.06)
 
 
 @pytest.mark.slow
-def test_authors_preset_earns_what_their_program_earns_on_all_levels(levels: list[Track]) -> None:
+def test_authors_preset_earns_the_reward_of_their_program_on_all_levels(levels: list[Track]) -> None:
     trace = drive(levels, PRESETS["authors"], "guide", 10_000, dtype=torch.float32)
     for car, (_, reward, lap_time) in enumerate(AUTHORS):
         assert_fidelity(trace, car, reward, lap_time)

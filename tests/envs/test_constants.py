@@ -3,7 +3,7 @@ import torch
 from coil_rl.envs.constants import constant, flat_index
 
 
-def test_a_constant_is_made_once_for_each_type_and_number_of_dimensions() -> None:
+def test_constants_are_cached_by_type_and_number_of_dimensions() -> None:
     flat, deep = torch.zeros(3), torch.zeros(4, 2, 5)
     assert constant(0.1, flat) is constant(0.1, flat)
     assert constant(range(4), deep).shape == (4, 1, 1)
@@ -13,7 +13,7 @@ def test_a_constant_is_made_once_for_each_type_and_number_of_dimensions() -> Non
     assert constant(range(4), deep, torch.int32).dtype == torch.int32
 
 
-def test_a_constant_made_in_inference_mode_can_be_differentiated_with() -> None:
+def test_constants_created_in_inference_mode_support_autograd() -> None:
     with torch.inference_mode():
         constant(0.123, torch.zeros(2))
     leaf = torch.ones(2, requires_grad=True)
@@ -21,9 +21,9 @@ def test_a_constant_made_in_inference_mode_can_be_differentiated_with() -> None:
     assert torch.allclose(leaf.grad, torch.full((2,), 2 * 0.123**2))
 
 
-def test_rows_become_places_in_the_flattened_tensor() -> None:
+def test_flat_index_selects_what_gather_selects() -> None:
     draw = torch.Generator().manual_seed(0)
     values = torch.randn(6, 2, 5, generator=draw)
-    place = torch.randint(6, (3, 2, 5), generator=draw)
-    found = values.flatten().index_select(0, flat_index(place)).view(3, 2, 5)
-    assert torch.equal(found, values.gather(0, place))
+    rows = torch.randint(6, (3, 2, 5), generator=draw)
+    selected = values.flatten().index_select(0, flat_index(rows)).view(3, 2, 5)
+    assert torch.equal(selected, values.gather(0, rows))

@@ -32,8 +32,8 @@ def no_gradients() -> Iterator[None]:
         yield
 
 
-def driven(env: ConeTrackEnv, steps: int, state: TensorDictBase | None = None, seed: int = 1) -> list[TensorDictBase]:
-    """What each step emitted under smooth random steering; episodes that end begin again."""
+def drive(env: ConeTrackEnv, steps: int, state: TensorDictBase | None = None, seed: int = 1) -> list[TensorDictBase]:
+    """Return the output of each step under smooth random steering, with resets."""
     draw = torch.Generator().manual_seed(seed)
     state = env.reset() if state is None else state
     emitted = []
@@ -50,24 +50,24 @@ def same(a: TensorDictBase, b: TensorDictBase) -> bool:
     return ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
 
 
-def one_step(ring: Track, place: float, action: float, **kwargs: Any) -> TensorDictBase:
-    """A step that ends at this place across a round track, 1 at the left boundary; [1, ...]."""
+def one_step(ring: Track, position: float, action: float, **kwargs: Any) -> TensorDictBase:
+    """Drive one step to this lateral position on a round track, 1 at the left boundary; [1, ...]."""
     env = DrivingTasksEnv([ring], 1, tasks=TASKS, **kwargs)
     state = env.reset()
     length = env.speed / env.rate
-    env.pose = torch.tensor([[5.0 - 1.3 * place], [-length], [math.pi / 2]])
+    env.pose = torch.tensor([[5.0 - 1.3 * position], [-length], [math.pi / 2]])
     state["action"] = torch.tensor([[action]])
     after: TensorDictBase = env.step(state)["next"]
     return after
 
 
 @pytest.mark.parametrize("kwargs", [{}, {"only": "left"}, {"info": False}, {"dtype": torch.float64}])
-def test_the_contract_of_envs_holds(rings: list[Track], kwargs: dict[str, Any]) -> None:
+def test_env_contract_holds(rings: list[Track], kwargs: dict[str, Any]) -> None:
     check_env(DrivingTasksEnv(rings, 3, tasks=TASKS, duration=0.2, **kwargs))
 
 
 @pytest.mark.parametrize(
-    ("task", "term", "paid"),
+    ("task", "term", "reward"),
     [
         ("centred", "centre", -0.5),
         ("corners", "inside", -3 * 0.5 * 0.2),
@@ -75,17 +75,17 @@ def test_the_contract_of_envs_holds(rings: list[Track], kwargs: dict[str, Any]) 
         ("smooth", "left", 0),
     ],
 )
-def test_a_place_right_of_the_middle_is_paid_as_the_task_says(ring: Track, task: str, term: str, paid: float) -> None:
+def test_lateral_position_is_rewarded_by_the_task(ring: Track, task: str, term: str, reward: float) -> None:
     after = one_step(ring, -0.5, 0.2, only=task)
     # The boundaries are splines through cones, nearly circles.
-    assert after["info", "reward", term].item() == pytest.approx(paid, abs=0.01)
+    assert after["info", "reward", term].item() == pytest.approx(reward, abs=0.01)
     assert after["info", "task", task].item()
     assert sum(entry.item() for entry in after["info", "task"].values()) == 1
 
 
-def test_only_the_weights_that_a_task_names_are_its_own(ring: Track) -> None:
-    usual = {"alive": 0.5, "left": 0.1, "cone": 0.0}
-    rewards = {task: one_step(ring, 0.4, 0.2, only=task, reward=usual)["info", "reward"] for task in TASKS}
+def test_tasks_override_only_the_weights_they_set(ring: Track) -> None:
+    common = {"alive": 0.5, "left": 0.1, "cone": 0.0}
+    rewards = {task: one_step(ring, 0.4, 0.2, only=task, reward=common)["info", "reward"] for task in TASKS}
     assert {task: reward["alive"].item() for task, reward in rewards.items()} == {
         "centred": 0.5, "corners": 0.5, "left": 0.25, "smooth": 0.5,
     }  # fmt: skip
@@ -94,25 +94,25 @@ def test_only_the_weights_that_a_task_names_are_its_own(ring: Track) -> None:
     assert rewards["left"]["smooth"].item() == pytest.approx(-0.1 * 0.2)
 
 
-def test_a_crash_costs_its_price_and_nothing_else(ring: Track) -> None:
+def test_crash_replaces_all_other_reward_terms(ring: Track) -> None:
     after = one_step(ring, 0.95, 0.2, only="left")
     assert after["terminated"].all()
     assert after["reward"].item() == -100
     assert all(value.item() == 0 for term, value in after["info", "reward"].items() if term != "crash")
 
 
-def test_with_the_weights_of_the_cone_world_it_is_the_cone_world(rings: list[Track]) -> None:
+def test_tasks_without_weights_equal_the_cone_world(rings: list[Track]) -> None:
     shared: dict[str, Any] = {"num_cars": 6, "assignment": "cyclic", "laps": 1, "rate": 8}
     envs = [ConeTrackEnv(rings, **shared), DrivingTasksEnv(rings, **shared, tasks=EQUAL, duration=1.0)]
     states = [env.reset() for env in envs]
     guide, finished, crashed = SplineGuide(), 0, 0
     for _ in range(155):
         emitted = []
-        for place, env in enumerate(envs):
-            action = guide(states[place].copy())["action"]
+        for i, env in enumerate(envs):
+            action = guide(states[i].copy())["action"]
             action[2:] = torch.linspace(0.2, 0.4, 4).unsqueeze(-1)
-            states[place]["action"] = action
-            step, states[place] = env.step_and_maybe_reset(states[place])
+            states[i]["action"] = action
+            step, states[i] = env.step_and_maybe_reset(states[i])
             emitted.append(step["next"])
         terms = emitted[1]["info", "reward"]
         assert all(terms.pop(term).eq(0).all() for term in ("centre", "left", "inside"))
@@ -123,25 +123,25 @@ def test_with_the_weights_of_the_cone_world_it_is_the_cone_world(rings: list[Tra
     assert crashed > 0
 
 
-def test_the_agent_is_told_the_task_that_pays_its_next_step(rings: list[Track]) -> None:
+def test_observed_task_is_that_of_the_next_reward(rings: list[Track]) -> None:
     changes = 0
-    for step in driven(DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5), 60):
-        paid = torch.cat(list(step["next", "info", "task"].values()), -1)
-        assert torch.equal(paid.float(), step["task"])
-        assert paid.sum(-1).eq(1).all()
-        placed = step["next", "info", "reward", "left"].ne(0) & ~step["next", "info", "crashed"]
-        assert torch.equal(placed, step["task"][:, 2:3].bool() & ~step["next", "info", "crashed"])
+    for step in drive(DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5), 60):
+        rewarded = torch.cat(list(step["next", "info", "task"].values()), -1)
+        assert torch.equal(rewarded.float(), step["task"])
+        assert rewarded.sum(-1).eq(1).all()
+        nonzero = step["next", "info", "reward", "left"].ne(0) & ~step["next", "info", "crashed"]
+        assert torch.equal(nonzero, step["task"][:, 2:3].bool() & ~step["next", "info", "crashed"])
         changes += int(step["next", "task"].ne(step["task"]).any(-1).sum())
     assert changes > 16
 
 
-def test_tasks_last_as_long_as_asked_and_follow_one_another_alike(rings: list[Track]) -> None:
+def test_task_durations_and_transitions_have_the_given_distribution(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 4096, tasks=EQUAL, duration=0.5)
     first = env.reset()["task"]
     assert first.mean(0).tolist() == pytest.approx([1 / 3] * 3, abs=0.03)
     pairs = torch.zeros(3, 3)
     for _ in range(40):
-        before, env.task = env.task, env._next()
+        before, env.task = env.task, env._next_task()
         pairs += torch.zeros(9).index_add(0, 3 * before + env.task, torch.ones(4096)).view(3, 3)
     stays = pairs.diagonal().sum() / pairs.sum()
     assert stays.item() == pytest.approx(1 - 1 / (0.5 * env.rate), abs=0.003)
@@ -150,18 +150,18 @@ def test_tasks_last_as_long_as_asked_and_follow_one_another_alike(rings: list[Tr
 
 
 def sequence(env: DrivingTasksEnv) -> Tensor:
-    return torch.stack([step["task"] for step in driven(env, 30)])
+    return torch.stack([step["task"] for step in drive(env, 30)])
 
 
-def test_a_seed_fixes_the_tasks(rings: list[Track]) -> None:
-    seen, again, other = (
+def test_seed_determines_the_tasks(rings: list[Track]) -> None:
+    first, again, other = (
         sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=seed)) for seed in (7, 7, 8)
     )
-    assert torch.equal(seen, again)
-    assert not torch.equal(seen, other)
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
 
 
-def test_one_task_alone_draws_nothing_and_changes_nothing(rings: list[Track]) -> None:
+def test_single_task_uses_no_random_numbers(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 8, tasks=TASKS, only="corners", duration=0.1, assignment="cyclic")
     before = env.generator.get_state()
     assert sequence(env)[..., 1].eq(1).all()
@@ -171,7 +171,7 @@ def test_one_task_alone_draws_nothing_and_changes_nothing(rings: list[Track]) ->
     assert torch.equal(env.reset()["info", "track"], tracks)
 
 
-def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track]) -> None:
+def test_partial_reset_changes_only_the_masked_cars(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 64, tasks=TASKS)
     first = env.reset()
     mask = torch.arange(64) % 2 == 0
@@ -181,28 +181,28 @@ def test_a_reset_changes_only_the_cars_that_ask_for_it(rings: list[Track]) -> No
     assert fresh["task"][mask].ne(first["task"][mask]).any()
 
 
-def test_a_restored_env_goes_on_bit_for_bit(rings: list[Track]) -> None:
+def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     env = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=3)
-    state = driven(env, 20)[-1]["next"].exclude("reward")
+    state = drive(env, 20)[-1]["next"].exclude("reward")
     state = env.maybe_reset(state)
     saved = copy.deepcopy(env.state_dict())
-    trace = driven(env, 80, state.clone())
+    trace = drive(env, 80, state.clone())
     assert any(step["next", "done"].any() for step in trace)
     restored = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=99)
     restored.load_state_dict(saved)
-    assert all(same(*pair) for pair in zip(driven(restored, 80, state.clone()), trace, strict=True))
+    assert all(same(*pair) for pair in zip(drive(restored, 80, state.clone()), trace, strict=True))
 
 
-def test_a_car_does_not_depend_on_the_others(rings: list[Track]) -> None:
+def test_env_is_batch_invariant(rings: list[Track]) -> None:
     envs = [DrivingTasksEnv(rings, 6, tasks=TASKS, duration=0.5, assignment="cyclic") for _ in range(2)]
     states = [env.reset() for env in envs]
     for value in torch.linspace(0, 0.3, 25):
         rows = []
-        for place, env in enumerate(envs):
-            states[place]["action"] = torch.full((6, 1), value.item())
-            states[place]["action"][1:] *= -place
-            rows.append(env.step(states[place])["next"][:1])
-            states[place] = env.step_mdp(states[place])
+        for i, env in enumerate(envs):
+            states[i]["action"] = torch.full((6, 1), value.item())
+            states[i]["action"][1:] *= -i
+            rows.append(env.step(states[i])["next"][:1])
+            states[i] = env.step_mdp(states[i])
         assert same(*rows)
 
 
@@ -219,13 +219,13 @@ def test_a_car_does_not_depend_on_the_others(rings: list[Track]) -> None:
         ({"rate": 0}, "rate=0 must be more than 0"),
     ],
 )
-def test_wrong_values_are_named(rings: list[Track], wrong: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         DrivingTasksEnv(rings, 2, **({"tasks": TASKS} | wrong))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_the_tasks_are_the_same_on_a_gpu(rings: list[Track]) -> None:
+def test_tasks_agree_on_a_gpu(rings: list[Track]) -> None:
     envs = [DrivingTasksEnv(rings, 32, tasks=TASKS, duration=0.2, device=device) for device in ("cpu", "cuda")]
     check_env(envs[1])
     for env in envs:
@@ -233,5 +233,5 @@ def test_the_tasks_are_the_same_on_a_gpu(rings: list[Track]) -> None:
         env.reset()
     for _ in range(20):
         for env in envs:
-            env.task = env._next()
+            env.task = env._next_task()
         assert torch.equal(envs[0].task, envs[1].task.cpu())

@@ -8,13 +8,12 @@ import pytest
 import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from tensordict import TensorDict
 
 from coil_rl.envs import ConeTrackEnv, Track, gym, shipped_tracks
 from coil_rl.guides import ConstantGuide, SplineGuide
 
 
-def test_one_car_passes_the_checker_of_gymnasium():
+def test_gymnasium_check_env_passes():
     env = gymnasium.make(gym.ID)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -22,14 +21,14 @@ def test_one_car_passes_the_checker_of_gymnasium():
     assert env.observation_space == gymnasium.spaces.Box(-1, 1, (20,), np.float32)
 
 
-def test_one_car_passes_the_checker_of_stable_baselines3():
+def test_stable_baselines3_check_env_passes():
     checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(gymnasium.make(gym.ID).unwrapped)
 
 
-def test_stable_baselines3_learns_on_it():
+def test_stable_baselines3_trains():
     sb3 = pytest.importorskip("stable_baselines3", reason="stable-baselines3 is not installed")
     env = gymnasium.make(gym.ID, advice=SplineGuide())
     model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(64)
@@ -48,7 +47,7 @@ def episode(env, seed, steps=40):
 
 
 @pytest.mark.parametrize("cars", [None, 3])
-def test_a_seed_decides_the_tracks_and_all_that_follows(cars):
+def test_seed_determines_tracks_and_episodes(cars):
     env = gymnasium.make(gym.ID) if cars is None else gymnasium.make_vec(gym.ID, num_envs=cars)
     track, rows = episode(env, 3)
     again, same = episode(env, 3)
@@ -58,12 +57,12 @@ def test_a_seed_decides_the_tracks_and_all_that_follows(cars):
     assert len({np.asarray(episode(env, seed, 0)[0]).tobytes() for seed in range(8)}) > 1
 
 
-def test_without_a_seed_no_two_envs_draw_alike():
+def test_unseeded_envs_draw_different_tracks():
     draws = [gymnasium.make_vec(gym.ID, num_envs=32).reset()[1]["track"].tolist() for _ in range(2)]
     assert draws[0] != draws[1]
 
 
-def test_vector_rows_are_those_of_the_batched_env():
+def test_vector_env_agrees_with_the_batched_env():
     cars = 6
     envs = gymnasium.make_vec(gym.ID, num_envs=cars)
     ours = ConeTrackEnv(shipped_tracks("train"), cars, seed=5)
@@ -86,14 +85,14 @@ def test_vector_rows_are_those_of_the_batched_env():
 def drive_to_the_end(envs):
     envs.reset(seed=0)
     while True:
-        before = envs.unwrapped.cars.env.track.clone()
+        before = envs.unwrapped.env.track.clone()
         observation, reward, terminated, truncated, info = envs.step(envs.action_space.sample())
         if (terminated | truncated).any():
             return before, observation, reward, terminated, truncated, info
 
 
 @pytest.mark.parametrize("advice", [None, ConstantGuide(0.25)])
-def test_autoreset_gives_the_last_observation_of_the_episode_and_the_first_of_the_next(advice):
+def test_autoreset_returns_the_final_and_the_next_observation(advice):
     envs = gymnasium.make_vec(gym.ID, num_envs=16, advice=advice)
     _, observation, reward, terminated, _, info = drive_to_the_end(envs)
     done = info["_final_obs"]
@@ -102,7 +101,7 @@ def test_autoreset_gives_the_last_observation_of_the_episode_and_the_first_of_th
     assert [last is not None for last in info["final_obs"]] == done.tolist()
     last = np.stack(info["final_obs"][done])
     assert last.shape == (done.sum(), 20 + (advice is not None))
-    cars = envs.unwrapped.cars.env
+    cars = envs.unwrapped.env
     start = cars.start_observation[:, cars.track].t().numpy()
     np.testing.assert_array_equal(observation[done, :20], start[done])
     assert (last[:, :20] != start[done]).any()
@@ -114,7 +113,7 @@ def test_autoreset_gives_the_last_observation_of_the_episode_and_the_first_of_th
         assert (last[:, 20] == 0.25).all()
 
 
-def test_time_limit_truncates_and_a_crash_terminates(ring: Track):
+def test_time_limit_truncates_and_crash_terminates(ring: Track):
     env = gymnasium.make(gym.ID, tracks=[ring], time_limit=0.25, rate=8)
     env.reset(seed=0)
     straight = np.zeros(1, np.float32)
@@ -127,7 +126,7 @@ def test_time_limit_truncates_and_a_crash_terminates(ring: Track):
     assert (step[1], step[3], step[4]["crashed"], step[4]["reward"]["crash"]) == (-100, False, True, -100)
 
 
-def test_advice_is_what_the_guide_says():
+def test_advice_is_appended_to_the_observation():
     envs = gymnasium.make_vec(gym.ID, num_envs=4, advice=SplineGuide())
     ours = ConeTrackEnv(shipped_tracks("train"), 4, seed=1)
     observation, _ = envs.reset(seed=1)
@@ -136,17 +135,16 @@ def test_advice_is_what_the_guide_says():
     assert envs.single_observation_space.shape == (21,)
 
 
-def test_arrays_are_the_callers_own():
+def test_returned_arrays_are_copies():
     envs = gymnasium.make_vec(gym.ID, num_envs=4)
     observation, info = envs.reset(seed=0)
     observation[:], info["pose"][:] = 7, 7
-    assert not (envs.unwrapped.cars.env.pose == 7).any()
+    assert not (envs.unwrapped.env.pose == 7).any()
     again, _ = envs.reset(seed=0)
     assert not (again == 7).any()
-    assert isinstance(envs.unwrapped.cars.reset(), TensorDict)
 
 
-def test_vector_wrappers_of_gymnasium_work_on_it():
+def test_vector_wrappers_of_gymnasium_work():
     envs = gymnasium.wrappers.vector.RecordEpisodeStatistics(gymnasium.make_vec(gym.ID, num_envs=8))
     envs = gymnasium.wrappers.vector.DictInfoToList(envs)
     _, infos = envs.reset(seed=0)
@@ -158,14 +156,14 @@ def test_vector_wrappers_of_gymnasium_work_on_it():
     assert ended["episode"]["l"] > 1
 
 
-def test_without_gymnasium_the_module_names_the_extra(monkeypatch):
+def test_import_without_gymnasium_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     monkeypatch.delitem(sys.modules, "coil_rl.envs.gym")
     with pytest.raises(ImportError, match=r"coil_rl.envs.gym needs Gymnasium: .* install 'coil-rl\[gym\]'"):
         importlib.import_module("coil_rl.envs.gym")
 
 
-def test_without_info_there_is_none():
+def test_info_can_be_disabled():
     envs = gymnasium.make_vec(gym.ID, num_envs=2, info=False)
     assert envs.reset(seed=0)[1] == {}
     assert envs.step(np.zeros((2, 1), dtype=np.float32))[4] == {}

@@ -1,11 +1,15 @@
-"""Level files: what is read is what was written, and what cannot be driven is refused in one sentence."""
+"""Level files: reading, writing, and one-sentence errors for every other file."""
 
-import re
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
 
+from coil_rl.envs import ConeTrackEnv, random_track
 from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_track, shipped_tracks
 from coil_rl.envs.track import Track, TrackError
 
@@ -13,21 +17,16 @@ TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 LEVELS = Path(__file__).parents[2] / "../shared/tracks"
 HEADER = ",Cone_Type,Cone_X,Cone_Y"
-levels_needed = pytest.mark.skipif(not LEVELS.is_dir(), reason="the example level files lie beside the repository only")
+needs_levels = pytest.mark.skipif(not LEVELS.is_dir(), reason="the authors' level files are not in the repository")
 
 
-def ring(**changes):
-    """A ring between circles of 9 and 11 m, driven anticlockwise."""
-    return Track(**({"name": "ring", "left": 9 * CIRCLE, "right": 11 * CIRCLE} | changes))
-
-
-def level(path, left=9 * CIRCLE, right=11 * CIRCLE, header=HEADER):
+def write_level(path, left=9 * CIRCLE, right=11 * CIRCLE):
     sides = [("LEFT", x, -y) for x, y in left] + [("RIGHT", x, -y) for x, y in right]
-    path.write_text("\n".join([header, *(f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides))]))
+    path.write_text("\n".join([HEADER, *(f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides))]))
     return path
 
 
-def refusal(call, *args, **kwargs):
+def error_of(call, *args, **kwargs):
     with pytest.raises(TrackError) as caught:
         call(*args, **kwargs)
     message = str(caught.value)
@@ -37,31 +36,26 @@ def refusal(call, *args, **kwargs):
 
 
 def test_saved_track_is_read_back(tmp_path):
-    track = ring()
+    track = Track("ring", 9 * CIRCLE, 11 * CIRCLE)
     save_track(track, tmp_path / "new" / "ring.csv")
-    again = load_track(tmp_path / "new" / "ring.csv")
-    assert again.name == "ring"
-    np.testing.assert_allclose(again.left, track.left, atol=1e-5)
-    np.testing.assert_allclose(again.right, track.right, atol=1e-5)
-    assert again.start == pytest.approx(track.start, abs=1e-4)
-    assert [file.name for file in (tmp_path / "new").iterdir()] == ["ring.csv"]
-
-
-def test_saved_level_has_the_format_of_level_files(tmp_path):
-    save_track(ring(), tmp_path / "ring.csv")
-    lines = (tmp_path / "ring.csv").read_bytes().decode().split("\n")
+    lines = (tmp_path / "new" / "ring.csv").read_bytes().decode().split("\n")
     assert lines[:2] == [HEADER, "0,LEFT,9.0,0.0"]
     assert lines[33] == "32,RIGHT,11.0,0.0"
     assert lines[2].split(",")[3].startswith("-"), "y points down in the file"
+    loaded = load_track(tmp_path / "new" / "ring.csv")
+    assert loaded.name == "ring"
+    np.testing.assert_allclose(loaded.left, track.left, atol=1e-5)
+    np.testing.assert_allclose(loaded.right, track.right, atol=1e-5)
+    assert loaded.start == pytest.approx(track.start, abs=1e-4)
 
 
-def test_file_start_is_in_degrees(tmp_path):
-    start = load_track(level(tmp_path / "ring.csv"), start=(0, -10, 90)).start
+def test_start_of_a_file_is_in_degrees(tmp_path):
+    start = load_track(write_level(tmp_path / "ring.csv"), start=(0, -10, 90)).start
     assert start == pytest.approx((0, -10, np.pi / 2))
 
 
-def test_reader_forgives_what_does_no_harm(tmp_path):
-    plain = load_track(level(tmp_path / "plain.csv"))
+def test_case_blank_lines_line_ends_and_extra_columns_are_ignored(tmp_path):
+    plain = load_track(write_level(tmp_path / "plain.csv"))
     text = (tmp_path / "plain.csv").read_text().replace(HEADER, ", cone_type ,CONE_X,Cone_Y,Colour")
     text = text.replace("LEFT", " left ").replace("\n", "\r\n\r\n")
     (tmp_path / "odd.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
@@ -74,84 +68,180 @@ def test_reader_forgives_what_does_no_harm(tmp_path):
         (b"", "is empty"),
         (b" \n\n", "is empty"),
         (b"\xff\xfe\x00\x81", "is not a text file"),
-        (b",Cone_Type,X,Y\n", "has no column Cone_X; its first line names these: Cone_Type, X, Y."),
-        (b",,\n", "has no column Cone_Type; its first line names these: none."),
+        (b",Cone_Type,X,Y\n", "has no column Cone_X; the columns of its first line are ['', 'Cone_Type', 'X', 'Y']."),
+        (b",,\n", "has no column Cone_Type; the columns of its first line are ['', '', '']."),
         (f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2".encode(), "line 4: Cone_Type is 'BLUE'; it must be LEFT or RIGHT."),
-        (f"{HEADER}\n0,LEFT,1,two".encode(), "line 2: Cone_Y is 'two'; it must be a finite number"),
-        (f"{HEADER}\n0,LEFT,nan,2".encode(), "line 2: Cone_X is 'nan'"),
-        (f"{HEADER}\n0,LEFT,1,-inf".encode(), "line 2: Cone_Y is '-inf'"),
-        (f"{HEADER}\n0,LEFT,1".encode(), "line 2: Cone_Y is ''"),
+        (f"{HEADER}\n0,LEFT,1,two".encode(), "line 2: Cone_X, Cone_Y are ['1', 'two']; they must be finite numbers"),
+        (f"{HEADER}\n0,LEFT,nan,2".encode(), "['nan', '2']"),
+        (f"{HEADER}\n0,LEFT,1,-inf".encode(), "['1', '-inf']"),
+        (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
         (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
         (HEADER.encode(), "left side of track 'bad' has 0 cones"),
+        (f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6, "is no file of at most"),
     ],
 )
-def test_file_that_is_no_level_is_refused(tmp_path, content, words):
+def test_invalid_files_are_rejected_with_a_message(tmp_path, content, words):
     (tmp_path / "bad.csv").write_bytes(content)
-    message = refusal(load_track, tmp_path / "bad.csv")
+    message = error_of(load_track, tmp_path / "bad.csv")
     assert words in message
     assert str(tmp_path / "bad.csv") in message
 
 
-def test_file_with_too_few_cones_or_crossing_sides_is_refused_by_name(tmp_path):
-    few = level(tmp_path / "few.csv", right=11 * CIRCLE[:3])
-    assert f"{few}: The right side of track 'few' has 3 cones" in refusal(load_track, few)
-    crossed = level(tmp_path / "crossed.csv", left=9 * CIRCLE + [3, 0])
-    assert f"{crossed}: The two sides cross" in refusal(load_track, crossed)
+def ring(count, radius):
+    turn = np.arange(count) * (2 * np.pi / count)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1).tolist()
 
 
-def test_missing_file_and_folder_are_refused(tmp_path):
-    assert "none.csv cannot be read (No such file or directory)" in refusal(load_track, tmp_path / "none.csv")
-    assert "none.csv cannot be read" in refusal(load_tracks, tmp_path / "none.csv")
-    assert f"{tmp_path} cannot be read" in refusal(load_track, tmp_path)
+@pytest.mark.parametrize(
+    ("left", "right", "words"),
+    [
+        (9 * CIRCLE, 11 * CIRCLE[:3], "The right side of track 'level' has 3 cones"),
+        (9 * CIRCLE + [3, 0], 11 * CIRCLE, "The two sides cross"),
+        (ring(1001, 9), ring(32, 11), "left side of track 'level' has 1001 cones, of shape [1001, 2]; give 4 to 1000"),
+        (ring(32, 9000), ring(32, 9002), "left side of track 'level' is too large; the limits are 500 m across"),
+        ([(200.0 * (k % 2), k / 9) for k in range(900)], ring(32, 11), "is too large"),
+        ([(0.0, 0.0), (1e-5, 0.0), (1e-5, 1e-5), (400.0, 0.0)], ring(32, 11), ""),
+        ([(x * 1e-5, 0.0) for x in range(999)] + [(300.0, 9.0)], ring(32, 11), ""),
+        ([(7.0 * (k * k % 97), 5.0 * (k * 31 % 89)) for k in range(19)], ring(32, 11), ""),
+    ],
+)
+def test_invalid_cones_are_rejected_by_file_name_without_filling_the_memory(tmp_path, left, right, words):
+    path = write_level(tmp_path / "level.csv", left, right)
+    assert f"{path}: " in (message := error_of(load_track, path))
+    assert words in message
 
 
-def test_folder_without_levels_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    "path", ["/dev/zero", "pipe", "loop", "a" * 300, "C:\\levels\\1.csv", "nul\0byte", ".", "x.csv"]
+)
+def test_paths_without_a_level_are_rejected_by_name(tmp_path, monkeypatch, path):
+    monkeypatch.chdir(tmp_path)
+    os.mkfifo("pipe")
+    os.symlink("loop", "loop")
+    for load in (load_track, load_tracks):
+        assert path in error_of(load, path)
+    assert "none.csv cannot be read (No such file or directory)" in error_of(load_tracks, "none.csv")
     (tmp_path / "notes.txt").write_text("no level")
-    assert "holds no level files" in refusal(load_tracks, tmp_path)
+    assert "holds no level files" in error_of(load_tracks, tmp_path)
+    (tmp_path / "bad.csv").mkdir()
+    assert "bad.csv is no file" in error_of(load_tracks, tmp_path)
 
 
 @pytest.mark.parametrize("start", [(1, 2), ("a", 0, 0), 5])
-def test_start_of_a_file_that_is_no_pose_is_refused(tmp_path, start):
-    assert "give three numbers" in refusal(load_track, level(tmp_path / "ring.csv"), start)
+def test_invalid_starts_are_rejected(tmp_path, start):
+    assert "give three numbers" in error_of(load_track, write_level(tmp_path / "ring.csv"), start)
 
 
-def test_folder_is_read_in_the_order_people_count(tmp_path):
-    for number in (10, 2, 1):
-        level(tmp_path / f"MAP_{number}.csv")
+def test_folders_are_read_in_natural_order_with_one_start(tmp_path):
+    for number in ("10", "2", "1", "²3"):
+        write_level(tmp_path / f"MAP_{number}.csv")
     (tmp_path / ".MAP_3.csv").write_text("half a level")
-    assert [track.name for track in load_tracks(tmp_path)] == ["MAP_1", "MAP_2", "MAP_10"]
+    tracks = load_tracks(tmp_path, start=(0, -10, 0))
+    assert [track.name for track in tracks] == ["MAP_1", "MAP_2", "MAP_10", "MAP_²3"]
+    assert {track.start for track in tracks} == {(0.0, -10.0, 0.0)}
     assert [track.name for track in load_tracks(tmp_path / "MAP_2.csv")] == ["MAP_2"]
-
-
-def test_one_start_serves_all_files_of_a_folder(tmp_path):
-    for number in (1, 2):
-        level(tmp_path / f"MAP_{number}.csv")
-    assert {track.start for track in load_tracks(tmp_path, start=(0, -10, 0))} == {(0.0, -10.0, 0.0)}
 
 
 def test_seven_tracks_are_shipped_to_train_and_three_to_test():
     train, test, every = (shipped_tracks(split) for split in ("train", "test", "all"))
     assert (len(train), len(test)) == (7, 3)
     assert [track.name for track in every] == [track.name for track in train + test]
-    with pytest.raises(ValueError, match=re.escape("'train', 'test' or 'all'")):
+    assert shipped_track("test_2") is test[1]
+    with pytest.raises(ValueError, match="'train', 'test' or 'all'"):
         shipped_tracks("tset")
-
-
-def test_a_shipped_track_goes_by_its_name():
-    assert np.array_equal(shipped_track("test_2").left, shipped_tracks("test")[1].left)
     with pytest.raises(ValueError, match=r"no shipped track 'test_4'; there are train_1, .*test_3"):
         shipped_track("test_4")
 
 
-@levels_needed
-@pytest.mark.parametrize(("name", "left", "right"), [("MAP_1", 82, 91), ("MAP_2", 83, 73), ("MAP_3", 46, 54)])
-def test_level_files_of_others_are_read(name, left, right):
-    track = load_track(LEVELS / f"{name}.csv", start=(7, -10, 0))
-    assert (len(track.left), len(track.right)) == (left, right)
-    assert np.linalg.norm(track.finish - (7, -10)) < 2
-    assert 57 < track.length < 148
+@needs_levels
+def test_the_authors_level_files_are_read():
+    tracks = load_tracks(LEVELS, start=(7, -10, 0))
+    sizes = {track.name: (len(track.left), len(track.right)) for track in tracks}
+    assert sizes == {"MAP_1": (82, 91), "MAP_2": (83, 73), "MAP_3": (46, 54)}
+    for track in tracks:
+        assert np.linalg.norm(track.finish - (7, -10)) < 2
+        assert 57 < track.length < 148
 
 
-@levels_needed
-def test_levels_of_others_are_a_folder_of_tracks():
-    assert [track.name for track in load_tracks(LEVELS)] == ["MAP_1", "MAP_2", "MAP_3"]
+# Mutated files
+
+SHARED = {"suppress_health_check": [HealthCheck.function_scoped_fixture], "phases": [Phase.explicit, Phase.generate]}
+CELLS = ["", "nan", "inf", "-inf", "1e309", "1e300", "-0", "9999", "0,5", "1e-300", "LEFT", "RIGHT", "left ", "B", "\0"]
+
+
+@pytest.fixture(scope="module")
+def lines(tmp_path_factory):
+    path = tmp_path_factory.mktemp("level") / "good.csv"
+    save_track(random_track(3), path)
+    return path.read_text().splitlines()
+
+
+@st.composite
+def mutations(draw, lines):
+    """Draw the bytes of a level file with one to three changes."""
+    lines = list(lines)
+    for _ in range(draw(st.integers(1, 3))):
+        at = draw(st.integers(0, max(0, len(lines) - 1)))
+        kind = draw(st.sampled_from(["cut", "double", "swap", "cell", "cell", "more", "reverse", "text"]))
+        if not lines or kind == "text":
+            lines.insert(at, draw(st.text(max_size=20)))
+        elif kind == "cut":
+            del lines[at : at + draw(st.sampled_from([1, 1, 2, 1000]))]
+        elif kind == "double":
+            lines[at:at] = lines[at : at + draw(st.sampled_from([1, 1, 1000]))]
+        elif kind == "swap":
+            other = draw(st.integers(0, len(lines) - 1))
+            lines[at], lines[other] = lines[other], lines[at]
+        elif kind == "cell":
+            cells = lines[at].split(",")
+            value = draw(st.sampled_from(CELLS) | st.floats(-600, 600).map(str))
+            cells[draw(st.integers(0, len(cells) - 1))] = value
+            lines[at] = ",".join(cells)
+        elif kind == "more":
+            lines[at] += draw(st.sampled_from([",", ",7,8", '"', ";", " "]))
+        else:
+            lines[1:] = lines[:0:-1]
+    text = draw(st.sampled_from(["\n", "\r\n", "\r"])).join(lines)
+    data = text.encode(draw(st.sampled_from(["utf-8"] * 4 + ["utf-16"])), "replace")
+    if draw(st.integers(0, 5)) == 0:
+        at = draw(st.integers(0, len(data)))
+        data = data[:at] + draw(st.binary(max_size=8)) + data[at + draw(st.integers(0, 8)) :]
+    return draw(st.sampled_from([b"", b"", b"", b"\xef\xbb\xbf"])) + data
+
+
+def load_mutated(data, lines, path):
+    """Return the track of a mutated file, or None if it is rejected properly."""
+    path.write_bytes(data.draw(mutations(lines)))
+    try:
+        track = load_track(path)
+    except TrackError as error:
+        message = str(error)
+    else:
+        assert 0 < track.length < 10_000
+        return track
+    assert str(path) in message
+    assert message.endswith(".")
+    assert "\n" not in message
+    return None
+
+
+@settings(max_examples=150, **SHARED)
+@given(data=st.data())
+def test_mutated_files_are_read_or_rejected_by_name(lines, tmp_path, data):
+    load_mutated(data, lines, tmp_path / "level.csv")
+
+
+@pytest.mark.slow
+@settings(max_examples=5000, **SHARED)
+@given(data=st.data())
+def test_many_mutated_files_are_read_or_rejected_by_name(lines, tmp_path, data):
+    load_mutated(data, lines, tmp_path / "level.csv")
+
+
+@settings(max_examples=12, **SHARED)
+@given(data=st.data())
+def test_tracks_of_mutated_files_can_be_driven(lines, tmp_path, data):
+    track = load_mutated(data, lines, tmp_path / "level.csv")
+    if track is not None:
+        steps = ConeTrackEnv([track], num_cars=4).rollout(5, break_when_any_done=False)
+        assert all(torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones"))

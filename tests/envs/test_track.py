@@ -1,86 +1,70 @@
-"""Tracks: their geometry, and that what cannot be driven is refused in one sentence."""
+"""Tracks: geometry, and one-sentence errors for invalid tracks."""
 
 import numpy as np
 import pytest
 
-from coil_rl.envs.track import Track, TrackError, evenly
+from coil_rl.envs.track import Track, TrackError, resample
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 
 
-def ring(**changes):
-    """A ring between circles of 9 and 11 m, driven anticlockwise."""
+def circle_track(**changes):
+    """A track between circles of 9 and 11 m, driven anticlockwise."""
     return Track(**({"name": "ring", "left": 9 * CIRCLE, "right": 11 * CIRCLE} | changes))
 
 
-def refusal(call, *args, **kwargs):
+def error_of(*args, **kwargs):
     with pytest.raises(TrackError) as caught:
-        call(*args, **kwargs)
+        circle_track(*args, **kwargs)
     message = str(caught.value)
     assert message.endswith(".")
     assert "\n" not in message
     return message
 
 
-def test_car_starts_between_the_last_cones_heading_for_the_finish():
-    track = ring()
+def test_default_start_is_between_the_last_cones_heading_for_the_finish():
+    track = circle_track()
     assert track.finish == pytest.approx([10, 0])
     x, y, heading = track.start
     assert (x, y) == pytest.approx((10 * np.cos(TURN[-1]), 10 * np.sin(TURN[-1])))
     assert heading == pytest.approx(np.arctan2(-y, 10 - x))
-
-
-def test_start_that_is_given_is_kept():
-    assert ring(start=(0, -10, 0)).start == (0.0, -10.0, 0.0)
+    assert circle_track(start=(0, -10, 0)).start == (0.0, -10.0, 0.0)
 
 
 def test_boundary_of_a_circle_is_that_circle():
-    points = ring().boundary("left", spacing=0.1)
+    track = circle_track()
+    points = track.boundary("left", spacing=0.1)
     assert points[0] == pytest.approx([9, 0])
     assert np.linalg.norm(points, axis=1) == pytest.approx(9, abs=1e-3)
     gaps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     assert gaps.max() < 0.101
     assert gaps.min() > 0.09
+    to_cones = np.linalg.norm(track.boundary("right", 0.01)[:, None] - track.right, axis=2).min(axis=0)
+    assert to_cones.max() < 0.01
 
 
-def test_boundary_passes_through_every_cone():
-    track = ring()
-    gaps = np.linalg.norm(track.boundary("right", 0.01)[:, None] - track.right, axis=2).min(axis=0)
-    assert gaps.max() < 0.01
-
-
-def test_length_is_that_of_the_centre_line():
-    assert ring().length == pytest.approx(20 * np.pi, rel=1e-3)
-
-
-def test_middle_of_a_ring_is_half_way_and_its_points_are_even():
-    middle = ring().middle(0.02)
+def test_middle_line_is_half_way_and_resampled_evenly():
+    middle = circle_track().middle(0.02)
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 10, atol=1e-3)
-    even = evenly(middle, 0.5)
+    even = resample(middle, 0.5)
     assert len(even) == round(20 * np.pi / 0.5)
     np.testing.assert_allclose(np.linalg.norm(np.roll(even, -1, axis=0) - even, axis=1), 0.5, rtol=0.01)
     np.testing.assert_allclose(even[0], middle[0])
 
 
-def test_cones_cannot_be_changed_afterwards():
-    track = ring()
+def test_cones_are_a_read_only_copy():
+    left = 9 * CIRCLE
+    track = circle_track(left=left)
+    left[0] = 100
+    assert track.left[0] == pytest.approx([9, 0])
     with pytest.raises(ValueError, match="read-only"):
         track.left[0] = 0
 
 
-def test_track_keeps_its_own_copy_of_the_cones():
-    left = 9 * CIRCLE
-    track = ring(left=left)
-    left[0] = 100
-    assert track.left[0] == pytest.approx([9, 0])
-
-
-@pytest.mark.parametrize("reverse", [False, True])
-def test_either_direction_is_driven(reverse):
-    inner, outer = 9 * CIRCLE, 11 * CIRCLE
-    track = ring(left=outer[::-1], right=inner[::-1]) if reverse else ring()
-    assert track.length == pytest.approx(20 * np.pi, rel=1e-3)
+@pytest.mark.parametrize("sides", [{}, {"left": 11 * CIRCLE[::-1], "right": 9 * CIRCLE[::-1]}])
+def test_length_is_that_of_the_centre_line_in_either_direction(sides):
+    assert circle_track(**sides).length == pytest.approx(20 * np.pi, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -103,20 +87,14 @@ def test_either_direction_is_driven(reverse):
         ({"start": (10, 0)}, "three finite numbers"),
     ],
 )
-def test_track_that_cannot_be_driven_is_refused(changes, words):
-    assert words in refusal(ring, **changes)
+def test_invalid_tracks_are_rejected_with_a_message(changes, words):
+    assert words in error_of(**changes)
 
 
-def test_curves_count_and_not_the_polygons_through_the_cones():
+def test_crossings_are_tested_on_the_curves_instead_of_the_polygons():
     # The curve through four corners is nearly a circle, and bulges through the straight edges of the larger square.
     corners = np.array([[5, -5], [5, 5], [-5, 5], [-5, -5.0]])
     edge = np.stack([np.full(12, 6.0), np.arange(-6.0, 6.0)], axis=1)
     quarter = np.array([[0, 1], [-1, 0]])
     larger = np.vstack([edge @ np.linalg.matrix_power(quarter, turns) for turns in range(4)])
-    assert "The two sides cross each other" in refusal(Track, "square", corners, larger)
-
-
-@pytest.mark.parametrize("arguments", [("middle", 0.1), ("left", 0), ("left", float("nan"))])
-def test_boundary_refuses_what_makes_no_sense(arguments):
-    with pytest.raises(ValueError, match=r"There is no side|above 0"):
-        ring().boundary(*arguments)
+    assert "The two sides cross each other" in error_of(left=corners, right=larger)

@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 import torch
 import worlds
+from tabular_env import TabularEnv
 from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
 from torchrl.envs import GymEnv, PendulumEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.envs import TabularEnv
 from coil_rl.learners import DQN
 from coil_rl.schedules import Linear
 from coil_rl.tabular import garnet, toymaker, value_iteration

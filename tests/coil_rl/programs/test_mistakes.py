@@ -95,7 +95,7 @@ def refusal(name, *arguments):
         ("evaluation.policy=worst", "evaluation.policy=worst must be one of last, best"),
         ("learner.minibatches=129", "learner.minibatches=129 leaves less than 2 frames of a batch to each"),
         ("env.cone_bonus=all", "env: cone_bonus='all' must be one of first_sighting, every_sighting"),
-        ("track.train.count=0", "track.train: random_tracks was asked for 0 tracks"),
+        ("track.train.count=0", "track.train: count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
         ("guide=constant guide.constant.value=[1,2]", "guide.constant: its action has the shape [1, 2], but the env"),
