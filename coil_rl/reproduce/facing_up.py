@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.envs.sight import SAMPLES
-from coil_rl.guides.spline import Plan, pick
+from coil_rl.guides.spline import PathPlan
 from coil_rl.report import style
 
 Array = NDArray[np.float64]
@@ -39,7 +39,7 @@ def draw_sight(axes: Axes, sight: float, half_field_of_view: float) -> None:
     axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2))
 
 
-def places_of(plan: Plan, scale: float = 1.0) -> dict[str, Array]:
+def places_of(plan: PathPlan, scale: float = 1.0) -> dict[str, Array]:
     """What the plan of one car consists of, [N, 2] m each, N 0 for what there is not.
 
     Args:
@@ -49,9 +49,9 @@ def places_of(plan: Plan, scale: float = 1.0) -> dict[str, Array]:
     Returns:
         `midpoint`, points of the `path`, `target`, and the one that is `steered for`.
     """
-    pairs = int(plan.pairs)
+    pairs = int(plan.midpoint_count)
     some = None if pairs > 1 else 0
-    chosen = pick(plan.targets, plan.square, plan.barred)[:, : int(not plan.barred.all())]
+    chosen = plan.nearest_target()[:, : int(not plan.excluded.all())]
     found = {
         "midpoint": plan.midpoints[:, :pairs, 0],
         "path": plan.path.equidistant(FINE)[:, :some, 0],
