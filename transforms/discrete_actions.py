@@ -75,10 +75,6 @@ class DiscreteActions(Transform):
             raise ValueError(f"choices={list(self.choices)} must lie between the action's bounds {low} and {high}")
         return torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
 
-    def nearest(self, numbers: Tensor) -> Tensor:
-        """Return the index of the nearest choice, [...], for numbers [..., 1]; of two the lower one."""
-        return (numbers - self.values).abs().argmin(-1)
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Discretise the advice in stored data of any batch size."""
         return self._call(tensordict)
@@ -87,7 +83,8 @@ class DiscreteActions(Transform):
         numbers = next_tensordict.get(self.advice_key, None)
         if numbers is None:
             return next_tensordict
-        choices = F.one_hot(self.nearest(numbers), len(self.values)).to(numbers.dtype)
+        nearest = (numbers - self.values).abs().argmin(-1)  # of two the lower one
+        choices = F.one_hot(nearest, len(self.values)).to(numbers.dtype)
         return next_tensordict.set(self.number_key, numbers).set(self.advice_key, choices)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:

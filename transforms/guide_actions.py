@@ -89,38 +89,24 @@ class GuideCache:
 
     def __init__(self, max_rows: int = 256) -> None:
         self.max_rows = max_rows
-        self.rows: Tensor | None = None
+        self.index: dict[bytes, int] = {}
         self.advice: Tensor | None = None
 
     def __call__(self, data: TensorDictBase, advise: Callable[[TensorDictBase], Tensor]) -> Tensor:
-        """Return `advise(data)`, [N, ...], and call it on new rows only.
-
-        Args:
-            data: [N].
-            advise: function from [M] to [M, ...], independent for each row.
-        """
-        rows = torch.cat(
-            [leaf.reshape(len(data), leaf.shape[1:].numel()).double() for leaf in data.values(True, True)], 1
-        )
-        cached = rows[:0] if self.rows is None else self.rows
-        match = _equal_rows(rows, cached)
-        new = ~match.any(1)
-        if len(cached) + int(new.sum()) > self.max_rows:
+        """Return `advise(data)`, [N, ...], from data [N]; `advise` is called on new rows only."""
+        columns = [leaf.reshape(len(data), leaf.shape[1:].numel()).double() for leaf in data.values(True, True)]
+        keys = [row.tobytes() for row in torch.cat(columns, 1).cpu().numpy()]
+        new: dict[bytes, int] = {}
+        for row, key in enumerate(keys):
+            if key not in self.index:
+                new.setdefault(key, row)
+        if len(self.index) + len(new) > self.max_rows:
             return advise(data)
-        if new.any():
-            unique = _equal_rows(rows[new], rows[new]).int().argmax(1) == torch.arange(
-                int(new.sum()), device=rows.device
-            )
-            advice = advise(data[new])[unique]
-            self.rows = torch.cat([cached, rows[new][unique]])
+        if new:
+            advice = advise(data[list(new.values())])
             self.advice = advice if self.advice is None else torch.cat([self.advice, advice])
-            match = _equal_rows(rows, self.rows)
-        return advise(data) if self.advice is None else self.advice[match.int().argmax(1)]
-
-
-def _equal_rows(rows: Tensor, others: Tensor) -> Tensor:
-    """Compare rows [N, D] with rows [M, D]: [N, M] bool."""
-    return (rows.unsqueeze(1) == others).all(-1)
+            self.index.update(zip(new, range(len(self.index), len(self.advice)), strict=True))
+        return advise(data) if self.advice is None else self.advice[[self.index[key] for key in keys]]
 
 
 class GuideActions(Transform):

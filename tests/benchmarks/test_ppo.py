@@ -22,6 +22,11 @@ def linears(module):
     return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
+def layers_of(plain, ours):
+    """Pairs of corresponding layers."""
+    return zip(linears(plain.actor) + linears(plain.critic), linears(ours.policy) + linears(ours.critic), strict=True)
+
+
 def log_scale(policy):
     """The parameter of the policy that belongs to no linear layer."""
     layers = {id(parameter) for layer in linears(policy) for parameter in layer.parameters()}
@@ -39,9 +44,7 @@ def made(request, ring):
     bare = ConeTrackEnv(shipped_tracks("train"), CARS)
     advised = bare if guide is None else TransformedEnv(bare, GuideActions({"guide": guide}))
     ours = PPO(advised, ["observation"] if guide is None else ["observation", "guide_action"], **OPTIONS)
-    for one, other in zip(
-        linears(plain.actor) + linears(plain.critic), linears(ours.policy) + linears(ours.critic), strict=True
-    ):
+    for one, other in layers_of(plain, ours):
         one.load_state_dict(other.state_dict())
     plain.log_scale.data.copy_(log_scale(ours.policy))
     return plain, ours, plain.collect()
@@ -80,9 +83,7 @@ def test_an_update_gives_the_same_weights(made, shift):
     metrics = ours.update(as_tensordict(batch))
     plain.update(batch)
     assert (metrics["clip_fraction"] > 0.1) == (shift > 0)
-    for one, other in zip(
-        linears(plain.actor) + linears(plain.critic), linears(ours.policy) + linears(ours.critic), strict=True
-    ):
+    for one, other in layers_of(plain, ours):
         torch.testing.assert_close(one.weight, other.weight, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(plain.log_scale, log_scale(ours.policy), atol=1e-5, rtol=1e-4)
     assert not torch.equal(before, plain.actor[0].weight)

@@ -6,9 +6,7 @@ from torchrl.data import Categorical
 from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.learners import PPO
 from coil_rl.testing import check_env, check_transform
-from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import (
     BiasedAdvice,
     DelayedAdvice,
@@ -44,9 +42,6 @@ def close(tensor, numbers):
 )
 def test_specs_hold_with_other_transforms(transforms):
     check_env(worlds.cones(*transforms, DiscreteActions(3)).train(), steps=5)
-
-
-def test_specs_hold_without_a_guide():
     check_transform(ConeTrackEnv(shipped_tracks("test"), 3), DiscreteActions(7))
 
 
@@ -77,14 +72,6 @@ def test_earlier_transforms_use_action_units():
     after = step(advised([0.3] * 5, RewardCoupling(1.0)), 0, 1, 2, 3, 4)
     assert close(after["next", "guide_distance"], [1.3, 0.8, 0.3, 0.2, 0.7])
     assert step(advised([0.3], RemovedAdvice()), 1)["next", "guide_action"].tolist() == [[[0, 1, 0, 0, 0]]]
-
-
-def test_ppo_has_a_categorical_policy():
-    env = worlds.cones(DiscreteActions(5))
-    ppo = PPO(env, ["observation", "guide_action"], epochs=1, minibatches=1)
-    batch = Rollout(env, ppo.policy, 4, ppo.keys).collect()
-    assert env.action_spec.is_in(batch["action"][:, 0])
-    assert abs(ppo.update(batch)["loss_objective"]) < 1e-6
 
 
 @pytest.mark.parametrize(

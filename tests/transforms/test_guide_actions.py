@@ -1,13 +1,14 @@
 import pytest
 import torch
+import worlds
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.nn.functional import one_hot
-from torchrl.envs import GymEnv, PendulumEnv, TransformedEnv
+from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, RandomGuide, SplineGuide, ZeroGuide
-from coil_rl.testing import check_env, check_transform
+from coil_rl.testing import check_env
 from coil_rl.transforms.guide_actions import GuideActions, GuideCache, Guides
 
 
@@ -36,26 +37,19 @@ def test_several_guides_keep_their_order_also_in_the_state():
 
 def test_specs_hold_for_cone_env_and_pendulum():
     check_env(cone_env({"spline": SplineGuide(), "random": RandomGuide()}), steps=60)
-    damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
-    env = TransformedEnv(PendulumEnv(), GuideActions({"damp": damp}))
+    env = worlds.pendulum()
     check_env(env)
     spec = env.observation_spec["guide_action"]
-    assert spec.shape == (1, 1)
-    assert (spec.space.low, spec.space.high) == (-2, 2)
+    assert (spec.shape, spec.space.low, spec.space.high) == ((1, 1), -2, 2)
 
 
 @pytest.mark.parametrize("categorical", [True, False])
 def test_discrete_advice_is_one_hot(categorical):
-    def lean(observation):
-        choice = (observation[..., 2] > 0).long()
-        return choice if categorical else one_hot(choice, 2)
-
-    guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
-    check_transform(GymEnv("CartPole-v1", categorical_action_encoding=categorical), GuideActions({"lean": guide}))
-    env = TransformedEnv(GymEnv("CartPole-v1", categorical_action_encoding=categorical), GuideActions({"lean": guide}))
+    env = worlds.carts(categorical=categorical)
+    check_env(env)
     rollout = env.rollout(5)
     leaning = (rollout["observation"][..., 2] > 0).long()
-    assert torch.equal(rollout["guide_action"].squeeze(1), one_hot(leaning, 2).float())
+    assert torch.equal(rollout["guide_action"].squeeze(-2), one_hot(leaning, 2).float())
 
 
 def test_a_guide_changes_no_other_entry():
@@ -66,13 +60,6 @@ def test_a_guide_changes_no_other_entry():
     reset = cone_env({"overwrite": guide}).reset()
     assert "action" not in reset
     assert (reset["observation"] <= 1).all()
-
-
-def test_random_guides_continue_from_a_state_dict():
-    env, again = cone_env({"random": RandomGuide(seed=3)}), cone_env({"random": RandomGuide(seed=4)})
-    env.rollout(3)
-    again.load_state_dict(env.state_dict())
-    assert torch.equal(env.reset()["guide_action"], again.reset()["guide_action"])
 
 
 @pytest.mark.parametrize(
@@ -107,7 +94,7 @@ def test_cached_advice_equals_the_function():
     cache, function = GuideCache(), CountingFunction()
     for data in (rows(1, 2, 1), rows(2), rows(3, 3, 1), rows(), rows(1, 2, 3)):
         assert torch.equal(cache(data, function), CountingFunction()(data))
-    assert function.rows == 5, "the function should be called for new rows only"
+    assert function.rows == 3, "the function should be called for new rows only"
 
 
 def test_cache_is_bounded():
@@ -116,4 +103,4 @@ def test_cache_is_bounded():
     for _ in range(2):
         assert torch.equal(cache(rows(1, 4), function), CountingFunction()(rows(1, 4)))
     assert function.rows == 3 + 2 * 2
-    assert len(cache.rows) == 3
+    assert len(cache.index) == 3

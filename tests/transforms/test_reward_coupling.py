@@ -30,12 +30,6 @@ def test_task_reward_is_exactly_the_reward_of_the_env():
         one, other = step_mdp(ours), step_mdp(theirs)
 
 
-def test_reward_in_evaluation_is_the_task_reward():
-    after = worlds.cones(RewardCoupling(5.0)).eval().rollout(5, break_when_any_done=False)["next"]
-    assert torch.equal(after["reward"], after["task_reward"])
-    assert (after["guide_distance"] > 0).any()
-
-
 def test_reward_sum_before_the_coupling_is_of_the_task_reward():
     env = worlds.cones(RewardCoupling(5.0))
     env.transform.insert(0, RewardSum())
@@ -43,13 +37,17 @@ def test_reward_sum_before_the_coupling_is_of_the_task_reward():
     torch.testing.assert_close(after["episode_reward"][:, -1], after["task_reward"].sum(1))
 
 
-def test_beta_follows_its_schedule():
-    coupling = RewardCoupling(Linear(1.0, 0.0))
+def test_beta_follows_its_schedule_in_training_and_is_zero_in_evaluation():
+    coupling = RewardCoupling(Linear(1.0, 0.5))
     env = worlds.cones(coupling).train()
-    for progress in (0.0, 0.25, 1.0):
+    for progress in (0.0, 0.5, 1.0):
         coupling.progress = progress
         after = env.rollout(3)["next"]
-        torch.testing.assert_close(after["task_reward"] - after["reward"], (1 - progress) * after["guide_distance"])
+        distance = (1 - progress / 2) * after["guide_distance"]
+        torch.testing.assert_close(after["task_reward"] - after["reward"], distance)
+    after = env.eval().rollout(3)["next"]
+    assert torch.equal(after["reward"], after["task_reward"])
+    assert (after["guide_distance"] > 0).any()
 
 
 def test_distance_of_discrete_actions_is_0_or_2():

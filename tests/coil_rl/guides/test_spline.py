@@ -114,20 +114,16 @@ def test_without_a_target_steering_is_kept(left: list[Point], right: list[Point]
 
 
 @both_splines
-def test_straight_road_and_left_bend(spline: str) -> None:
-    road = [(0.8 + 1.6 * i, 1.2) for i in range(4)]
-    assert advice(road, [(x, -y) for x, y in road], 0.5, spline=spline) == pytest.approx(0, abs=1e-6)
-    left, right = ([(0.5 + 1.5 * i, side + 0.15 * i**2) for i in range(4)] for side in (1.2, -1.2))
-    assert advice(left, right, spline=spline) > 0.05
-
-
-@both_splines
 @given(seed=seeds)
-def test_advice_is_antisymmetric(spline: str, seed: int) -> None:
+def test_advice_is_antisymmetric_and_independent_of_padding(spline: str, seed: int) -> None:
     guide = SplineGuide(spline).steer
     cones, count, steering = roads(seed, cars=40)
     mirrored = cones.flip(1) * torch.tensor([1.0, -1.0])
     assert torch.allclose(guide(mirrored, count.flip(1), -steering), -guide(cones, count, steering), rtol=0, atol=1e-9)
+    padding = torch.arange(SLOTS) >= count.unsqueeze(-1)
+    shuffled = torch.where(padding.unsqueeze(-1), cones.flip(2) - 3, cones)
+    assert torch.equal(guide(shuffled, count, steering), guide(cones, count, steering))
+    assert torch.equal(guide(cones[:, :, :6], count, steering), guide(cones, count, steering))
 
 
 @both_splines
@@ -150,17 +146,6 @@ def test_advice_is_batch_invariant(spline: str, dtype: torch.dtype) -> None:
         assert torch.equal(guide(*(value[car : car + 1] for value in batch)), together[car : car + 1])
 
 
-@both_splines
-@given(seed=seeds)
-def test_advice_is_independent_of_padding(spline: str, seed: int) -> None:
-    guide = SplineGuide(spline).steer
-    cones, count, steering = roads(seed, cars=20)
-    padding = torch.arange(SLOTS) >= count.unsqueeze(-1)
-    shuffled = torch.where(padding.unsqueeze(-1), cones.flip(2) - 3, cones)
-    assert torch.equal(guide(shuffled, count, steering), guide(cones, count, steering))
-    assert torch.equal(guide(cones[:, :, :6], count, steering), guide(cones, count, steering))
-
-
 coordinates = st.sampled_from([0.0, 1.0, 1.0 + 1e-7, -1.0, 2.0, 5.0]) | st.floats(-7, 7, width=32)
 points = st.lists(st.tuples(coordinates, coordinates), max_size=SLOTS)
 
@@ -177,12 +162,6 @@ def test_advice_is_an_action_for_any_cones(
         action = SplineGuide(spline).steer(cones.to(dtype), count, current.to(dtype))
         assert (action.shape, action.dtype) == ((1, 1), dtype)
         assert action.abs() <= 1
-
-
-@both_splines
-def test_cones_at_one_point_give_an_action(spline: str) -> None:
-    for point in ((0.0, 0.0), (3.0, 0.5), (-2.0, 1.0)):
-        assert abs(advice([point] * SLOTS, [point] * SLOTS, 0.1, spline=spline)) <= 1
 
 
 def test_keys_are_configurable_and_there_is_no_state() -> None:
