@@ -233,7 +233,7 @@ class ShuffledAdvice(DegradedAdvice):
 
     def _check_rows(self, rows: int) -> None:
         if rows < 2:
-            raise ValueError("ShuffledAdvice needs a batch of at least two rows, but the batch is one row")
+            raise ValueError("ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict.set(self.memory_key, next_tensordict[self.key].unsqueeze(-3))

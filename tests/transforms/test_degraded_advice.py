@@ -278,7 +278,7 @@ def test_one_row_cannot_be_shuffled():
     for env in (SerialEnv(1, PendulumEnv), PendulumEnv()):
         guide = TensorDictModule(lambda speed: -speed.unsqueeze(-1), in_keys=["thdot"], out_keys=["action"])
         single = TransformedEnv(env, GuideActions({"damp": guide}))
-        with pytest.raises(ValueError, match="at least two rows, but the batch is one row"):
+        with pytest.raises(ValueError, match="but the batch is one row; use more"):
             single.append_transform(ShuffledAdvice()).reset()
 
 
