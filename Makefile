@@ -29,9 +29,9 @@ evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
 	$(BIN)/coil-evaluate $(ARGS)
 
 # Stable-Baselines3 is only a yardstick, so .venv has it from here on and not before.
-bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='device=cuda'
+bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='--device cuda'
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
-	$(BIN)/coil-benchmark $(ARGS)
+	$(BIN)/python -m benchmarks $(ARGS)
 
 reproduce: $(INSTALLED) ## make every result of the paper again, as small as can be; in earnest with BUDGET=paper
 	$(BIN)/coil-reproduce all=true budget=$(BUDGET) $(ARGS)
@@ -48,7 +48,7 @@ kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and
 check: $(INSTALLED) ## lint, formatting, types and import directions
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy -p coil_rl
+	$(BIN)/mypy -p coil_rl -p benchmarks
 	$(BIN)/lint-imports --no-logo
 
 format: $(INSTALLED) ## format the code and mend what lint can mend

@@ -1,18 +1,21 @@
-"""TorchRL transforms that bring guides to any env, and that spoil their advice on purpose."""
+"""TorchRL transforms for guides in any env: advice, combined actions, reward coupling, degraded advice."""
 
-from coil_rl.transforms.combined_actions import MixedAction, ResidualAction
+from coil_rl.transforms.combined_actions import JumpStart, MixedAction, ResidualAction, Takeover
 from coil_rl.transforms.degraded_advice import (
     BiasedAdvice,
     DegradedAdvice,
+    DelayedAdvice,
+    NoisyAdvice,
     PartialAdvice,
+    RandomAdvice,
+    RemovedAdvice,
     ScaledAdvice,
+    ShuffledAdvice,
 )
 from coil_rl.transforms.discrete_actions import DiscreteActions
-from coil_rl.transforms.displaced_advice import DelayedAdvice, RemovedAdvice, ShuffledAdvice
-from coil_rl.transforms.drawn_advice import NoisyAdvice, RandomAdvice
-from coil_rl.transforms.guide_actions import GuideActions
+from coil_rl.transforms.guide_actions import GuideActions, Guides
+from coil_rl.transforms.guide_transform import GuideTransform
 from coil_rl.transforms.reward_coupling import RewardCoupling
-from coil_rl.transforms.takeover import JumpStart, Takeover
 
 __all__ = [
     "BiasedAdvice",
@@ -20,6 +23,8 @@ __all__ = [
     "DelayedAdvice",
     "DiscreteActions",
     "GuideActions",
+    "GuideTransform",
+    "Guides",
     "JumpStart",
     "MixedAction",
     "NoisyAdvice",

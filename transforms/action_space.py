@@ -1,19 +1,21 @@
-"""Actions as vectors of numbers, whatever an env takes."""
+"""Conversion between the actions of an env and vectors of numbers."""
 
 from __future__ import annotations
 
 import torch
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
+from torchrl.envs import Transform
 
 
 class ActionSpace:
-    """One env's actions as vectors [*batch, A]; a choice among n becomes one-hot, with A = n.
+    """Actions of an env as vectors [*batch, A]; a discrete action is one-hot, A is the number of choices.
 
     Args:
-        spec: of the action.
-        batch_dims: of the env.
+        spec: action spec of the env.
+        batch_dims: number of batch dimensions of the env.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
@@ -26,15 +28,28 @@ class ActionSpace:
         first = (0,) * batch_dims
         self.bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
 
+    @classmethod
+    def of_parent(cls, transform: Transform, action_key: NestedKey) -> ActionSpace:
+        """Return the action space of the env of a transform. Slow: `Transform.parent` rebuilds the env.
+
+        Raises:
+            RuntimeError: outside an env.
+        """
+        if transform.parent is None:
+            raise RuntimeError(
+                f"{type(transform).__name__} needs the action spec of an env: use it in a TransformedEnv"
+            )
+        return cls(transform.parent.full_action_spec[action_key], transform.parent.batch_dims)
+
     def vectors(self, action: Tensor) -> Tensor:
-        """Actions as the env takes them, to [*batch, A]."""
+        """Convert env actions to vectors [*batch, A]."""
         if self.choices:
             batch = action.shape[: action.ndim - len(self.event)]
             action = F.one_hot(action.reshape(batch).long(), self.choices)
         return action if action.dtype.is_floating_point else action.to(self.dtype)
 
     def actions(self, vectors: Tensor) -> Tensor:
-        """[*batch, A] to actions as the env takes them: of the choices, the one with the largest number."""
+        """Convert vectors [*batch, A] to env actions; a discrete action is the argmax."""
         if self.continuous:
             return vectors
         best = vectors.argmax(-1)
@@ -43,11 +58,11 @@ class ActionSpace:
         return best.reshape((*best.shape, *self.event)).to(self.spec.dtype)
 
     def clamp(self, vectors: Tensor) -> Tensor:
-        """[*batch, A] within the bounds of the action, if it has any."""
+        """Clamp vectors [*batch, A] to the bounds of the action, if it has any."""
         return vectors if self.bounds is None else vectors.clamp(*self.bounds)
 
     def advice_spec(self, batch: torch.Size, guides: int) -> TensorSpec:
-        """Of [*batch, guides, A]: bounded like the action, and within 0 and 1 where it is one-hot."""
+        """Return the spec of advice [*batch, guides, A]: bounds of the action, 0 and 1 for one-hot vectors."""
         shape, device = (*batch, guides, self.size), self.spec.device
         if not self.continuous:
             return Bounded(0, 1, shape, device=device, dtype=self.dtype)

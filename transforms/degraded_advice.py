@@ -1,45 +1,48 @@
-"""Advice that is made worse on purpose: guides that are biased, undertuned or right half of the time.
+"""Degraded advice: controls for the claim that a guide helps.
 
-Whoever claims that a guide helped compares it with these. Each stands behind `GuideActions` and changes what it wrote,
-under the same key and within the same bounds, so that nothing downstream knows; behind one another they add up.
+Each transform follows `GuideActions` and changes its entry in place, within the same bounds, so several can be chained.
+Biased, scaled, partial, delayed and noisy advice degrade a guide. Random, shuffled and removed advice are placebos.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Bounded, Composite
+from torch.nn import functional as F
+from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
+
+from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class DegradedAdvice(Transform):
-    """Changes the advice of every guide in the same way; what comes out of the advice's bounds is clipped to them.
+    """Base class: applies `degrade` to the advice of all guides and clamps the result to the bounds of the advice.
 
-    A subclass says how, in `degrade`. A call with stored data, `transform(tensordict)`, does the same; only a transform
-    that belongs to an env knows bounds.
+    `transform(tensordict)` does the same for stored data; outside an env there are no bounds.
 
     Args:
-        key: the advice, [*batch, n_guides, A] in action units.
+        key: entry of the advice, [*batch, n_guides, A] in action units.
+        memory_key: entry for advice of the past, [*batch, slots, n_guides, A].
+        slots: length of the memory; 0 for none.
     """
 
-    low: Tensor | None
-    high: Tensor | None
+    needs_past = False  # whether stored data of a single step are not enough
 
-    def __init__(self, key: NestedKey = "guide_action") -> None:
-        super().__init__(in_keys=[key], out_keys=[key])
-        self.key = key
-        # Asking the env costs as much as a step, so it is asked once.
-        self._asked = False
-        self.register_buffer("low", None, persistent=False)
-        self.register_buffer("high", None, persistent=False)
+    def __init__(self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0) -> None:
+        super().__init__(in_keys=[key], out_keys=[key, memory_key] if slots else [key])
+        self.key, self.memory_key, self.slots = key, memory_key, slots
+        self._bounds: tuple[Tensor, Tensor] | None = None
+        self._bounds_known = False
 
     def degrade(self, advice: Tensor) -> Tensor:
-        """The advice [*batch, n_guides, A] made worse."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how it changes the advice: define degrade")
+        """Return the degraded advice, [*batch, n_guides, A]."""
+        raise NotImplementedError(f"{type(self).__name__} must define degrade")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict, self.degrade(next_tensordict[self.key]))
@@ -48,40 +51,57 @@ class DegradedAdvice(Transform):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Degrade the advice in stored data, of any batch size."""
-        return self._call(tensordict)
-
-    def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
-        if not self._asked and self.parent is not None:
-            self._asked, spec = True, self.parent.full_observation_spec[self.key]
-            if isinstance(spec, Bounded):
-                first = (0,) * len(self.parent.batch_size)
-                self.low, self.high = spec.space.low[first], spec.space.high[first]
-        return tensordict.set(self.key, advice if self.low is None else advice.clamp(self.low, self.high))
-
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Leave it as it is.
+        """Degrade the advice in stored data of any batch size.
 
         Raises:
-            KeyError: without advice in it.
+            RuntimeError: if the transform needs previous steps.
+        """
+        if self.needs_past:
+            raise RuntimeError(f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv")
+        return DegradedAdvice._call(self, tensordict)
+
+    def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
+        if not self._bounds_known and self.parent is not None:
+            spec, first = self.parent.full_observation_spec[self.key], (0,) * len(self.parent.batch_size)
+            self._bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
+            self._bounds_known = True  # `self.parent` is as slow as an env step
+        return tensordict.set(self.key, advice if self._bounds is None else advice.clamp(*self._bounds))
+
+    def _memory_spec(self, advice: TensorSpec) -> dict[NestedKey, TensorSpec]:
+        *batch, guides, size = advice.shape
+        memory = advice.unsqueeze(-3).expand(*batch, self.slots, guides, size)
+        return {self.memory_key: memory.clone()} if self.slots else {}
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory.
+
+        Raises:
+            KeyError: without advice.
         """
         if self.key not in observation_spec.keys(True, True):
             raise KeyError(
                 f"{type(self).__name__} changes {self.key!r}, but the env writes {sorted(map(str, observation_spec))}; "
                 "put it behind GuideActions"
             )
-        return observation_spec
+        return observation_spec.update(self._memory_spec(observation_spec[self.key]))
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Add the memory, which is an input of resets."""
+        if self.slots:
+            state = input_spec["full_state_spec"]
+            if state is None:
+                state = Composite(shape=input_spec.shape, device=input_spec.device)
+            memory = self._memory_spec(self.parent.full_observation_spec[self.key])
+            input_spec["full_state_spec"] = state.update(memory)
+        return input_spec
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice that is off by the same amount always.
+    """Advice with a constant offset.
 
     Args:
-        offset: in action units.
-        key: the advice, [*batch, n_guides, A].
-
-    Raises:
-        ValueError: for an offset that is not finite.
+        offset: in action units, finite.
+        key: entry of the advice.
     """
 
     def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
@@ -89,22 +109,18 @@ class BiasedAdvice(DegradedAdvice):
         self.offset = _finite("offset", offset)
 
     def degrade(self, advice: Tensor) -> Tensor:
-        """Advice + offset."""
+        """Return advice + offset."""
         return advice + self.offset
 
 
 class ScaledAdvice(DegradedAdvice):
-    """A fraction of the advice.
+    """Advice multiplied by a constant.
 
     Args:
-        gain: 0.5 is an undertuned guide, 0 a silent one, -1 an adversary.
-        key: the advice, [*batch, n_guides, A].
-
-    Raises:
-        ValueError: for a gain that is not finite.
+        gain: 0.5 for an undertuned guide, 0 for no advice, -1 for an adversary; finite.
+        key: entry of the advice.
 
     Example:
-        >>> import torch
         >>> from tensordict import TensorDict
         >>> stored = TensorDict({"guide_action": torch.tensor([[[0.5]], [[-1.0]]])}, [2])
         >>> ScaledAdvice(gain=-1)(stored)["guide_action"].flatten().tolist()
@@ -116,19 +132,16 @@ class ScaledAdvice(DegradedAdvice):
         self.gain = _finite("gain", gain)
 
     def degrade(self, advice: Tensor) -> Tensor:
-        """Advice * gain."""
+        """Return advice * gain."""
         return advice * self.gain
 
 
 class PartialAdvice(DegradedAdvice):
-    """Advice that is right where it steers to one side, and 0 where it should steer to the other.
+    """Advice to one side only; 0 for the other side.
 
     Args:
-        side: "left" keeps what is positive, "right" what is negative.
-        key: the advice, [*batch, n_guides, A].
-
-    Raises:
-        ValueError: for another side.
+        side: "left" keeps positive values, "right" negative values.
+        key: entry of the advice.
     """
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
@@ -138,8 +151,176 @@ class PartialAdvice(DegradedAdvice):
         self.side = side
 
     def degrade(self, advice: Tensor) -> Tensor:
-        """The positive or the negative part of the advice."""
+        """Return the positive or the negative part of the advice."""
         return advice.clamp(min=0) if self.side == "left" else advice.clamp(max=0)
+
+
+class NoisyAdvice(DegradedAdvice):
+    """Advice with Gaussian noise, independent at every step.
+
+    Args:
+        sigma: standard deviation in action units.
+        seed: seed of the noise.
+        key: entry of the advice.
+    """
+
+    def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
+        super().__init__(key)
+        if not 0 <= sigma < math.inf:
+            raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
+        self.sigma, self.rng = sigma, SeededGenerator(seed)
+
+    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+        """Return advice + noise."""
+        return torch.add(advice, _draw(torch.randn, self.rng, advice, after_reset), alpha=self.sigma)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        after_reset = tensordict.get("_reset", None) is not None
+        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+
+
+class RandomAdvice(DegradedAdvice):
+    """Placebo: uniform random numbers in place of the advice, independent at every step.
+
+    Args:
+        low: lower bound in action units.
+        high: upper bound.
+        seed: seed of the draws.
+        key: entry of the advice.
+    """
+
+    def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
+        super().__init__(key)
+        if not -math.inf < low < high < math.inf:
+            raise ValueError(f"low={low} must be less than high={high}, and both finite")
+        self.low, self.range, self.rng = low, high - low, SeededGenerator(seed)
+
+    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+        """Return random numbers."""
+        return self.low + self.range * _draw(torch.rand, self.rng, advice, after_reset)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        after_reset = tensordict.get("_reset", None) is not None
+        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+
+
+class ShuffledAdvice(DegradedAdvice):
+    """Placebo: the advice for another row of the batch; same distribution, no information.
+
+    At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
+    advice of another row.
+
+    Args:
+        seed: seed of the draws.
+        key: entry of the advice.
+        memory_key: entry for the original advice, [*batch, 1, n_guides, A].
+
+    Raises:
+        ValueError: for a batch of one row, when the env builds its specs.
+    """
+
+    def __init__(
+        self, seed: int = 0, key: NestedKey = "guide_action", memory_key: NestedKey = "unshuffled_advice"
+    ) -> None:
+        super().__init__(key, memory_key, slots=1)
+        self.rng = SeededGenerator(seed)
+
+    def degrade(self, advice: Tensor) -> Tensor:
+        """Return the advice for other rows."""
+        rows = advice.flatten(0, -3) if advice.ndim > 2 else advice.unsqueeze(0)
+        self._check_rows(len(rows))
+        return rows.roll(int(torch.randint(1, len(rows), (), generator=self.rng.generator)), 0).view_as(advice)
+
+    def _check_rows(self, rows: int) -> None:
+        if rows < 2:
+            raise ValueError("ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more")
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        next_tensordict.set(self.memory_key, next_tensordict[self.key].unsqueeze(-3))
+        return super()._call(next_tensordict)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        mask, previous = tensordict.get("_reset", None), tensordict.get(self.memory_key, None)
+        if mask is None or previous is None or mask.all():
+            return self._call(tensordict_reset)
+        tensordict_reset.set(self.memory_key, tensordict_reset[self.key].unsqueeze(-3))
+        return self._write(tensordict_reset, self.degrade(previous.squeeze(-3)))
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory."""
+        self._check_rows(self.parent.batch_size.numel())
+        return super().transform_observation_spec(observation_spec)
+
+
+class DelayedAdvice(DegradedAdvice):
+    """Advice of an earlier step; at first the first advice of the episode.
+
+    Args:
+        steps: delay; 0 for none.
+        key: entry of the advice.
+        memory_key: entry for the advice of the last `steps` steps, [*batch, steps, n_guides, A], oldest first.
+    """
+
+    needs_past = True
+
+    def __init__(
+        self, steps: int = 12, key: NestedKey = "guide_action", memory_key: NestedKey = "delayed_advice"
+    ) -> None:
+        if steps < 0:
+            raise ValueError(f"steps={steps} must be at least 0")
+        super().__init__(key, memory_key, steps)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        if self.slots:
+            first = tensordict_reset[self.key].unsqueeze(-3)
+            tensordict_reset.set(self.memory_key, first.repeat_interleave(self.slots, -3))
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.slots:
+            return next_tensordict
+        memory, newest = tensordict[self.memory_key], next_tensordict[self.key].unsqueeze(-3)
+        next_tensordict.set(self.memory_key, torch.cat([memory[..., 1:, :, :], newest], -3))
+        return next_tensordict.set(self.key, memory[..., 0, :, :])
+
+
+class RemovedAdvice(DegradedAdvice):
+    """Placebo: the agent's previous action in place of the advice; zeros at the start of an episode.
+
+    Args:
+        key: entry of the advice.
+        action_key: entry of the action; a discrete action becomes one-hot.
+    """
+
+    needs_past = True
+
+    def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
+        super().__init__(key)
+        self.action_key = action_key
+
+    def degrade(self, advice: Tensor) -> Tensor:
+        """Return zeros, for the first step."""
+        return torch.zeros_like(advice)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        advice = next_tensordict[self.key]
+        action = tensordict[self.action_key].reshape(*next_tensordict.batch_size, -1)
+        if action.shape[-1] != advice.shape[-1]:
+            action = F.one_hot(action.squeeze(-1).long(), advice.shape[-1])
+        return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
+
+
+def _draw(sample: Callable[..., Tensor], rng: SeededGenerator, advice: Tensor, after_reset: bool) -> Tensor:
+    """Draw one random number for each number of the advice.
+
+    A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
+    generator: later draws then do not depend on when other rows are reset.
+    """
+    state = rng.generator.get_state() if after_reset else None
+    draws = sample(2, *advice.shape, generator=rng.generator)
+    if state is not None:
+        rng.generator.set_state(state)
+    return draws[int(after_reset)].to(advice)
 
 
 def _finite(name: str, value: float) -> float:

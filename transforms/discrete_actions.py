@@ -1,10 +1,11 @@
-"""Choices in place of numbers: the agent picks one of a few actions of an env that takes a number."""
+"""Discrete actions for an env with one bounded continuous action."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Sequence
+from functools import cached_property
 
 import torch
 from tensordict import TensorDictBase
@@ -18,22 +19,20 @@ from coil_rl.transforms.action_space import ActionSpace
 
 
 class DiscreteActions(Transform):
-    """Gives an agent a few values of an action to choose from, and advice as the nearest of them.
+    """Discretise the action, and round the advice to the nearest choice.
 
-    The agent's action becomes the number of its choice, and of the advice it sees which choice is nearest, one-hot. It
-    stands last: whatever stands before it, and the env, has numbers in action units as without it. A residual agent
-    adds its choice to what the guide really advises, a guide that takes over is not rounded, and the distance that
-    `RewardCoupling` charges for is the one between the number chosen and the number advised.
+    The agent's action becomes the index of a choice, and the advice becomes one-hot. Place it last: the transforms
+    before it and the env work in action units, with the advice as given, not rounded.
 
     Args:
-        choices: how many, equally spaced from bound to bound, or the numbers themselves.
-        action_key: the action, one bounded number; becomes [*batch], int64.
-        advice_key: the advice, [*batch, n_guides, 1], if there is any; becomes [*batch, n_guides, n], 0 or 1.
-        number_key: where the advice stays as it was, [*batch, n_guides, 1].
+        choices: number of choices, equally spaced from bound to bound, or the values in action units.
+        action_key: entry of the action, one bounded number; becomes [*batch], int64.
+        advice_key: entry of the advice, if any, [*batch, n_guides, 1]; becomes [*batch, n_guides, n], 0 or 1.
+        number_key: entry for the advice in action units, [*batch, n_guides, 1].
 
     Raises:
-        ValueError: for fewer than two choices, choices that are not finite or do not rise, and, as soon as it belongs
-            to an env, for an action of another kind or a choice beyond its bounds.
+        ValueError: for fewer than two choices, or values that are not finite and increasing; in an env also for an
+            action of another kind, or values outside its bounds.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -55,33 +54,20 @@ class DiscreteActions(Transform):
             if choices < 2:
                 raise ValueError(f"choices={choices} must be at least 2")
         elif len(choices) < 2 or not all(low < high for low, high in itertools.pairwise(choices)):
-            raise ValueError(f"choices={list(choices)} must be at least two numbers, each more than the one before it")
+            raise ValueError(f"choices={list(choices)} must be at least two increasing numbers")
         elif not all(map(math.isfinite, choices)):
             raise ValueError(f"choices={list(choices)} must be finite")
         self.choices = choices
         self.action_key, self.advice_key, self.number_key = action_key, advice_key, number_key
-        self._values: Tensor | None = None
 
-    @property
+    @cached_property
     def values(self) -> Tensor:
-        """[n], what each choice stands for, in action units.
-
-        Raises:
-            RuntimeError: outside an env.
-        """
-        if self._values is None:
-            if self.parent is None:
-                raise RuntimeError("DiscreteActions works inside a TransformedEnv only: it needs the env's action spec")
-            self._values = self._of(self.parent.full_action_spec[self.action_key])
-        return self._values
-
-    def _of(self, spec: Bounded) -> Tensor:
+        """[n], values of the choices in action units; RuntimeError outside an env."""
+        spec = ActionSpace.of_parent(self, self.action_key).spec
         size = spec.shape[self.parent.batch_dims :].numel()
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point or size != 1:
             kind = f"{size} numbers" if spec.dtype.is_floating_point and size != 1 else type(spec).__name__
-            raise ValueError(
-                f"DiscreteActions makes choices of one number between bounds, but this env's action is {kind}"
-            )
+            raise ValueError(f"DiscreteActions needs an action of one bounded number, but this env's action is {kind}")
         low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
         if isinstance(self.choices, int):
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
@@ -89,19 +75,16 @@ class DiscreteActions(Transform):
             raise ValueError(f"choices={list(self.choices)} must lie between the action's bounds {low} and {high}")
         return torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
 
-    def nearest(self, numbers: Tensor) -> Tensor:
-        """Numbers [..., 1] to the number of the choice that is nearest, [...]; between two the lower one."""
-        return (numbers - self.values).abs().argmin(-1)
-
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Make choices of the advice in stored data, of any batch size."""
+        """Discretise the advice in stored data of any batch size."""
         return self._call(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         numbers = next_tensordict.get(self.advice_key, None)
         if numbers is None:
             return next_tensordict
-        choices = F.one_hot(self.nearest(numbers), len(self.values)).to(numbers.dtype)
+        nearest = (numbers - self.values).abs().argmin(-1)  # of two the lower one
+        choices = F.one_hot(nearest, len(self.values)).to(numbers.dtype)
         return next_tensordict.set(self.number_key, numbers).set(self.advice_key, choices)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -114,12 +97,12 @@ class DiscreteActions(Transform):
         return tensordict.set(self.action_key, self.values[tensordict[self.action_key]].unsqueeze(-1))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
-        """Make the action a choice."""
+        """Replace the action spec."""
         input_spec["full_action_spec", self.action_key] = self._action_spec()
         return input_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Make the advice one-hot, beside the advice as it was."""
+        """Replace the spec of the advice and add `number_key`."""
         numbers = observation_spec.get(self.advice_key, None)
         if numbers is not None:
             space = ActionSpace(self._action_spec(), self.parent.batch_dims)

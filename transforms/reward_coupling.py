@@ -1,4 +1,4 @@
-"""Reward coupling (RFC): the agent pays for the distance between its action and the guide's (paper equation 93)."""
+"""Reward coupling (RFC): a penalty on the distance between the actions of agent and guide (paper equation 93)."""
 
 from __future__ import annotations
 
@@ -6,27 +6,26 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
 from torchrl.data import Composite, Unbounded
 
-from coil_rl.transforms.guided import Guided, Schedule
+from coil_rl.transforms.guide_transform import GuideTransform, Schedule
 
-ORDERS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
+NORMS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
 
 
-class RewardCoupling(Guided):
-    """Makes the reward R - beta ||a - g||, where g is the advice the agent saw when it chose a.
+class RewardCoupling(GuideTransform):
+    """Reward R - beta ||a - g||, where g is the advice that the agent observed before action a.
 
-    Beside it, `task_reward` [*batch, 1] is the env's own reward, and `guide_distance` [*batch, 1] is ||a - g||. In
-    evaluation the reward is the task's.
+    Writes the env's own reward as `task_reward` [*batch, 1] and ||a - g|| as `guide_distance` [*batch, 1]. In
+    evaluation the reward is the task reward.
 
     Args:
-        beta: price of the distance, a number or a schedule over the run.
-        norm: of the distance. Between choices, which are one-hot, l1 says 2 where they differ, l2 the root of it.
-        guide: which row of the advice.
+        beta: weight of the distance, a number or a schedule over the run.
+        norm: norm of the distance. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
+        guide: row of the advice.
 
     Raises:
-        ValueError: for a norm that is none.
+        ValueError: for an unknown norm.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -39,35 +38,30 @@ class RewardCoupling(Guided):
         True
     """
 
-    alters = "beta"
+    mdp_parameter = "beta"
 
     def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", guide: int = 0) -> None:
-        if norm not in ORDERS:
-            raise ValueError(f"norm={norm!r} must be one of {', '.join(ORDERS)}")
+        if norm not in NORMS:
+            raise ValueError(f"norm={norm!r} must be one of {', '.join(NORMS)}")
         super().__init__(["task_reward", "guide_distance"], guide=guide)
-        self.beta, self.order = beta, ORDERS[norm]
+        self.beta, self.order = beta, NORMS[norm]
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict["reward"]
-        difference = self.space.vectors(tensordict[self.action_key]) - self.advice(tensordict)
+        difference = self.action_space.vectors(tensordict[self.action_key]) - self.advice(tensordict)
         distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True).to(reward.dtype)
-        next_tensordict.set("task_reward", reward)
-        next_tensordict.set("guide_distance", distance)
+        next_tensordict.set("task_reward", reward).set("guide_distance", distance)
         if self.training:
-            next_tensordict.set("reward", reward - self.now(self.beta) * distance)
+            next_tensordict.set("reward", reward - self.current(self.beta) * distance)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         for key in self.out_keys:
-            tensordict_reset.set(key, self._zero())
+            tensordict_reset.set(key, self.parent.full_reward_spec["reward"].zero())
         return tensordict_reset
 
-    def _zero(self) -> Tensor:
-        zero: Tensor = self.parent.full_reward_spec["reward"].zero()
-        return zero
-
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the two parts of the reward."""
+        """Add `task_reward` and `guide_distance`."""
         observation_spec = super().transform_observation_spec(observation_spec)
         reward = self.parent.full_reward_spec["reward"]
         for key in self.out_keys:

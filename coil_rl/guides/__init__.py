@@ -1,7 +1,7 @@
 """Guides: controllers that advise an agent. Each is a TensorDictModule that writes an action."""
 
-from coil_rl.guides.racing import RacingGuide
+from coil_rl.guides.racing_line import RacingLineGuide
 from coil_rl.guides.simple import ConstantGuide, FollowAdvice, RandomGuide, ZeroGuide
 from coil_rl.guides.spline import SplineGuide
 
-__all__ = ["ConstantGuide", "FollowAdvice", "RacingGuide", "RandomGuide", "SplineGuide", "ZeroGuide"]
+__all__ = ["ConstantGuide", "FollowAdvice", "RacingLineGuide", "RandomGuide", "SplineGuide", "ZeroGuide"]

@@ -1,4 +1,4 @@
-"""The policy of a run as a guide: today's agent can advise tomorrow's."""
+"""The policy of a finished run as a guide."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from coil_rl.train.load import load_policy, read_config
 
 
 class LearnedGuide(TensorDictModuleBase):
-    """What a trained policy would do, its action being the deterministic one.
-
-    It brings along what the policy needs: a policy of COIL asks its own guide, a residual policy adds to it.
+    """Deterministic action of a trained policy, with the guides and action transforms of its run.
 
     Args:
-        run: the folder that `coil-train` left.
-        which: the last policy, or the one with the best return of a training batch.
-        device: where it runs.
+        run: folder of a run of `coil-train`.
+        which: the last policy, or the one with the best training return.
+        device: device of the networks.
 
     Raises:
         UserError: if the folder holds no finished run.
+        ValueError: if the run has no policy (method=guide).
     """
 
     def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
@@ -34,25 +33,25 @@ class LearnedGuide(TensorDictModuleBase):
         config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
-        # What the transforms need of an env are its specs; one of them is there for two cars or more.
+        # The transforms need the specs of an env; some need at least two rows.
         env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
         self.policy, self.transforms = load_policy(folder, config, env, which), None
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
         if config.method.needs_guide or config.action:
             self.transforms = env.transform
             self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
-        # Transforms know their env by a weak reference; in a tuple it is no module of this one.
-        self._kept = (env,)
+        # Transforms hold a weak reference to their env; the tuple keeps it from becoming a submodule.
+        self._env = (env,)
         self.requires_grad_(False)
         self.eval()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action`, as the env gets it in the end."""
-        seen = tensordict.select(*self.in_keys)
+        """Write `action` as executed by the env."""
+        data = tensordict.select(*self.in_keys)
         if self.transforms is not None:
-            seen = self.transforms(seen)
+            data = self.transforms(data)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            chosen = self.policy(seen)
+            data = self.policy(data)
         if self.transforms is not None:
-            chosen = self.transforms.inv(chosen)
-        return tensordict.set("action", chosen["action"])
+            data = self.transforms.inv(data)
+        return tensordict.set("action", data["action"])

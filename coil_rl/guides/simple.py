@@ -1,4 +1,4 @@
-"""Guides that know nothing: the zero line for every claim that a guide helped."""
+"""Constant and random guides as baselines, and a policy that follows the advice."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class _Constant(nn.Module):
@@ -25,32 +26,23 @@ class _Constant(nn.Module):
         return self.value.expand(*observation.shape[:-1], -1)
 
 
-class _Random(nn.Module):
+class _Uniform(SeededGenerator):
     def __init__(self, low: float, high: float, size: int, seed: int) -> None:
-        super().__init__()
+        super().__init__(seed)
         self.low, self.high, self.size = low, high, size
-        self.generator = torch.Generator().manual_seed(seed)
 
     def forward(self, observation: Tensor) -> Tensor:
         draw = torch.rand(*observation.shape[:-1], self.size, generator=self.generator)
         return (self.low + (self.high - self.low) * draw).to(observation)
 
-    def get_extra_state(self) -> Tensor:
-        """The generator's state."""
-        return self.generator.get_state()
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Restore the generator."""
-        self.generator.set_state(state.cpu())
-
 
 class ConstantGuide(TensorDictModule):
-    """Always the same action.
+    """Guide with a constant action.
 
     Args:
         value: the action, one number or one per dimension.
-        in_key: an entry [*batch, N] that tells the batch shape.
-        out_key: where to write the action, [*batch, A].
+        in_key: any entry [*batch, N], for the batch shape.
+        out_key: entry for the action, [*batch, A].
     """
 
     pure = True
@@ -62,12 +54,12 @@ class ConstantGuide(TensorDictModule):
 
 
 class ZeroGuide(ConstantGuide):
-    """Always the action 0.
+    """Guide with the action 0.
 
     Args:
-        size: A, numbers in an action.
-        in_key: an entry [*batch, N] that tells the batch shape.
-        out_key: where to write the action, [*batch, A].
+        size: A, size of an action.
+        in_key: any entry [*batch, N], for the batch shape.
+        out_key: entry for the action, [*batch, A].
     """
 
     def __init__(self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action") -> None:
@@ -76,15 +68,15 @@ class ZeroGuide(ConstantGuide):
 
 
 class RandomGuide(TensorDictModule):
-    """A uniform action, drawn anew at every step from a generator of its own that `state_dict()` holds.
+    """Guide with uniform random actions; the state of its generator is in `state_dict()`.
 
     Args:
         low: lower bound.
         high: upper bound.
-        size: A, numbers in an action.
-        seed: of the generator.
-        in_key: an entry [*batch, N] that tells the batch shape.
-        out_key: where to write the action, [*batch, A].
+        size: A, size of an action.
+        seed: seed of the generator.
+        in_key: any entry [*batch, N], for the batch shape.
+        out_key: entry for the action, [*batch, A].
     """
 
     def __init__(
@@ -97,17 +89,17 @@ class RandomGuide(TensorDictModule):
         out_key: NestedKey = "action",
     ) -> None:
         _check_size(size)
-        super().__init__(_Random(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
+        super().__init__(_Uniform(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
 
 
 class FollowAdvice(TensorDictModuleBase):
-    """Does what the advice says that `GuideActions` wrote: so a guide drives, whatever else happened to its advice.
+    """Policy that takes the action advised by one guide, after all transforms of the advice.
 
     Args:
-        env: for its actions.
-        guide: which row of the advice, or which for each row of the env.
-        in_key: of the advice, [*batch, n_guides, A].
-        out_key: where to write the action.
+        env: env of the actions.
+        guide: row of the advice, or one for each row of the env.
+        in_key: entry of the advice, [*batch, n_guides, A].
+        out_key: entry for the action.
     """
 
     guide: Tensor
@@ -121,15 +113,14 @@ class FollowAdvice(TensorDictModuleBase):
     ) -> None:
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
-        self.space = ActionSpace(env.full_action_spec[out_key], env.batch_dims)
+        self.action_space = ActionSpace(env.full_action_spec[out_key], env.batch_dims)
         self.register_buffer("guide", torch.as_tensor(guide, device=env.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         advice = tensordict[self.in_keys[0]]
         guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
-        advice = advice.gather(-2, guide).squeeze(-2)
-        return tensordict.set(self.out_keys[0], self.space.actions(advice))
+        return tensordict.set(self.out_keys[0], self.action_space.actions(advice.gather(-2, guide).squeeze(-2)))
 
 
 def _check_size(size: int) -> None:

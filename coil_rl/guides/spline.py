@@ -1,4 +1,4 @@
-"""The paper's safety policy (appendix A.1): steer along the middle of the cones in sight."""
+"""Safety policy of the paper (appendix A.1): pursuit of a spline through the middle of the visible cones."""
 
 from __future__ import annotations
 
@@ -18,48 +18,54 @@ from coil_rl.envs.sight import field_of_view_margin
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
 
-PAIR_DISTANCE = 4.0
-TARGET_REACHED = 0.625
+PAIR_DISTANCE = 4.0  # m, between the two cones of a pair
+TARGET_REACHED = 0.625  # m
 FAR = 1e3  # m
 
 
-class Plan(NamedTuple):
-    """What the guide makes of the cones in sight; all places in m in the car's frame.
+class PathPlan(NamedTuple):
+    """Path through the visible cones, positions in m in the frame of the car.
 
     Attributes:
-        midpoints: of close left-right pairs, nearest first, [2, M, B].
-        pairs: how many of them are real, [B].
-        path: the spline through them.
-        targets: along the path, [2, T, B]; a shorter path repeats its last.
-        square: of their distances, [T, B] m^2.
-        barred: 0 for those ahead and not reached, else 1, [T, B].
+        midpoints: midpoints of left-right pairs, nearest first, [2, M, B].
+        midpoint_count: number of valid midpoints, [B].
+        path: spline through the midpoints.
+        targets: points along the path, [2, T, B]; a shorter path repeats its last point.
+        squared_distance: squared distance of the targets, [T, B] m^2.
+        excluded: 1 for targets that are reached or outside the field of view, else 0, [T, B].
     """
 
     midpoints: Tensor
-    pairs: Tensor
+    midpoint_count: Tensor
     path: Spline
     targets: Tensor
-    square: Tensor
-    barred: Tensor
+    squared_distance: Tensor
+    excluded: Tensor
+
+    def nearest_target(self) -> Tensor:
+        """Return the nearest target that is not excluded, [2, B]; any target if all are."""
+        return first_point(self.targets, self.squared_distance, self.excluded)
 
 
 class SplineGuide(TensorDictModuleBase):
-    """A smooth path through the midpoints of left-right pairs of cones, and pursuit of a target on it.
+    """Smooth path through the midpoints of left-right pairs of cones, and pursuit of its nearest target.
 
-    Reads `cones`, `cone_count` and `steering`, writes `action`: it knows the cones in sight and the steering in force,
-    never the map and never its own past.
+    Reads `cones`, `cone_count` and `steering` of the current step, writes `action`.
 
     Args:
-        spline: of the path, "cubic" (smoothing) or "quadratic" (least-squares parabola).
+        spline: "cubic" (smoothing spline) or "quadratic" (least-squares parabola).
         smoothing: lambda of the cubic smoothing spline, m^3.
-        gain: the advice is this fraction of equation 103.
+        gain: factor of the advice of equation 103.
         sharpness: power of the distance in equation 103.
-        max_steering: degrees of an action of 1.
-        cones: only the nearest so many cones of a side are paired.
-        midpoints: room for so many midpoints.
-        targets: room for so many targets along the path.
-        in_keys: where to read the three.
-        out_key: where to write the advice.
+        max_steering: steering angle of action 1, degrees.
+        cones: number of nearest cones of each side used for pairs.
+        midpoints: maximum number of midpoints.
+        targets: maximum number of targets along the path.
+        in_keys: entries of cones, cone count and steering.
+        out_key: entry for the advice.
+
+    Raises:
+        ValueError: for a value out of range.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -69,7 +75,7 @@ class SplineGuide(TensorDictModuleBase):
     """
 
     pure = True
-    spacing = 1.0  # m from target to target
+    spacing = 1.0  # m between targets
 
     def __init__(
         self,
@@ -105,59 +111,56 @@ class SplineGuide(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.steer(*(tensordict[key] for key in self.in_keys)))
 
     def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
-        """Advise a steering.
+        """Return the advice, [B, 1], as a fraction of `max_steering`.
 
         Args:
-            cones: [B, 2, K, 2] m in the car's frame, nearest first, left side first.
+            cones: [B, 2, K, 2] m in the frame of the car, nearest first, left side first.
             cone_count: [B, 2].
-            steering: [B, 1], the steering in force, kept where there is nothing to steer for.
-
-        Returns:
-            [B, 1], fraction of `max_steering`.
+            steering: [B, 1], current steering, returned if there is no target.
         """
         plan = self.plan(cones, cone_count)
-        advice = self._pursuit(pick(plan.targets, plan.square, plan.barred))
-        return torch.where(plan.barred.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
+        advice = self._pursuit(plan.nearest_target())
+        return torch.where(plan.excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
-    def plan(self, cones: Tensor, cone_count: Tensor) -> Plan:
-        """The path and the targets on it; arguments are those of `steer`."""
+    def plan(self, cones: Tensor, cone_count: Tensor) -> PathPlan:
+        """Return the path and its targets; arguments as for `steer`."""
         points, count = self._midpoints(cones, cone_count)
         path = self.fit(points, count)
         steps = (path.polyline_length / constant(self.spacing, points)).round_().clamp_(1, self.targets - 1)
-        targets = slots_in_use(steps, self.targets - 1) + 1
-        x, y = found = path.along((constant(range(targets), points[0]) / steps).clamp_(max=1))
+        slots = slots_in_use(steps, self.targets - 1) + 1
+        x, y = targets = path.along((constant(range(slots), points[0]) / steps).clamp_(max=1))
         square = torch.addcmul(x * x, y, y)
-        room = torch.minimum(square - constant(TARGET_REACHED**2, square), field_of_view_margin(x, square))
-        # One midpoint is no path.
-        room = torch.minimum(room, count - constant(2, count))
-        return Plan(points, count, path, found, square, room.lt_(constant(0, room)))
+        # Negative for an excluded target; a single midpoint is not a path.
+        margin = torch.minimum(square - constant(TARGET_REACHED**2, square), field_of_view_margin(x, square))
+        margin = torch.minimum(margin, count - constant(2, count))
+        return PathPlan(points, count, path, targets, square, margin.lt_(constant(0, margin)))
 
     def _pursuit(self, target: Tensor) -> Tensor:
-        """Equation 103 for targets [2, B] m that are ahead: [B], fraction of `max_steering`."""
+        """Return equation 103 for targets [2, B] m ahead: [B], fraction of `max_steering`."""
         x, y = target.unbind(0)
         square = torch.addcmul(x * x, y, y).clamp_(min=TARGET_REACHED**2)
-        # As exp and log, because a power rounds differently at the end of a tensor, and so does `atan2`.
+        # Powers and `atan2` round differently at the end of a tensor, so exp, log and atan.
         sharp = (square.log_() * constant(-self.sharpness / 2, square)).exp_()
         alpha = (y / x.clamp(min=torch.finfo(x.dtype).tiny)).atan_() * constant(180 / math.pi, x)
         beta = (alpha * sharp).atan_() * constant(self.gain * 2 / math.pi, x)
         return beta.clamp_(-abs(self.gain), abs(self.gain))
 
     def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Midpoints of close left-right pairs, nearest first: [2, M, B] m, and how many there are [B]."""
+        """Return the midpoints of close left-right pairs, nearest first, [2, M, B] m, and their number [B]."""
         near = cones[:, :, : slots_in_use(count, self.cones)].permute(3, 2, 1, 0)
         real = (count.t() - constant(range(near.shape[1]), near[0])).clamp_(0, 1)
-        # What is no cone lies apart from everything, so it makes no pair.
+        # Padding is moved far away, so that it makes no pairs.
         left, right = torch.lerp(constant((-FAR, FAR), near[0, 0]), near, real).unbind(2)
         left, right = left.unsqueeze(2), right.unsqueeze(1)
         apart = (left - right).square_().sum(0).ge_(constant(PAIR_DISTANCE**2, left)).flatten(0, 1)
-        middle = (left + right).flatten(1, 2)
+        doubled = (left + right).flatten(1, 2)
         total = (constant(len(apart), apart) - apart.sum(0)).clamp_(max=self.midpoints)
-        kept = slots_in_use(total, min(self.midpoints, len(apart)))
-        nearest = flat_index(smallest(middle.square().sum(0), apart, kept))
-        points = middle.flatten(1).index_select(1, nearest).view(2, kept, -1)
+        slots = slots_in_use(total, min(self.midpoints, len(apart)))
+        nearest = flat_index(smallest(doubled.square().sum(0), apart, slots))
+        points = doubled.flatten(1).index_select(1, nearest).view(2, slots, -1)
         return points * constant(0.5, points), total
 
 
-def pick(targets: Tensor, order: Tensor, barred: Tensor) -> Tensor:
-    """The first one by order [T, B] of the targets [2, T, B] that are not barred: [2, B]."""
-    return targets.flatten(1).index_select(1, flat_index(smallest(order, barred, 1)))
+def first_point(points: Tensor, order: Tensor, excluded: Tensor) -> Tensor:
+    """Return the point [2, B] with the smallest `order` [T, B] of the points [2, T, B] that are not excluded."""
+    return points.flatten(1).index_select(1, flat_index(smallest(order, excluded, 1)))

@@ -18,11 +18,11 @@ from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
-from coil_rl.guides.advice import Advice
 from coil_rl.learners import networks
 from coil_rl.learners.phases import Phases
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Schedule, schedule
+from coil_rl.transforms.guide_actions import Guides
 
 
 class DynamicCoil(PPO):
@@ -73,7 +73,7 @@ class DynamicCoil(PPO):
             raise ValueError(f"critic_phases={critic_phases!r} must be one of both, agent, guide")
         if not env.action_spec.dtype.is_floating_point:
             raise ValueError("guides learn through actions that are numbers; this env has choices")
-        self.advice = Advice(guides)
+        self.advice = Guides(guides, trainable=True)
         self.guides: dict[str, TensorDictModuleBase] = dict(guides)
         self.start = [{name: p.detach().clone() for name, p in guide.named_parameters()} for guide in guides.values()]
         self.phases = phases(len(guides))

@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.limits import check_numbers
-from coil_rl.transforms.guided import Guided
+from coil_rl.transforms.guide_transform import GuideTransform
 
 AFTER = ("reward", "done", "terminated")
 
@@ -67,10 +67,10 @@ class Replay:
         check_numbers(0, capacity, starts=starts)
         check_numbers(0, 2**63 - 1, seed=seed)
         for transform in env.modules():
-            if isinstance(transform, Guided) and callable(getattr(transform, transform.alters, None)):
+            if isinstance(transform, GuideTransform) and callable(getattr(transform, transform.mdp_parameter, None)):
                 raise ValueError(
-                    f"{transform.alters} of {type(transform).__name__} changes over the run, and with it what an "
-                    "action leads to, so that steps of the past would mislead; make it a number, or take a learner "
+                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run, and with it what "
+                    "an action leads to, so that steps of the past would mislead; make it a number, or take a learner "
                     "without replay, such as PPO"
                 )
         self.shared = "agent_acts" in env.observation_spec

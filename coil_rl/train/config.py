@@ -108,35 +108,6 @@ class Evaluate(Common):
 
 
 @dataclass
-class Batch:
-    """Frames between two updates."""
-
-    cars: int = MISSING
-    steps: int = MISSING
-
-
-@dataclass
-class Benchmark(Common):
-    """Configuration of `coil-benchmark`."""
-
-    learner: dict[str, Any] = MISSING
-    methods: dict[str, Any] = MISSING
-    parts: list[str] = MISSING
-    seconds: float = MISSING
-    repeats: int = MISSING
-    starts: int = MISSING
-    cars: list[int] = MISSING
-    batches: list[Batch] = MISSING
-    compare_cars: int = MISSING
-    memory_cars: list[int] = MISSING
-    sb3_frames: int = MISSING
-    compile: list[int] = field(default_factory=list)
-    quick: bool = False
-    when_quick: dict[str, Any] = field(default_factory=dict)
-    checkpoint_every: int = 1  # set by learners with replay for coil-train; nothing is written here
-
-
-@dataclass
 class Report:
     """Configuration of `coil-report`."""
 
@@ -222,7 +193,6 @@ REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
 ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
 ConfigStore.instance().store(name="schema", node=Train)
 ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
-ConfigStore.instance().store(name="benchmark_schema", node=Benchmark)
 ConfigStore.instance().store(name="report_schema", node=Report)
 ConfigStore.instance().store(name="listen_schema", node=Listen)
 ConfigStore.instance().store(name="replay_schema", node=Replay)

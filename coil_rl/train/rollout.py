@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.train.finite import check_batch
-from coil_rl.transforms.guided import Guided
+from coil_rl.transforms.guide_transform import GuideTransform
 
 
 class Rollout:
@@ -37,7 +37,7 @@ class Rollout:
         self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
     ) -> None:
         self.env, self.policy, self.steps = env.train(), policy, steps
-        self.guided = [module for module in env.modules() if isinstance(module, Guided)]
+        self.guided = [module for module in env.modules() if isinstance(module, GuideTransform)]
         self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row

@@ -10,9 +10,8 @@ from coil_rl.transforms import RewardCoupling
 
 
 @pytest.mark.parametrize(("norm", "order"), [("l1", 1), ("l2", 2), ("linf", torch.inf)])
-def test_reward_is_the_tasks_less_beta_times_the_distance(norm, order):
-    env = worlds.cones(RewardCoupling(0.3, norm)).train()
-    rollout = env.rollout(30, break_when_any_done=False)
+def test_reward_is_the_task_reward_minus_beta_times_the_distance(norm, order):
+    rollout = worlds.cones(RewardCoupling(0.3, norm)).train().rollout(30, break_when_any_done=False)
     after = rollout["next"]
     distance = torch.linalg.vector_norm(rollout["action"] - rollout["guide_action"][..., 0, :], order, -1, True)
     assert torch.equal(after["guide_distance"], distance)
@@ -20,7 +19,7 @@ def test_reward_is_the_tasks_less_beta_times_the_distance(norm, order):
     assert (distance > 0.01).any()
 
 
-def test_task_reward_is_to_the_bit_what_the_env_pays():
+def test_task_reward_is_exactly_the_reward_of_the_env():
     coupled, plain = worlds.cones(RewardCoupling(5.0)).train(), worlds.cones()
     actions = torch.rand(40, 6, 1, generator=torch.Generator().manual_seed(0)) * 2 - 1
     one, other = coupled.reset(), plain.reset()
@@ -31,43 +30,41 @@ def test_task_reward_is_to_the_bit_what_the_env_pays():
         one, other = step_mdp(ours), step_mdp(theirs)
 
 
-def test_evaluation_pays_the_tasks_reward_alone():
-    env = worlds.cones(RewardCoupling(5.0)).eval()
-    after = env.rollout(5, break_when_any_done=False)["next"]
-    assert torch.equal(after["reward"], after["task_reward"])
-    assert (after["guide_distance"] > 0).any()
-
-
-def test_a_sum_of_rewards_before_the_coupling_is_the_tasks():
+def test_reward_sum_before_the_coupling_is_of_the_task_reward():
     env = worlds.cones(RewardCoupling(5.0))
     env.transform.insert(0, RewardSum())
     after = env.train().rollout(10)["next"]
     torch.testing.assert_close(after["episode_reward"][:, -1], after["task_reward"].sum(1))
 
 
-def test_beta_follows_its_schedule():
-    coupling = RewardCoupling(Linear(1.0, 0.0))
+def test_beta_follows_its_schedule_in_training_and_is_zero_in_evaluation():
+    coupling = RewardCoupling(Linear(1.0, 0.5))
     env = worlds.cones(coupling).train()
-    for progress in (0.0, 0.25, 1.0):
+    for progress in (0.0, 0.5, 1.0):
         coupling.progress = progress
         after = env.rollout(3)["next"]
-        torch.testing.assert_close(after["task_reward"] - after["reward"], (1 - progress) * after["guide_distance"])
+        distance = (1 - progress / 2) * after["guide_distance"]
+        torch.testing.assert_close(after["task_reward"] - after["reward"], distance)
+    after = env.eval().rollout(3)["next"]
+    assert torch.equal(after["reward"], after["task_reward"])
+    assert (after["guide_distance"] > 0).any()
 
 
-def test_a_choice_costs_where_it_is_not_the_guides():
-    env = worlds.carts(RewardCoupling(0.5, "l1")).train()
-    rollout = env.rollout(5)
+def test_distance_of_discrete_actions_is_0_or_2():
+    rollout = worlds.carts(RewardCoupling(0.5, "l1")).train().rollout(5)
     differs = rollout["action"] != rollout["guide_action"].argmax(-1).squeeze(-1)
     assert torch.equal(rollout["next", "guide_distance"].squeeze(-1), 2.0 * differs)
 
 
 @pytest.mark.parametrize("env", worlds.everywhere(lambda: RewardCoupling(0.5)), ids=["cones", "pendulum", "carts"])
-def test_specs_hold_around_every_world(env):
+def test_specs_hold_in_every_env(env):
     check_env(env.train())
 
 
-def test_what_cannot_be_is_refused():
+def test_invalid_arguments_are_rejected():
     with pytest.raises(ValueError, match="norm='l3' must be one of l1, l2, linf"):
         RewardCoupling(0.5, "l3")
-    with pytest.raises(KeyError, match="RewardCoupling reads row 1 of guide_action, but there is 1 of them"):
+    with pytest.raises(ValueError, match="guide=-1 must be at least 0"):
+        RewardCoupling(0.5, guide=-1)
+    with pytest.raises(KeyError, match="RewardCoupling reads row 1 of guide_action, but there is advice of 1 guides"):
         worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1)

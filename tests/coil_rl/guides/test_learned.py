@@ -25,30 +25,27 @@ def run(request, tmp_path_factory):
     return make_untrained_run(tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split())
 
 
-def test_it_drives_as_the_policy_does_in_the_env_it_was_trained_in(run):
+def test_guide_drives_as_the_policy_in_its_own_env(run):
     config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
     overrides = {"num_cars": 3, "assignment": "cyclic"}
-    alone = evaluate_policy(build_env(config, overrides), agent)
+    policy = evaluate_policy(build_env(config, overrides), agent)
     guided = composed(*TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
     learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
-    assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in alone.episodes]
+    assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
 
 
-def test_it_is_a_guide_even_while_others_explore(run):
+def test_guide_is_deterministic_and_advises_another_agent(run):
     env = build_env(composed(*TINY, "method=ppo", "run_dir=unused"))
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
     check_guide(guide, data, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
-
-
-def test_it_may_guide_another_agent(run):
     config = composed(*TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
     step = build_env(config).rollout(5, break_when_any_done=False)[:, -1]
-    assert torch.equal(step["guide_action"][:, 0], build_guides(config)["learned"](step.clone())["action"])
+    assert torch.equal(step["guide_action"][:, 0], guide(step.clone())["action"])
 
 
-def test_a_folder_without_an_agent_is_refused(tmp_path):
+def test_a_folder_without_a_policy_is_rejected(tmp_path):
     with pytest.raises(UserError, match=r"run=.* is not the folder of a run: it has no config.yaml"):
         LearnedGuide(str(tmp_path))
     run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")

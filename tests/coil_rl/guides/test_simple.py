@@ -14,7 +14,7 @@ def test_constant_and_zero_keep_the_contract():
     assert (ZeroGuide(size=3)(DATA.copy())["action"] == 0).all()
 
 
-def test_random_is_uniform_and_belongs_to_its_seed():
+def test_random_is_uniform_and_depends_on_its_seed():
     guide, same, other = (RandomGuide(-2, 1, seed=seed) for seed in (7, 7, 8))
     many = TensorDict({"observation": torch.zeros(100_000, 1)}, [100_000])
     draw = guide(many.copy())["action"]

@@ -1,0 +1,1 @@
+"""Speed measurements, outside the installed package: `make bench` or `python -m benchmarks --help`."""

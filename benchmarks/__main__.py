@@ -1,0 +1,133 @@
+"""Command line of the speed measurements: measure the parts, compare with the goals, write benchmark.md and .json."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from argparse import Namespace
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.errors import HydraException
+from tabulate import tabulate
+from tqdm import tqdm
+
+from benchmarks.driving import measure_compiled, measure_driving, measure_robot, profile_operators
+from benchmarks.process import measure_processes
+from benchmarks.timing import Row
+from benchmarks.training import measure_one_car, measure_sb3, measure_shares, measure_training
+from coil_rl.errors import UserError
+from coil_rl.train.versions import versions
+
+PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
+    "processes": ("Start-up and memory of fresh processes", measure_processes),
+    "env": ("Env steps per second, with resets, random actions unless the guide drives", measure_driving),
+    "training": ("Training in frames per second", measure_training),
+    "shares": ("Shares of the time of an update, collection included", measure_shares),
+    "robot": ("Recordings and perception of the robot, 360 points a scan, CPU time", measure_robot),
+    "one_car": ("Guide drives, beside one car in NumPy and SciPy", measure_one_car),
+    "sb3": ("PPO beside Stable-Baselines3", measure_sb3),
+    "operators": ("Operators of 20 batched steps with advice", profile_operators),
+    "compiled": ("Env steps per second with advice under torch.compile", measure_compiled),
+}
+GOALS = [
+    ("training", "PPO / by hand, {batch}", "ppo / by hand", ">=", 0.9),
+    ("training", "COIL / by hand, {batch}", "coil / by hand", ">=", 0.9),
+    ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
+    ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
+    ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),
+    ("processes", "state per car (B), {cars} cars", "state per car (B)", "<", 2000),
+]
+FULL = {
+    "cars": [64, 256, 1024, 4096, 16384, 65536], "batches": [(256, 64), (1024, 32), (4096, 16)], "compare_cars": 4096,
+    "memory_cars": [64, 4096, 65536], "sb3_frames": 512, "seconds": 2.0, "repeats": 5,
+}  # fmt: skip
+QUICK = {
+    "cars": [16, 64], "batches": [(16, 16)], "compare_cars": 64, "memory_cars": [64, 1024], "sb3_frames": 64,
+    "seconds": 0.1, "repeats": 2,
+}  # fmt: skip
+
+
+def parse(argv: Sequence[str] | None = None) -> Namespace:
+    """Return the options, with the sizes of `FULL` or `QUICK`."""
+    parser = argparse.ArgumentParser("python -m benchmarks", description="Measure the speed of coil-rl.")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of coil-train, e.g. learner.compile=true")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda")
+    parser.add_argument("--threads", type=int, default=1, help="of torch")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=[name for name in PARTS if name != "compiled"])
+    parser.add_argument("--cars", nargs="+", type=int, help="numbers of cars for env steps")
+    parser.add_argument("--compile", nargs="+", type=int, default=[], metavar="CARS", help="also under torch.compile")
+    parser.add_argument("--seconds", type=float, help="of each subject, all rounds together")
+    parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it works")
+    parser.add_argument("--output", type=Path, default=Path("outputs/benchmark") / time.strftime("%Y-%m-%d_%H-%M-%S"))
+    args = parser.parse_intermixed_args(argv)
+    sizes = QUICK if args.quick else FULL
+    vars(args).update({key: value for key, value in sizes.items() if getattr(args, key, None) is None})
+    if args.compile:
+        args.parts = [*args.parts, "compiled"]
+    if (args.output / "benchmark.json").exists():
+        parser.error(f"{args.output} already holds a benchmark; choose another folder with --output")
+    return args
+
+
+def goals(results: Mapping[str, Any]) -> list[Row]:
+    """Return the measured values beside the goals of the project."""
+    rows: list[Row] = []
+    for part, subject, key, sign, bound in GOALS:
+        for row in results.get(part, []):
+            if key in row:
+                met = row[key] >= bound if sign == ">=" else row[key] < bound
+                rows.append(
+                    {"subject": subject.format(**row), "value": row[key], "goal": f"{sign} {bound}", "met": met}
+                )
+    return rows
+
+
+def page(results: Mapping[str, Any]) -> str:
+    """Return the results as Markdown tables."""
+    sections = [("Goals", results["goals"]), *((title, results.get(part)) for part, (title, _) in PARTS.items())]
+    return "\n\n".join(f"## {title}\n\n{_table(rows)}" for title, rows in sections if rows)
+
+
+def _table(rows: Sequence[Row] | str) -> str:
+    if isinstance(rows, str):
+        return f"```\n{rows}\n```"
+    cells = [{key: _cell(value) for key, value in row.items() if key != "rounds"} for row in rows]
+    return tabulate(cells, headers="keys", tablefmt="pipe", disable_numparse=True)
+
+
+def _cell(value: Any) -> str:
+    if not isinstance(value, float):
+        return "" if value is None else str(value)
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Measure, print the page and write it, with every number as JSON."""
+    args = parse(argv)
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(0)
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler prints its start and end otherwise
+    args.output.mkdir(parents=True, exist_ok=True)
+    settings = {key: value for key, value in vars(args).items() if key != "output"}
+    results: dict[str, Any] = {"versions": versions(), "settings": settings, "goals": []}
+    for part in tqdm(args.parts, unit="part", desc="benchmark"):
+        try:
+            results[part] = PARTS[part][1](args)
+        except (UserError, HydraException) as error:
+            raise SystemExit(f"benchmark: {error}") from error
+        results["goals"] = goals(results)
+        # Written after each part, so that an interrupted run keeps its results.
+        (args.output / "benchmark.json").write_text(json.dumps(results, indent=2) + "\n")
+        (args.output / "benchmark.md").write_text(page(results) + "\n")
+    print(page(results))
+    met = sum(row["met"] for row in results["goals"])
+    print(f"\nbenchmark: {met} of {len(results['goals'])} goals met; see {args.output}")
+
+
+if __name__ == "__main__":
+    main()

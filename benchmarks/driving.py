@@ -1,0 +1,145 @@
+"""Env steps per second with and without a guide, slowest operators, and the robot's perception."""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+import time
+from argparse import Namespace
+from pathlib import Path
+
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import DictConfig
+from torch.profiler import profile
+from torchrl.envs import EnvBase, TransformedEnv
+
+import coil_rl.train.config  # noqa: F401  registers the schema
+from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
+from coil_rl.envs import Perception, read_recording, save_drive, simulated_cone_classifier, simulated_drive
+from coil_rl.train.build import build_bare_env, build_guides
+from coil_rl.transforms import GuideActions
+
+
+def train_config(args: Namespace, method: str) -> DictConfig:
+    """Return the configuration of `coil-train` with the overrides of the command line."""
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        given = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused", *args.overrides]
+        return compose("train", given)
+
+
+def driving_env(args: Namespace, cars: int, guide: bool) -> EnvBase:
+    """Return the configured env, with or without the advice of the guide at every step."""
+    config = train_config(args, "coil")
+    env = build_bare_env(config, {"num_cars": cars})
+    return TransformedEnv(env, GuideActions(build_guides(config))) if guide else env
+
+
+class Driving:
+    """Steps of an env with resets; each call returns the number of cars.
+
+    Args:
+        env: batched env.
+        follow: take the advised actions in place of random ones.
+    """
+
+    def __init__(self, env: EnvBase, follow: bool = False) -> None:
+        self.env, self.follow, self.cars, self.steps = env, follow, env.batch_size.numel(), 0
+        self.ended = torch.zeros((), dtype=torch.int64, device=env.device)
+        with torch.no_grad():
+            self.state = env.reset()
+
+    @torch.no_grad()
+    def __call__(self) -> int:
+        """Step all cars once."""
+        random = torch.rand(*self.env.batch_size, 1, device=self.env.device) * 2 - 1
+        self.state["action"] = self.state["guide_action"][..., 0, :] if self.follow else random
+        step, self.state = self.env.step_and_maybe_reset(self.state)
+        self.ended += step["next", "done"].sum()
+        self.steps += 1
+        return self.cars
+
+    def until_resets(self) -> Driving:
+        """Drive until the first episodes end, so that resets are measured too."""
+        while not self.ended:
+            self()
+        self.ended.zero_()
+        self.steps = 0
+        return self
+
+
+def measure_driving(args: Namespace) -> list[Row]:
+    """Return a row for each number of cars."""
+    rows = []
+    for cars in args.cars:
+        bare, guided = (Driving(driving_env(args, cars, guide)).until_resets() for guide in (False, True))
+        following = Driving(driving_env(args, cars, True), follow=True)
+        rates = measure(args, {"env": bare, "advice": guided, "follow": following})
+        median = medians(rates)
+        rows.append(
+            {
+                "cars": cars,
+                "env steps/s": median["env"],
+                "with advice": median["advice"],
+                "guide drives": median["follow"],
+                "ms per batched step": 1e3 * cars / median["env"],
+                "ms with advice": 1e3 * cars / median["advice"],
+                "resets in 1000 steps": 1e3 * float(guided.ended) / (cars * guided.steps),
+                "rounds": rates,
+            }
+        )
+    return rows
+
+
+def measure_compiled(args: Namespace) -> list[Row]:
+    """Return the speed with advice under `torch.compile` beside eager mode."""
+    rows = []
+    for cars in args.compile:
+        env = driving_env(args, cars, guide=True)
+        env.compile(warmup=3)
+        compiled, start = Driving(env), time.perf_counter()
+        compiled.until_resets()  # resets are compiled separately
+        synchronise()
+        seconds = time.perf_counter() - start
+        rates = measure(args, {"eager": Driving(driving_env(args, cars, guide=True)), "compiled": compiled})
+        ratio = median_ratio(rates["compiled"], rates["eager"])
+        rows.append({"cars": cars, **medians(rates), "ratio": ratio, "compiling (s)": seconds, "rounds": rates})
+    return rows
+
+
+def profile_operators(args: Namespace, steps: int = 20) -> str:
+    """Return the profiler's table of the operators with most own time in batched steps with advice."""
+    driving = Driving(driving_env(args, args.compare_cars, guide=True)).until_resets()
+    device = "device" if args.device.startswith("cuda") else "cpu"
+    with profile() as profiler:
+        for _ in range(steps):
+            driving()
+        synchronise()
+    return str(profiler.key_averages().table(sort_by=f"self_{device}_time_total", row_limit=10))
+
+
+def measure_robot(args: Namespace) -> list[Row]:
+    """Return scans per second of CPU time, for a simulated lap with 360 points a scan."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "lap.mcap"
+        save_drive(simulated_drive("both", 0), path)
+        recording = read_recording(path)
+        ranges, angles = recording.ranges, recording.angles(0)
+        perceive, scan = Perception(simulated_cone_classifier()), itertools.cycle(range(len(ranges)))
+
+        def single_scan() -> int:
+            row = next(scan)
+            perceive(ranges[row : row + 1], angles)
+            return 1
+
+        def whole_recording() -> int:
+            perceive(ranges, angles)
+            return len(ranges)
+
+        subjects = {
+            "reading MCAP": lambda: len(read_recording(path).ranges),
+            "perception, whole recording": whole_recording,
+            "perception, single scans": single_scan,
+        }
+        rates = measure(args, subjects, time.process_time)
+    return [{"subject": name, "scans/s": rate} for name, rate in medians(rates).items()]

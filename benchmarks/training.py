@@ -1,0 +1,190 @@
+"""Training speed beside yardsticks: PPO by hand, Stable-Baselines3, and one car in NumPy and SciPy."""
+
+from __future__ import annotations
+
+import math
+import sys
+import tempfile
+import time
+from argparse import Namespace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from benchmarks.driving import Driving, driving_env, train_config
+from benchmarks.ppo import PlainPPO
+from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
+from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner
+from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+METHODS = ("ppo", "coil")
+SHARES = ("env", "guide", "policy", "update")
+TESTS = Path(__file__).parents[1] / "tests"
+ORACLE_STEPS = 20
+SB3_ENVS = (1, 8)
+
+
+class Training:
+    """Training of `coil-train`; each call is one update and returns its frames.
+
+    Replay of off-policy learners is filled first.
+    """
+
+    def __init__(self, args: Namespace, method: str, cars: int, steps: int) -> None:
+        config = train_config(args, method)
+        env = build_env(config, {"num_cars": cars})
+        learner = build_learner(config, env)
+        rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
+        self.folder = tempfile.TemporaryDirectory()  # for the best policy
+        self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
+        replay = getattr(learner, "replay", None)
+        while replay is not None and len(replay) < replay.starts:
+            self()
+
+    def __call__(self) -> int:
+        """Collect a batch and learn from it."""
+        self.experiment.update(0.0)
+        return self.experiment.rollout.frames
+
+    def watch(self, stopwatch: Stopwatch) -> None:
+        """Time the parts of later updates, by the names of `SHARES`."""
+        env, learner = self.experiment.rollout.env, self.experiment.learner
+        timed = [(env.base_env, "_step", "env"), (env.base_env, "_reset", "env")]
+        for guides in (module for module in env.transform if isinstance(module, GuideActions)):
+            timed += [(guides, "_call", "guide"), (guides, "_reset", "guide")]
+        for owner, method, name in [*timed, (learner.policy, "forward", "policy"), (learner, "update", "update")]:
+            stopwatch.wrap(owner, method, name)
+
+
+def has_yardstick(args: Namespace) -> bool:
+    """Return whether the configured learner is PPO with continuous actions."""
+    config = train_config(args, "ppo")
+    return not config.action and str(config.learner["_target_"]).endswith(".PPO")
+
+
+def by_hand(args: Namespace, method: str, cars: int, steps: int) -> Work:
+    """Return the update of `PlainPPO` with the same env and hyper-parameters."""
+    config = train_config(args, method)
+    guide = next(iter(build_guides(config).values())) if method == "coil" else None
+    hyper_parameters = instantiate(config.learner, _target_="builtins.dict", _convert_="all")
+    plain = PlainPPO(build_bare_env(config, {"num_cars": cars}), guide, steps, **hyper_parameters)
+
+    def update() -> int:
+        plain.update(plain.collect())
+        return cars * steps
+
+    return update
+
+
+def measure_training(args: Namespace) -> list[Row]:
+    """Return a row for each batch: frames per second with and without a guide, of PPO also by hand."""
+    rows = []
+    for cars, steps in args.batches:
+        subjects: dict[str, Work] = {method: Training(args, method, cars, steps) for method in METHODS}
+        hand = METHODS if has_yardstick(args) else ()
+        subjects |= {f"{method} by hand": by_hand(args, method, cars, steps) for method in hand}
+        rates = measure(args, subjects)
+        ratios = {f"{method} / by hand": median_ratio(rates[method], rates[f"{method} by hand"]) for method in hand}
+        cost = {"cost of a frame, coil / ppo": median_ratio(rates["ppo"], rates["coil"])}
+        rows.append({"batch": f"{cars} x {steps}", **medians(rates), **cost, **ratios, "rounds": rates})
+    return rows
+
+
+def measure_shares(args: Namespace, updates: int = 2) -> list[Row]:
+    """Return the shares of the time of an update, collection included; the framework is the rest."""
+    rows = []
+    for cars, steps in args.batches:
+        for method in METHODS:
+            training, stopwatch = Training(args, method, cars, steps), Stopwatch()
+            training()
+            training.watch(stopwatch)
+            start = time.perf_counter()
+            for _ in range(updates):
+                training()
+            total = time.perf_counter() - start
+            shares = {name: stopwatch.seconds.get(name, 0.0) / total for name in SHARES}
+            shares["framework"] = 1 - sum(shares.values())
+            rows.append({"method": method, "batch": f"{cars} x {steps}", **shares})
+    return rows
+
+
+def measure_one_car(args: Namespace) -> list[Row]:
+    """Return the speed of `compare_cars` driven by the guide beside one car in NumPy and SciPy."""
+    ours = Driving(driving_env(args, args.compare_cars, guide=True), follow=True)
+    rates = measure(args, {"one car": one_car(args), "ours": ours})
+    row = {f"{name} (steps/s)": rate for name, rate in medians(rates).items()}
+    return [{"cars": args.compare_cars, **row, "ratio": median_ratio(rates["ours"], rates["one car"]), "rounds": rates}]
+
+
+def one_car(args: Namespace) -> Work:
+    """Return steps of `tests/oracle.py` on the training tracks in turn, driven by the guide."""
+    sys.path.append(str(TESTS))
+    import oracle  # type: ignore[import-not-found]
+
+    config = train_config(args, "coil")
+    options = {key: config.env[key] for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")}
+    node = config.guide.get("spline", {})
+    guide = {key: node[key] for key in ("spline", "smoothing", "gain") if key in node}
+    cars = [oracle.OneCar(t.left, t.right, t.start, **options) for t in build(config.track.train, "track.train")]
+
+    def steps() -> int:
+        for _ in range(ORACLE_STEPS):
+            car = cars[0]
+            result = car.step(oracle.guide_action(*car.cones(), car.steering, **guide))
+            if result.terminated or result.truncated:
+                cars.append(cars.pop(0))
+                cars[0].reset()
+        return ORACLE_STEPS
+
+    return steps
+
+
+def measure_sb3(args: Namespace) -> list[Row]:
+    """Return frames per second of PPO beside Stable-Baselines3 on the CPU, on vectors of single envs.
+
+    The networks have the same size; other values are its defaults, with a shorter rollout.
+    """
+    if not has_yardstick(args):
+        return [{"not measured": "Stable-Baselines3 runs PPO with continuous actions"}]
+    if find_spec("stable_baselines3") is None or find_spec("gymnasium") is None:
+        return [{"not measured": "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"}]
+    (cars, steps), *_ = args.batches
+    subjects: dict[str, Work] = {"ours": Training(args, "ppo", cars, steps)}
+    subjects |= {str(envs): sb3(args, envs) for envs in SB3_ENVS}
+    rates = measure(args, subjects)
+    median = medians(rates)
+    return [
+        {"envs": envs, "frames/s": median[str(envs)], f"ours, {cars} x {steps}": median["ours"],
+         "ratio": median_ratio(rates["ours"], rates[str(envs)]), "rounds": rates}
+        for envs in SB3_ENVS
+    ]  # fmt: skip
+
+
+def sb3(args: Namespace, envs: int) -> Work:
+    """Return an update of PPO of Stable-Baselines3."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+    from torch import nn
+
+    from coil_rl.envs.gym import ConeTrackGym
+
+    config = train_config(args, "ppo")
+    options: Any = OmegaConf.to_container(config.env, resolve=True)
+    options = {key: value for key, value in options.items() if key not in ("_target_", "num_cars", "device")}
+    options["tracks"] = build(config.track.train, "track.train")
+    hidden = list(config.learner.hidden)
+    policy: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": nn.Tanh}
+    policy["log_std_init"] = math.log(config.learner.action_scale)
+    vector = make_vec_env(ConeTrackGym, envs, env_kwargs=options)
+    model = PPO("MlpPolicy", vector, n_steps=args.sb3_frames // envs, policy_kwargs=policy, device="cpu")
+
+    def update() -> int:
+        model.learn(args.sb3_frames, reset_num_timesteps=False)
+        return int(args.sb3_frames)
+
+    return update

@@ -1,1 +1,0 @@
-"""What `coil-benchmark` measures, and the yardsticks it measures with."""

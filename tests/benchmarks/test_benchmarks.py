@@ -1,0 +1,87 @@
+import json
+import time
+from argparse import Namespace
+
+import pytest
+
+from benchmarks.__main__ import PARTS, goals, main, page
+from benchmarks.driving import Driving
+from benchmarks.timing import Stopwatch, measure, median_ratio
+from coil_rl.envs import ConeTrackEnv
+
+
+def test_subjects_alternate_after_a_warm_up():
+    calls = []
+
+    def subject(name):
+        return lambda: calls.append(name) or time.sleep(0.01) or 5
+
+    rates = measure(Namespace(seconds=0.0, repeats=3), {"a": subject("a"), "b": subject("b")})
+    assert calls == ["a", "b"] * 4
+    assert all(len(rounds) == 3 and 0 < max(rounds) <= 500 for rounds in rates.values())
+    # A ratio of medians would be 10 / 4: the second round was slow.
+    assert median_ratio([10, 2, 20], [5, 1, 4]) == 2
+
+
+def test_stopwatch_counts_the_outer_of_two_methods():
+    class Work:
+        def outer(self):
+            time.sleep(0.02)
+            return self.inner()
+
+        def inner(self):
+            time.sleep(0.02)
+            return 7
+
+    work, stopwatch = Work(), Stopwatch()
+    stopwatch.wrap(work, "outer", "outer")
+    stopwatch.wrap(work, "inner", "inner")
+    assert work.outer() == work.inner() == 7
+    assert stopwatch.seconds["outer"] >= 0.04
+    assert 0.02 <= stopwatch.seconds["inner"] < 0.04
+
+
+def test_driving_resets_cars(ring):
+    driving = Driving(ConeTrackEnv([ring], 4)).until_resets()
+    for _ in range(60):
+        assert driving() == 4
+    assert driving.steps == 60
+    assert 0 < int(driving.ended) < 240
+
+
+def test_goals_and_page():
+    results = {
+        "training": [{"batch": "8 x 4", "ppo / by hand": 0.95, "coil / by hand": 0.5}],
+        "processes": [{"cars": 64, "state per car (B)": 400.0}],
+        "sb3": [{"not measured": "it is not installed"}],
+    }
+    results["goals"] = goals(results)
+    assert [row["met"] for row in results["goals"]] == [True, False, True]
+    assert "| it is not installed |" in page(results)
+
+
+@pytest.mark.slow
+def test_quick_run_measures_everything(tmp_path, capsys):
+    parts = [name for name in PARTS if name != "compiled"]
+    arguments = ["track=generated", "track.train.count=1", "--quick", "--output", str(tmp_path / "run")]
+    main(arguments)
+    results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
+    assert set(results) == {"versions", "settings", "goals", *parts}
+    for row in results["shares"]:
+        assert sum(row[key] for key in ("env", "guide", "policy", "update", "framework")) == pytest.approx(1)
+    assert all(172 < row["state per car (B)"] < 2000 for row in results["processes"])
+    assert (tmp_path / "run" / "benchmark.md").read_text() in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(arguments)
+    assert "already holds a benchmark" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("learner", ["a2c", "dqn"])
+def test_other_learners_are_measured_without_yardsticks(learner, tmp_path):
+    overrides = ["track=generated", "track.train.count=1", f"learner={learner}"]
+    overrides += ["learner.starts=300", "learner.ratio=1"] if learner == "dqn" else []
+    main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])
+    results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
+    (row,) = results["training"]
+    assert set(row["rounds"]) == {"ppo", "coil"}
+    assert "not measured" in results["sb3"][0]

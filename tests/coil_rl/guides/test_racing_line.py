@@ -1,0 +1,137 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
+from coil_rl.guides import RacingLineGuide, SplineGuide
+from coil_rl.testing import check_guide
+from coil_rl.train.evaluation import evaluate_policy
+
+# Midpoints (2, 0.5) and (3, 0.5); with a spacing of 1 m these are the targets.
+TWO_TARGETS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])
+# Midpoints (0.5, 0), which is reached, and (1.5, 0.5).
+ONE_TARGET = ([(0.5, 1.0)], [(0.5, -1.0), (2.5, 0.0)])
+KEYS = ("cones", "cone_count", "steering")
+
+
+@pytest.fixture(scope="module")
+def steps():
+    """Steps of twenty cars with a poor guide: [800]."""
+    env = ConeTrackEnv(random_tracks(count=2, seed=4), 20)
+    poor = RacingLineGuide(turn=2.0, margin=0.3)
+    steps = env.rollout(40, poor, break_when_any_done=False).select(*KEYS).reshape(-1)
+    steps["steering"] = torch.linspace(-1, 1, len(steps)).unsqueeze(-1)
+    return steps
+
+
+def advice(left, right, steering=0.0, **kwargs):
+    cones = torch.zeros(1, 2, 16, 2, dtype=torch.float64)
+    for side, points in enumerate((left, right)):
+        for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
+            cones[0, side, slot] = torch.tensor(point)
+    count = torch.tensor([[len(left), len(right)]])
+    return RacingLineGuide(spacing=1.0, **kwargs).steer(cones, count, torch.full((1, 1), steering).double()).item()
+
+
+def arc(x, y, turn=1.4):
+    """Steering for `turn` times the curvature 2 sin(alpha) / d of the arc to (x, y), for a car of 2 m."""
+    return math.asin(2 * turn * 2 * y / (x * x + y * y)) / math.radians(80)
+
+
+def lap(track, guide, rate=24.0):
+    return evaluate_policy(ConeTrackEnv([track], 1, rate=rate, laps=1), guide).episodes[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, arc(3, 0.5)),
+        ({"turn": 1}, arc(3, 0.5, turn=1)),
+        ({"lookahead": 3.0}, arc(2, 0.5)),
+        # The cone nearest to the arc to (3, 0.5) is (2, -1), at 1.193 m.
+        ({"turn": 1, "margin": 1.19}, arc(3, 0.5, turn=1)),
+        ({"turn": 1, "margin": 1.2}, arc(2, 0.5, turn=1)),
+    ],
+)
+def test_target_is_the_farthest_with_a_clear_arc_within_the_lookahead(options, expected):
+    assert arc(3, 0.5) == pytest.approx(0.22025, abs=1e-5)
+    assert advice(*TWO_TARGETS, **options) == pytest.approx(expected, abs=1e-9)
+
+
+@pytest.mark.parametrize("margin", [0.0, 0.6, 1.9])
+def test_without_a_clear_arc_the_target_is_the_nearest(margin):
+    assert advice(*ONE_TARGET, margin=margin, turn=1) == pytest.approx(arc(1.5, 0.5, 1))
+
+
+def test_without_a_target_steering_is_kept_and_sharp_arcs_are_clamped():
+    assert advice([], [], 0.3) == pytest.approx(0.3)
+    assert advice([(2.0, 1.0), (4.0, 1.0)], [], -0.7) == pytest.approx(-0.7)
+    assert advice(*ONE_TARGET, turn=3.0) == pytest.approx(1)
+
+
+def test_blocked_arcs_agree_with_geometry(steps):
+    guide, draw = RacingLineGuide(margin=0.5), np.random.default_rng(3)
+    cones, count = steps["cones"][::10].double(), steps["cone_count"][::10]
+    curvature = draw.uniform(-0.49, 0.49, (6, len(cones)))
+    curvature[0], distance = 0, draw.uniform(1, 8, curvature.shape)
+    clear = 1 - guide._blocked(*(torch.from_numpy(x) for x in (curvature, distance)), cones, count)
+    assert 0.05 < clear.mean() < 0.95
+    for (target, row), found in np.ndenumerate(clear.numpy()):
+        k, reach = curvature[target, row], distance[target, row]
+        expected = reach <= 7
+        for side, sign in enumerate((1, -1)):
+            x, y = cones[row, side, : count[row, side]].numpy().T
+            # Left of a circle driven anticlockwise is its inside.
+            left = y if k == 0 else (1 / abs(k) - np.hypot(x, y - 1 / k)) * np.sign(k)
+            expected &= bool((sign * left >= 0.5)[np.hypot(x, y) <= reach + 0.5].all())
+        assert found == expected
+
+
+def test_guide_keeps_the_contract_and_differs_from_the_safety_policy(steps):
+    check_guide(RacingLineGuide(), steps[::7])
+    check_guide(RacingLineGuide(spline="quadratic"), steps[::31])
+    action = RacingLineGuide()(steps.clone())["action"]
+    assert action.abs().max() <= 1
+    assert (action != SplineGuide()(steps.clone())["action"]).float().mean() > 0.9
+
+
+def test_advice_is_antisymmetric_and_independent_of_padding(steps):
+    cones, count, steering = (steps[key] for key in KEYS)
+    guide, mirror = RacingLineGuide().steer, torch.tensor([1.0, -1.0], dtype=torch.float64)
+    mirrored = guide(cones.double().flip(1) * mirror, count.flip(1), -steering.double())
+    torch.testing.assert_close(mirrored, -guide(cones.double(), count, steering.double()), rtol=0, atol=1e-9)
+    padding = torch.arange(cones.shape[2]) >= count.unsqueeze(-1)
+    other = torch.where(padding.unsqueeze(-1), torch.full_like(cones, 1.5), cones)
+    assert torch.equal(guide(other, count, steering), guide(cones, count, steering))
+
+
+def test_corners_are_cut(ring):
+    racing, safe = lap(ring, RacingLineGuide(), rate=12), lap(ring, SplineGuide(), rate=12)
+    assert racing["completed"]
+    assert racing["lap_time"] < safe["lap_time"] - 0.3
+    assert 0 < racing["clearance"] < safe["clearance"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [0, 5])
+def test_laps_of_shipped_tracks_are_shorter_and_smoother_without_a_crash(number):
+    track = shipped_tracks("train")[number]
+    racing, safe = lap(track, RacingLineGuide()), lap(track, SplineGuide())
+    assert racing["completed"]
+    assert racing["lap_time"] < safe["lap_time"]
+    assert racing["smoothness"] < safe["smoothness"] / 3
+    assert racing["reward"] > safe["reward"]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [("margin", -0.1, "at least 0"), ("margin", 2.0, "less than car_length=2.0"),
+     ("turn", 0, "more than 0"), ("lookahead", math.inf, "more than 0"),
+     ("spacing", 0, "more than 0"), ("car_length", math.nan, "more than 0"), ("max_steering", 100, "at most 90"),
+     ("targets", 1, "at least 2")],
+)  # fmt: skip
+def test_a_value_out_of_range_is_rejected(name, value, message):
+    with pytest.raises(ValueError, match=f"{name}={value} .*{message}"):
+        RacingLineGuide(**{name: value})
