@@ -44,7 +44,7 @@ class Training:
         # The experiment keeps its best policy in a file; that belongs to what it costs.
         self.folder = tempfile.TemporaryDirectory()
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
-        while isinstance(learner, OffPolicy) and len(learner.replay) < learner.replay.starts:
+        while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
             self.experiment.update(0.0)
 
     def __call__(self) -> int:
