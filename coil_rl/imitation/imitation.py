@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -67,7 +67,7 @@ class Imitation:
         >>> metrics = learner.update(Rollout(env, learner.policy, steps=20, keys=learner.keys).collect())
     """
 
-    kind = "imitation"
+    kind: ClassVar[str] = "imitation"
 
     def __init__(
         self,

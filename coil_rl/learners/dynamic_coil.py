@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -34,11 +34,8 @@ class Phase:
     earlier: int
 
 
-class StopRule(Protocol):
-    """Condition for the end of a phase."""
-
-    def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
-        """Return whether a phase ends, given its frames so far and the mean reward per step in each of its updates."""
+# Whether a phase ends, given its frames so far and the mean reward per step in each of its updates.
+StopRule = Callable[[int, Sequence[float]], bool]
 
 
 @dataclass(frozen=True)
@@ -103,11 +100,6 @@ class PhaseSchedule:
 
     Raises:
         ValueError: for an unknown order or choice, or without a guide.
-
-    Example:
-        >>> phases = PhaseSchedule(2, agent_phase=AfterFrames(100), guide_phase=AfterFrames(50))
-        >>> [(phases.phase.agent, phases.phase.guides) for _ in range(5) if phases.advance(50, reward=1.0) or True]
-        [(True, ()), (False, (0,)), (True, ()), (True, ()), (False, (1,))]
     """
 
     def __init__(

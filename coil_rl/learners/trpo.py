@@ -82,14 +82,11 @@ class TRPO(PPO):
         return {name: float(value) for name, value in report.items()} | means
 
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
-        """Take a step of the policy.
+        """Take a step of the policy; returns its metrics.
 
         Args:
             rows: [N] with `minibatch_keys`. Steps in which a guide acted count for auxiliary losses only.
             progress: as for `update`.
-
-        Returns:
-            The values of `update` that concern the policy, numbers or scalars.
         """
         agent_rows = rows[rows["agent_acts"].squeeze(-1)] if self.guide_may_act else rows
         if len(agent_rows) < 2:  # one advantage cannot be standardised

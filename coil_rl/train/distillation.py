@@ -31,12 +31,7 @@ def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
 
 
 def proxy_config(config: DictConfig, name: str) -> DictConfig:
-    """Return the configuration of the run that trains the proxy of a guide.
-
-    Args:
-        config: of a training run.
-        name: of one of its guides.
-    """
+    """Return the configuration of the run that trains the proxy of one guide of a training run."""
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     guide, proxy = {name: resolved["guide"][name]}, resolved["proxy"]
     proxy["method"]["transforms"]["advice"]["guides"] = guide

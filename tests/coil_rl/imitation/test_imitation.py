@@ -7,7 +7,7 @@ from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase, GymEnv, PendulumEnv, TransformedEnv
+from torchrl.envs import EnvBase, GymEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
@@ -166,15 +166,6 @@ def test_two_dimensional_actions_and_batches(name):
     if name == "linear":
         expected = data["guide_action"][..., 0, :].clamp(torch.tensor([-1.0, 1.0]), torch.tensor([1.0, 3.0]))
         torch.testing.assert_close(action, expected)
-
-
-def test_env_without_batch_and_tracks():
-    damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1) / 8, ["thdot"], ["action"])
-    env = TransformedEnv(PendulumEnv(), GuideActions({"damp": damp}))
-    learner = Imitation(env, ["th", "thdot"], regressor=SklearnRegressor(LinearRegression()))
-    assert learner.keys == ["th", "thdot", "guide_action"]
-    metrics = learner.update(Rollout(env, learner.policy, 30, learner.keys).collect())
-    assert metrics["r2_random_split"] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("categorical", [True, False])

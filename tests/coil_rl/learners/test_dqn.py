@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 import torch
-import worlds
 from tensordict.nn import TensorDictModule
 from torch.nn import functional as F
 from torchrl.envs import GymEnv, TransformedEnv
@@ -12,7 +11,7 @@ from coil_rl.learners import DQN
 from coil_rl.schedules import Linear
 from coil_rl.tabular import garnet, toymaker, value_iteration
 from coil_rl.train.rollout import Rollout
-from coil_rl.transforms import DiscreteActions, GuideActions
+from coil_rl.transforms import GuideActions
 
 
 def table(mdp, num_envs=32, **options):
@@ -114,11 +113,3 @@ def test_one_hot_actions():
     dqn, rollout = make(env, ratio=8)
     assert dqn.update(rollout.collect())["minibatches"] == 1
     assert env.action_spec.is_in(dqn.policy(env.reset())["action"])
-
-
-def test_discrete_steering_with_and_without_advice():
-    env = worlds.cones(DiscreteActions(5))
-    for keys in (["observation"], ["observation", "guide_action"]):
-        dqn, rollout = make(env, in_keys=keys, ratio=4)
-        assert dqn.update(rollout.collect())["minibatches"] == 3
-        assert dqn.network.module[0].module.layers[0].in_features == 15 + 5 * len(keys)

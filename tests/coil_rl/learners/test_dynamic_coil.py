@@ -158,15 +158,6 @@ def test_control_orders_change_their_networks_only(order, groups):
     assert updates(make(env := cars(), phases={"order": order}), env, 1)[0][0] == groups
 
 
-def test_gradient_reaches_the_learning_guide_only():
-    learner = make(env := cars(), phases={"order": "guide"})
-    learner.update(Rollout(env, learner.policy, 32, [*learner.keys]).collect())
-    groups = learner.parameter_groups()
-    norms = [sum(float(p.grad.abs().sum()) for p in group if p.grad is not None) for group in groups]
-    assert norms[2] > 0
-    assert norms[0] == norms[3] == 0
-
-
 def test_learning_rates_shrink_from_each_phase_to_the_next_of_its_kind():
     result = updates(make(env := cars(), shrink=0.5), env, 6)
     assert [metrics["learning_rate"] for _, metrics in result] == [1e-3, 0, 5e-4, 0, 2.5e-4, 0]

@@ -1,17 +1,18 @@
 """Properties of learners with a replay buffer."""
 
+import copy
+
 import pytest
 import torch
 import worlds
 from tensordict import TensorDict
-from torchrl.envs import Compose, PendulumEnv, RewardSum, TransformedEnv
+from torchrl.envs import Compose, PendulumEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import DQN, SAC
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear
-from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import (
     DelayedAdvice,
@@ -99,53 +100,41 @@ def test_probability_that_the_guide_acts_may_change_over_the_run():
 TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8]}
 
 
-def experiment(folder, kind, seed=0):
-    """A run with random, delayed advice, which cannot be computed again from a stored observation."""
+def make(kind, seed=0):
+    """A learner and its rollouts, with random, delayed advice, which cannot be computed again from an observation."""
     torch.manual_seed(seed)
-    folder.mkdir(exist_ok=True)
     advice = [GuideActions({"any": RandomGuide(seed=seed)}), DelayedAdvice(2)]
     discrete = [DiscreteActions(5)] if kind is DQN else []
-    env = ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed)
-    env = TransformedEnv(env, Compose(*advice, *discrete, RewardSum()))
+    env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed), Compose(*advice, *discrete))
     learner = kind(env, ["observation", "guide_action"], seed=seed, **TINY)
-    rollout = Rollout(env, learner.policy, 4, [*learner.keys, *watched_keys(env, {})])
-    return Experiment(learner, rollout, 8 * 4 * 6, folder, checkpoint_every=1)
+    return learner, Rollout(env, learner.policy, 4, learner.keys)
 
 
-class Killed(BaseException):
-    pass
+@pytest.mark.parametrize("kind", [DQN, SAC])
+@pytest.mark.parametrize("updates", [1, 4], ids=["buffer not full", "buffer full"])
+def test_state_contains_everything_the_next_update_depends_on(kind, updates):
+    first, rollout = make(kind)
+    for _ in range(updates):
+        first.update(rollout.collect())
+    second, _ = make(kind, seed=9)
+    state = copy.deepcopy(first.state_dict())
+    assert len(state["steps"]["action"]) == min(32 * updates, 90)
+    second.load_state_dict(state)
+    batch, metrics, actions = rollout.collect(), [], []
+    for learner in (first, second):
+        torch.manual_seed(1)  # SAC samples actions
+        metrics.append(learner.update(batch.clone()))
+        actions.append(learner.policy(batch.clone())["action"])
+    assert metrics[0] == metrics[1]
+    assert torch.equal(*actions)
+    assert (first.buffer[:] == second.buffer[:]).all()
 
 
-@pytest.mark.parametrize(("kind", "updates"), [(DQN, 1), (SAC, 4)], ids=["buffer not full", "buffer full"])
-def test_resumed_run_writes_the_files_of_an_uninterrupted_run(tmp_path, kind, updates):
-    whole = experiment(tmp_path / "whole", kind)
-    rows = whole.run()
-    assert rows[-1]["learner/kept"] == 90
-
-    stopped = experiment(tmp_path / "stopped", kind)
-    save = stopped._save
-
-    def killed():
-        save()
-        if stopped.updates == updates:
-            raise Killed
-
-    stopped._save = killed
-    with pytest.raises(Killed):
-        stopped.run()
-    resumed = experiment(tmp_path / "stopped", kind, seed=9)
-    resumed.resume()
-    resumed.run()
-    for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "stopped" / name).read_bytes(), name
-    assert (resumed.learner.buffer[:] == whole.learner.buffer[:]).all()
-
-
-def test_steps_are_stored_with_the_advice_before_and_after_them(tmp_path):
-    run = experiment(tmp_path / "run", SAC)
-    batch = run.rollout.collect()
-    run.learner.update(batch)
-    steps, expected = run.learner.buffer[:], batch.select(*run.learner.stored_keys).reshape(-1)
+def test_steps_are_stored_with_the_advice_before_and_after_them():
+    learner, rollout = make(SAC)
+    batch = rollout.collect()
+    learner.update(batch)
+    steps, expected = learner.buffer[:], batch.select(*learner.stored_keys).reshape(-1)
     assert len(steps) == 32
     for key in ("guide_action", ("next", "guide_action"), "action"):
         assert torch.equal(steps[key], expected[key])
@@ -153,10 +142,10 @@ def test_steps_are_stored_with_the_advice_before_and_after_them(tmp_path):
 
 
 @pytest.mark.parametrize("kind", [DQN, SAC])
-def test_metrics_are_zero_before_learning_starts(tmp_path, kind):
-    run = experiment(tmp_path / "run", kind)
-    run.learner.starts = 40
-    first, second = (run.learner.update(run.rollout.collect()) for _ in range(2))
+def test_metrics_are_zero_before_learning_starts(kind):
+    learner, rollout = make(kind)
+    learner.starts = 40
+    first, second = (learner.update(rollout.collect()) for _ in range(2))
     assert first["minibatches"] == 0
     assert second["minibatches"] == 8
     assert {value for name, value in first.items() if name.startswith(("loss", "value", "alpha"))} == {0.0}

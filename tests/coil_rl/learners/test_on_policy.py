@@ -7,14 +7,8 @@ import pytest
 import torch
 import worlds
 from cart_poles import CartPoles
-from hydra import compose, initialize_config_module
-from torchrl.envs import RewardSum, TransformedEnv
 
-import coil_rl.train.config  # noqa: F401  registers the schema of the configuration
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
-from coil_rl.schedules import Linear
-from coil_rl.train.build import build_env, build_learner
-from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import JumpStart, Takeover
 
@@ -63,39 +57,6 @@ def test_state_contains_everything_the_next_update_depends_on(kind):
     assert torch.equal(weights(first), weights(second))
 
 
-class Killed(BaseException):
-    pass
-
-
-@pytest.mark.parametrize("kind", LEARNERS)
-def test_resumed_run_writes_the_files_of_an_uninterrupted_run(kind, tmp_path):
-    def experiment(name, seed=0):
-        torch.manual_seed(seed)
-        env = TransformedEnv(CartPoles(8, seed), RewardSum())
-        learner = kind(env, minibatches=2, learning_rate=Linear(1e-2, 0.0), seed=seed)
-        rollout = Rollout(env, learner.policy, 16, [*learner.keys, *watched_keys(env, {})])
-        (tmp_path / name).mkdir(exist_ok=True)
-        return Experiment(learner, rollout, 5 * rollout.frames, tmp_path / name, checkpoint_every=2)
-
-    experiment("whole").run()
-    stopped = experiment("stopped")
-    update = stopped.learner.update
-
-    def killed(batch, progress):
-        if stopped.updates == 3:
-            raise Killed
-        return update(batch, progress)
-
-    stopped.learner.update = killed
-    with pytest.raises(Killed):
-        stopped.run()
-    resumed = experiment("stopped", seed=9)
-    resumed.resume()
-    resumed.run()
-    for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "stopped" / name).read_bytes(), name
-
-
 @pytest.mark.parametrize("kind", LEARNERS)
 @pytest.mark.parametrize("make", [partial(JumpStart, 0), partial(JumpStart, 0, random=True), partial(Takeover, 0.0)])
 def test_guide_that_never_acts_changes_no_bit(kind, make):
@@ -137,20 +98,6 @@ def test_reinforce_without_baseline_has_no_critic_parameters():
     learner = trained(Reinforce, CartPoles(8), baseline="none")
     assert not list(learner.critic.parameters())
     assert not learner.state_dict()["critic"]
-
-
-@pytest.mark.parametrize("name", ["a2c", "reinforce", "trpo"])
-@pytest.mark.parametrize("method", ["residual_coil", "jump_start", "kickstart"])
-def test_learner_learns_with_every_method(name, method):
-    small = ["track=generated", "track.train.count=1", "budget.cars=8", "learner.minibatches=2", "run_dir=unused"]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*small, f"method={method}", f"learner={name}"])
-    env = build_env(config)
-    learner = build_learner(config, env)
-    before = [weight.clone() for weight in learner.policy.parameters()]
-    metrics = learner.update(Rollout(env, learner.policy, 8, learner.keys).collect(0.5), 0.5)
-    assert ("loss_guide" in metrics) == (method == "kickstart")
-    assert any((old != new).any() for old, new in zip(before, learner.policy.parameters(), strict=True))
 
 
 COMMON = [("gamma", 2), ("minibatches", 0), ("learning_rate", -1), ("action_scale", 0), ("action_gain", -1),
