@@ -17,6 +17,7 @@ from omegaconf import OmegaConf
 from benchmarks.driving import Driving, driving_env, train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
+from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
@@ -42,8 +43,7 @@ class Training:
         rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
-        replay = getattr(learner, "replay", None)
-        while replay is not None and len(replay) < replay.starts:
+        while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
             self()
 
     def __call__(self) -> int:

@@ -1,4 +1,4 @@
-"""Gymnasium's CartPole-v1, many at a time: what a learner of choices is expected to solve."""
+"""Gymnasium's CartPole-v1 as a batched env, a standard task for learners with discrete actions."""
 
 import torch
 from tensordict import TensorDict
@@ -10,7 +10,7 @@ LIMIT = 500
 
 
 class CartPoles(SeededEnv):
-    """B carts; pushing left is choice 0, right is 1. Every step pays 1, and 475 steps an episode are a solution."""
+    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; a mean of 475 steps per episode is a solution."""
 
     batch_locked = True
 

@@ -4,7 +4,7 @@ from cart_poles import CartPoles
 from torchrl.envs.utils import check_env_specs
 
 
-def test_it_does_as_gymnasiums_carts_do():
+def test_states_equal_those_of_gymnasium():
     ours, theirs = CartPoles(1), gymnasium.make("CartPole-v1").unwrapped
     theirs.reset(seed=0)
     state = ours.reset()
@@ -18,5 +18,5 @@ def test_it_does_as_gymnasiums_carts_do():
     assert state["terminated"].item()
 
 
-def test_it_keeps_the_contract():
+def test_specs():
     check_env_specs(CartPoles(3))

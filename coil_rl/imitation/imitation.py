@@ -1,9 +1,8 @@
-"""Imitation of a guide: offline (paper algorithm 6) and by data-set aggregation, DAgger (algorithm 7).
+"""Imitation of a guide: offline (OIL, paper algorithm 6) and by data-set aggregation (DAgger, algorithm 7).
 
-The guide is asked in every state of a batch, whoever acted there, and what it says is added to a data set. On all of
-that a regressor is fitted anew. One batch in which the guide acted makes this behavioural cloning, offline imitation
-learning; several, in which the guide acts less and less, make it DAgger: the later batches hold the states into which
-the policy itself gets.
+The guide's action in every state of a batch is added to a data set, and a regressor is fitted to the whole data set.
+One batch in which the guide acted gives behavioural cloning, offline imitation learning. Several batches in which the
+guide acts less and less give DAgger: later batches hold the states that the policy itself reaches.
 """
 
 from __future__ import annotations
@@ -11,62 +10,64 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError
-from coil_rl.imitation import dataset as folders
-from coil_rl.imitation.regressor import Regressor
-from coil_rl.imitation.validation import cross_validated, scores
-from coil_rl.learners.networks import Joined, Keyed
+from coil_rl.imitation.regressors import Regressor
+from coil_rl.imitation.validation import cross_validate, scores
+from coil_rl.learners.limits import check_range
+from coil_rl.learners.networks import ConcatObservations, FastTensorDictModule
+from coil_rl.train import checkpoint
 from coil_rl.transforms.action_space import ActionSpace
 
 
 class Imitation:
-    """The learner of imitation: a policy that does what a guide would do.
+    """The imitation learner.
 
     Args:
-        env: for the shapes of what is observed, advised and done.
-        in_keys: what the policy observes.
-        regressor: what is to learn; a `fresh` one does.
-        advice_key: the entry [*batch, n_guides, A] with what the guides say of this very state.
-        guide: whose row of it is learned.
-        group_key: the entry that says on which track a car is, for the validation; None, or an env that has no such
-            entry, leaves that part of it out.
-        validate: also fit on parts of the data and test on the rest, which takes several times as long.
-        dataset: a folder of `coil_rl.imitation.dataset.save` to begin with.
+        env: the env, for its specs.
+        in_keys: entries that the policy observes.
+        regressor: specification of the regressor.
+        advice_key: entry with the advice in a state, [*batch, n_guides, A].
+        guide: index of the guide in the advice.
+        group_key: entry with the track of a sample, for the validation on unseen tracks. None, or an entry that the env
+            does not have, skips that validation.
+        validate: whether to validate in each update, which takes several more fits.
+        dataset: file of a data set to start from, `dataset.pt` of another run.
         seed: of the random split of the validation.
 
     Attributes:
-        policy: writes the action that the regressor predicts, brought within the action's bounds; before the first
-            update it predicts 0.
-        keys: what a batch must hold.
-        dataset: everything gathered, [N] with the observed entries, `action` (what the guide said) and the track.
+        kind: as for `PPO`.
+        policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
+        keys: entries that a batch must have.
+        dataset: [N] with the observed entries, `action` (of the guide) and the track.
 
     Raises:
-        KeyError: if the env has no such advice or observation, naming what it has.
+        KeyError: if the env has no such advice or observation.
         ValueError: if there is no such guide.
-        UserError: if the folder holds no data set, or one of another env.
+        UserError: if the file is missing or damaged, or a data set of another env.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
-        >>> from coil_rl.imitation import Sklearn
+        >>> from coil_rl.imitation import SklearnRegressor
         >>> from coil_rl.train.rollout import Rollout
         >>> from coil_rl.transforms import GuideActions
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))
-        >>> learner = Imitation(env, regressor=Sklearn(LinearRegression()))
+        >>> learner = Imitation(env, regressor=SklearnRegressor(LinearRegression()))
         >>> metrics = learner.update(Rollout(env, learner.policy, steps=20, keys=learner.keys).collect())
     """
+
+    kind: ClassVar[str] = "imitation"
 
     def __init__(
         self,
@@ -81,116 +82,108 @@ class Imitation:
         dataset: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
-        spec, batch = env.observation_spec, len(env.batch_size)
-        self.joined = Joined(env, in_keys)
-        if advice_key not in spec.keys(True, True):
-            known = [key for key in spec.keys(True, True) if isinstance(key, str)]
+        spec, batch_dims = env.observation_spec, len(env.batch_size)
+        available = list(spec.keys(True, True))
+        if advice_key not in available:
+            names = ", ".join(key for key in available if isinstance(key, str))
             raise KeyError(
-                f"the env has no entry {advice_key} to imitate; it has {', '.join(known)}: put the transform "
-                "GuideActions around it"
+                f"the env has no entry {advice_key}; it has {names}; put the transform GuideActions around it"
             )
-        guides, size = spec[advice_key].shape[batch:]
+        guides, size = spec[advice_key].shape[batch_dims:]
         if not 0 <= guide < guides:
             raise ValueError(f"guide={guide} must be at least 0 and less than {guides}, the number of guides")
-        if not 0 <= seed < 2**32:
-            raise ValueError(f"seed={seed} must be at least 0 and at most {2**32 - 1}")
-        self.regressor = regressor.fresh(self.joined.width, size).to(env.device)
-        self.policy = Keyed(
-            _Action(self.joined, self.regressor, ActionSpace(env.action_spec, batch)), in_keys, ["action"]
-        )
+        check_range(0, 2**32 - 1, seed=seed)
+        self.concat = ConcatObservations(env, in_keys)
+        self.regressor = regressor.fresh(self.concat.width, size).to(env.device)
+        action = _Action(self.concat, self.regressor, ActionSpace(env.action_spec, batch_dims))
+        self.policy = FastTensorDictModule(action, in_keys, ["action"])
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
-        self.group_key = _known(group_key, spec)
+        group = group_key if group_key is None or isinstance(group_key, str) else tuple(group_key)
+        self.group_key: NestedKey | None = group if group in available else None
         self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
         self.validate, self.seed, self.device = validate, seed, env.device
         self.dataset: TensorDictBase | None = None
         if dataset is not None:
-            self.dataset = self._fitting(folders.load(dataset), dataset, env)
+            self.dataset = self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Add what the guide says of a batch to the data set, and fit the regressor anew.
+        """Add the guide's actions in a batch to the data set, and fit the regressor to it.
 
         Args:
             batch: [*B, T] with `keys`.
             progress: not used.
 
         Returns:
-            `samples` of the data set; `target_variance`, the mean squared error of always predicting the mean;
-            `mse_ahead` and `r2_ahead`, of this batch before it is learned from: where the policy itself drove, that is
-            how well it does what the guide would; `mse_training` and `r2_training`, of the samples learned from; with
-            `validate`, what `cross_validated` says.
+            The number of `samples`; `target_variance`, the mean squared error of predicting the mean; `mse_ahead` and
+            `r2_ahead`, on this batch before the fit; `mse_training` and `r2_training`, on the data set after the fit;
+            with `validate`, the metrics of `cross_validate`.
 
         Raises:
-            UserError: if the data cannot be validated.
+            UserError: if there are too few samples or tracks to validate.
         """
         pairs = self._pairs(batch)
         dataset: TensorDictBase = pairs if self.dataset is None else torch.cat([self.dataset, pairs])
         self.dataset = dataset
-        x, y = self.joined(*(dataset[key] for key in self.in_keys)), dataset["action"]
+        x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]
         metrics = {"samples": float(len(y)), "target_variance": float(y.var(0, correction=0).mean())}
         with torch.no_grad():
-            ahead = self.regressor(self.joined(*(pairs[key] for key in self.in_keys)))
-            metrics |= scores([ahead], [pairs["action"]], "ahead")
+            predicted = self.regressor(self.concat(*(pairs[key] for key in self.in_keys)))
+            metrics |= scores([predicted], [pairs["action"]], "ahead")
         if self.validate:
             groups = None if self.group_key is None else dataset[self.group_key].reshape(-1)
-            metrics |= cross_validated(self.regressor, x, y, groups, self.seed)
+            metrics |= cross_validate(self.regressor, x, y, groups, self.seed)
         self.regressor.fit(x, y)
         with torch.no_grad():
             return metrics | scores([self.regressor(x)], [y], "training")
 
     def export(self, folder: Path) -> None:
-        """Leave the data set as `dataset` in the folder of a run, for others to begin with."""
-        if self.dataset is not None and not (folder / "dataset").exists():
-            folders.save(self.dataset, folder / "dataset")
+        """Save the data set as `dataset.pt` in the folder of a run."""
+        if self.dataset is not None:
+            checkpoint.save(self.dataset.to_dict(), folder / "dataset.pt")
 
     def _pairs(self, batch: TensorDictBase) -> TensorDictBase:
-        data = batch.select(*self.keys).reshape(-1)
-        pairs = data.select(*(key for key in self.keys if key != self.advice_key or key in self.in_keys))
-        return pairs.set("action", data[self.advice_key][:, self.guide])
+        rows = batch.select(*self.keys).reshape(-1)
+        pairs = rows.select(*(key for key in self.keys if key != self.advice_key or key in self.in_keys))
+        return pairs.set("action", rows[self.advice_key][:, self.guide])
 
-    def _fitting(self, dataset: TensorDictBase, folder: str | os.PathLike[str], env: EnvBase) -> TensorDictBase:
-        """A data set that was read, if it can be added to."""
-        wanted = self._pairs(env.fake_tensordict())
-        for key in wanted.keys(True, True):
+    def _load(self, file: Path, env: EnvBase) -> TensorDictBase:
+        """Load the entries of a data set that this learner needs."""
+        if not file.is_file():
+            raise UserError(f"there is no data set {file}; give the dataset.pt of a run")
+        dataset = _from_dict(checkpoint.load(file))
+        expected = self._pairs(env.fake_tensordict())
+        keys = list(expected.keys(True, True))
+        for key in keys:
             shape = dataset[key].shape[1:] if key in dataset.keys(True, True) else None
-            if shape != wanted[key].shape[1:]:
+            if shape != expected[key].shape[1:]:
                 raise UserError(
-                    f"{folder} holds data of another env: {key} is {'missing' if shape is None else list(shape)}, "
-                    f"but {list(wanted[key].shape[1:])} is wanted; give another, or none"
+                    f"{file} is a data set of another env: {key} is {'missing' if shape is None else list(shape)}, "
+                    f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
                 )
-        return dataset.select(*wanted.keys(True, True)).to(env.device)
+        return dataset.select(*keys).to(env.device)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything an update depends on besides the batch."""
-        return {
-            "policy": self.policy.state_dict(),
-            "dataset": None if self.dataset is None else self.dataset.to_dict(),
-        }
+        """Return everything the next update depends on besides its batch."""
+        dataset = None if self.dataset is None else self.dataset.to_dict()
+        return {"policy": self.policy.state_dict(), "dataset": dataset}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a state of `state_dict`."""
+        """Restore a state from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
-        entries = state["dataset"]
-        if entries is not None:
-            entries = TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
-            entries = entries.to(self.device)
-        self.dataset = entries
+        self.dataset = None if state["dataset"] is None else _from_dict(state["dataset"]).to(self.device)
+
+
+def _from_dict(entries: dict[str, Any]) -> TensorDictBase:
+    return TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
 
 
 class _Action(nn.Module):
-    """What a regressor says of the observed entries, as an action that the env takes."""
+    """Prediction of a regressor for the observed entries, as an action of the env."""
 
-    def __init__(self, joined: Joined, regressor: Regressor, space: ActionSpace) -> None:
+    def __init__(self, concat: ConcatObservations, regressor: Regressor, space: ActionSpace) -> None:
         super().__init__()
-        self.joined, self.regressor, self.space = joined, regressor, space
+        self.concat, self.regressor, self.space = concat, regressor, space
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[*batch, ...] each to the action: [*batch, A], or [*batch] where it is a number of a finite set."""
-        return self.space.actions(self.space.clamp(self.regressor(self.joined(*inputs))))
-
-
-def _known(key: str | Sequence[str] | None, spec: TensorSpec) -> NestedKey | None:
-    """The key as TensorDict takes it, if the env has it."""
-    if key is None:
-        return None
-    nested = key if isinstance(key, str) else tuple(key)
-    return nested if nested in spec.keys(True, True) else None
+        """Map inputs [*batch, ...] to actions [*batch, A], or [*batch] for categorical actions."""
+        return self.space.actions(self.space.clamp(self.regressor(self.concat(*inputs))))

@@ -1,8 +1,8 @@
 """Deep Q-learning (Mnih et al. 2015), by default with double Q-learning (van Hasselt et al. 2016).
 
-A network says of each choice what return it expects, Q(s, a). Steps of the past are drawn at random, and Q(s, a) is
-moved towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or r alone where the episode terminated; Q' is a copy of the
-network that follows it slowly. The agent takes the best choice and, in some of the steps, any.
+A network estimates the return of each discrete action, Q(s, a). For stored steps sampled at random, Q(s, a) is moved
+towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or y = r where the episode terminated. Q' is a target network that
+follows Q slowly. The policy is epsilon-greedy.
 """
 
 from __future__ import annotations
@@ -13,40 +13,36 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
+from torch import nn
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss
 
 from coil_rl.learners import networks
-from coil_rl.learners.limits import check_numbers
+from coil_rl.learners.limits import check_range
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.schedules import Schedule, schedule
+from coil_rl.schedules import Linear, Schedule, schedule
 
 
 class DQN(OffPolicy):
-    """The DQN learner: networks, replay, loss and optimiser.
+    """The DQN learner.
+
+    COIL is DQN with `guide_action` among `in_keys`; the advice is one-hot.
 
     Args:
-        env: for the shapes of what is observed and the number of choices.
-        in_keys: what the network observes. COIL is DQN with `guide_action` among them, which is one-hot.
+        env: the env, with discrete actions.
+        in_keys: entries that the network observes.
         hidden: widths of the hidden layers.
-        action_gain: size of the weights behind the values at the start; with 0 every choice is worth 0.
-        learning_rate: of Adam, a number or a schedule over the run.
-        gamma: discount.
-        epsilon: share of the steps in which the agent takes any choice, a number or a schedule. Deterministic it never
-            does.
-        double: let the network choose and its slow copy judge the next action; else the copy does both.
-        tau: share of the way to the network that its slow copy goes after each minibatch.
-        max_grad_norm: gradients are scaled down to this norm.
-        capacity: steps that are kept.
-        batch_size: steps of a minibatch.
-        ratio: how often a step is learned from, on average.
-        starts: steps before it begins to learn.
-        seed: of the draws of minibatches.
+        action_gain: initial scale of the last weights; with 0 all action values are 0.
+        epsilon: probability of a random action, a number or a schedule; 0 for deterministic actions.
+        double: whether the network, not the target network, selects the next action.
+        tau: step of the target network towards the network after each minibatch, as a fraction.
+        ratio: how often a step is sampled, on average.
+        options: as for `OffPolicy`.
 
     Raises:
-        ValueError: for a value outside its range, an env that takes numbers, or as `Replay`.
+        ValueError: for a value out of range, an env with continuous actions, or as `OffPolicy`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -65,53 +61,42 @@ class DQN(OffPolicy):
         env: EnvBase,
         in_keys: Sequence[str] = ("observation",),
         *,
-        hidden: Sequence[int] = (64, 64),
+        hidden: Sequence[int] = (128, 128),
         action_gain: float = 1.0,
-        learning_rate: float | Schedule = 1e-3,
-        gamma: float = 0.99,
-        epsilon: float | Schedule = 0.1,
+        epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
-        tau: float = 0.005,
-        max_grad_norm: float = 10.0,
-        capacity: int = 100_000,
-        batch_size: int = 256,
-        ratio: float = 8.0,
-        starts: int = 1_000,
-        seed: int = 0,
+        tau: float = 0.01,
+        ratio: float = 16.0,
+        **options: Any,
     ) -> None:
         self.epsilon = schedule(epsilon)
-        check_numbers(1, hidden=min(hidden, default=1))
-        check_numbers(0, action_gain=action_gain)
+        check_range(0, action_gain=action_gain)
         for progress in (0, 1):
-            check_numbers(0, 1, epsilon=self.epsilon(progress))
+            check_range(0, 1, epsilon=self.epsilon(progress))
         spec = env.action_spec
         if not isinstance(spec, (Categorical, OneHot)):
             raise ValueError(
-                "DQN takes one of a few choices, but this env takes numbers; "
+                "DQN needs discrete actions, but this env has continuous ones; "
                 "put the transform DiscreteActions around it: action=choices"
             )
-        one = env.action_spec_unbatched  # the network is asked about batches of any size
-        network = networks.Network(env, in_keys, hidden, spec.space.n, action_gain, layers=networks.relu_layers)
-        self.network = TensorDictSequential(networks.Keyed(network, in_keys, ["action_value"]), QValueModule(spec=one))
-        self.explorer = EGreedyModule(one, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
+        super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
+        single = env.action_spec_unbatched  # the network is evaluated on batches of any size
+        network = networks.ObservationNetwork(env, in_keys, hidden, spec.space.n, action_gain, activation=nn.ReLU)
+        values = networks.FastTensorDictModule(network, in_keys, ["action_value"])
+        self.network = TensorDictSequential(values, QValueModule(spec=single))
+        self.explorer = EGreedyModule(single, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
         self.policy = TensorDictSequential(*self.network.module, self.explorer)
-        # Huber's loss would fit medians, which do not see the rare step that ends an episode, unless rewards were tiny.
-        loss = DQNLoss(self.network, action_space=one, double_dqn=double, delay_value=True, loss_function="l2")
-        super().__init__(
-            env, in_keys, loss, learning_rate=learning_rate, gamma=gamma, tau=tau, max_grad_norm=max_grad_norm,
-            capacity=capacity, batch_size=batch_size, ratio=ratio, starts=starts, seed=seed,
-        )  # fmt: skip
+        # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless rewards are tiny.
+        self.set_loss(
+            DQNLoss(self.network, action_space=single, double_dqn=double, delay_value=True, loss_function="l2")
+        )
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """As `OffPolicy` does.
-
-        Args:
-            batch: [*B, T] with `keys`.
-            progress: share of the run that is over, for the schedules.
+        """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.
 
         Returns:
-            What `OffPolicy` returns; the mean `value` of the best choice in the last minibatch, 0 before it begins to
-            learn; and `epsilon`.
+            The metrics of `OffPolicy`; `value`, the mean value of the best action in the last minibatch, 0 before
+            learning starts; and `epsilon`.
         """
         metrics = super().update(batch, progress)
         self.explorer.eps.fill_(self.epsilon(progress))
@@ -119,15 +104,15 @@ class DQN(OffPolicy):
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """The mean value of the best choice, 0 before it begins to learn."""
+        """Return the mean value of the best action, 0 before learning starts."""
         value = 0.0 if minibatch is None else float(self.network(minibatch)["chosen_action_value"].mean())
         return {"value": value}
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything an update depends on besides the batch."""
+        """Return everything the next update depends on besides its batch."""
         return {"policy": self.policy.state_dict()} | super().state_dict()
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a state of `state_dict`."""
+        """Restore a state from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
         super().load_state_dict(state)

@@ -1,14 +1,14 @@
-"""Dynamic COIL (paper section 3.3): an agent that listens to guides, and guides that learn to be listened to.
+"""Dynamic COIL (paper section 3.3): an agent that observes advice, and guides that learn through the agent.
 
-Guides and agent are one differentiable network: the guides say what they would do, the agent sees that and acts. The
-phases of a run decide who learns. In an agent phase the guides are frozen and this is COIL; in a guide phase the agent
-is frozen and one guide learns through it, by the same PPO loss and with a smaller learning rate. Each phase learns a
-little more slowly than the one of its kind before it.
+Guides and agent form one differentiable network: the agent observes the actions of the guides. In an agent phase the
+guides are frozen, which is COIL. In a guide phase the agent is frozen and one guide learns through it, with the same
+PPO loss and a smaller learning rate. The learning rate shrinks from each phase to the next of its kind.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
@@ -19,41 +19,167 @@ from torch.func import functional_call
 from torchrl.envs import EnvBase
 
 from coil_rl.learners import networks
-from coil_rl.learners.phases import Phases
+from coil_rl.learners.limits import LARGEST_SEED, check_choice, check_range
 from coil_rl.learners.ppo import PPO
-from coil_rl.schedules import Schedule, schedule
+from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides
 
 
-class DynamicCoil(PPO):
-    """The learner of Dynamic COIL and its controls.
+@dataclass(frozen=True)
+class Phase:
+    """A phase: whether the agent learns, which guides learn, and the number of earlier phases of the same kind."""
+
+    agent: bool
+    guides: tuple[int, ...]
+    earlier: int
+
+
+# Whether a phase ends, given its frames so far and the mean reward per step in each of its updates.
+StopRule = Callable[[int, Sequence[float]], bool]
+
+
+@dataclass(frozen=True)
+class AfterFrames:
+    """Stop rule for phases of fixed length: a phase ends with the update that completes its frames."""
+
+    frames: int
+
+    def __post_init__(self) -> None:
+        check_range(1, frames=self.frames)
+
+    def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
+        """Return whether the phase is complete."""
+        return frames >= self.frames
+
+
+@dataclass(frozen=True)
+class AtConvergence:
+    """Stop rule: a phase ends when consecutive evaluations have not improved on the best one before them.
+
+    An evaluation is the mean reward per step in the batch of one update.
 
     Args:
-        env: for the shapes of what is observed and done; its actions are continuous.
-        in_keys: what agent and critic observe; the agent also sees the advice, which the critic could compute.
-        guides: the guides by name, networks that learn; each reads what the env writes and writes `action`.
-        phases: makes the order of who learns when for so many guides.
-        guide_learning_rate: of the guides, a number or a schedule over the run.
-        shrink: each phase learns at this fraction of the rate of the one of its kind before it.
-        critic_phases: in which phases the critic learns: "both", "agent" or "guide".
-        ppo: everything else as for `PPO`.
+        evaluations: number of consecutive evaluations without improvement.
+        improvement: minimum increase of the mean reward.
+        frames: maximum length of the phase; None: unlimited.
+    """
+
+    evaluations: int = 5
+    improvement: float = 0.0
+    frames: int | None = None
+
+    def __post_init__(self) -> None:
+        check_range(1, evaluations=self.evaluations, frames=1 if self.frames is None else self.frames)
+        check_range(0, improvement=self.improvement)
+
+    def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
+        """Return whether the reward has converged, or the maximum length is reached."""
+        if self.frames is not None and frames >= self.frames:
+            return True
+        best, since = float("-inf"), 0
+        for reward in rewards:
+            best, since = (reward, 0) if reward > best + self.improvement else (best, since + 1)
+        return since >= self.evaluations
+
+
+class PhaseSchedule:
+    """The order of the phases.
+
+    Args:
+        guides: n, number of guides.
+        order: "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the agent only;
+            "guide": one guide after the other, never the agent.
+        choice: of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at random.
+        agent_phase: stop rule of phases in which the agent learns.
+        guide_phase: stop rule of the other phases.
+        seed: of the stochastic choice.
 
     Attributes:
-        guides: by name.
-        phases: who learns when.
+        phase: the current phase.
+        number: of the current phase, from 0.
 
     Raises:
-        ValueError: for a value outside its range, a guide without parameters, or two guides that share some.
-
-    Example:
-        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.train.rollout import Rollout
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
-        >>> first, second = (networks.Keyed(networks.Network(env, ["observation"], [8], 1, 1.0), ["observation"],
-        ...                                 ["action"]) for _ in range(2))
-        >>> learner = DynamicCoil(env, guides={"first": first, "second": second})
-        >>> metrics = learner.update(Rollout(env, learner.policy, steps=32).collect())
+        ValueError: for an unknown order or choice, or without a guide.
     """
+
+    def __init__(
+        self,
+        guides: int,
+        *,
+        order: Literal["alternate", "joint", "agent", "guide"] = "alternate",
+        choice: Literal["sequential", "stochastic"] = "sequential",
+        agent_phase: StopRule = AfterFrames(131_072),
+        guide_phase: StopRule = AfterFrames(65_536),
+        seed: int = 0,
+    ) -> None:
+        check_choice(("alternate", "joint", "agent", "guide"), order=order)
+        check_choice(("sequential", "stochastic"), choice=choice)
+        check_range(1, guides=guides)
+        check_range(0, LARGEST_SEED, seed=seed)
+        self.guides, self.order, self.choice = guides, order, choice
+        self.agent_phase, self.guide_phase = agent_phase, guide_phase
+        self.generator = torch.Generator().manual_seed(seed)
+        self.number, self.frames = 0, 0
+        self.rewards: list[float] = []
+        self.phase = self._next()
+
+    def advance(self, frames: int, reward: float) -> bool:
+        """Count an update, given the frames and the mean reward of its batch; returns whether it ends its phase."""
+        self.frames += frames
+        self.rewards.append(reward)
+        stop = self.agent_phase if self.phase.agent else self.guide_phase
+        if not stop(self.frames, self.rewards):
+            return False
+        self.number, self.frames, self.rewards = self.number + 1, 0, []
+        self.phase = self._next()
+        return True
+
+    def _next(self) -> Phase:
+        if self.order in ("agent", "joint"):
+            return Phase(True, tuple(range(self.guides)) if self.order == "joint" else (), self.number)
+        earlier = self.number if self.order == "guide" else self.number // 2
+        if self.order == "alternate" and self.number % 2 == 0:
+            return Phase(True, (), earlier)
+        if self.choice == "sequential":
+            return Phase(False, (earlier % self.guides,), earlier)
+        return Phase(False, (int(torch.randint(self.guides, (), generator=self.generator)),), earlier)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the position in the schedule."""
+        return {
+            "number": self.number,
+            "frames": self.frames,
+            "rewards": list(self.rewards),
+            "phase": (self.phase.agent, list(self.phase.guides), self.phase.earlier),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state_dict`."""
+        agent, guides, earlier = state["phase"]
+        self.phase = Phase(agent, tuple(guides), earlier)
+        self.number, self.frames, self.rewards = state["number"], state["frames"], list(state["rewards"])
+        self.generator.set_state(state["generator"])
+
+
+class DynamicCoil(PPO):
+    """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
+
+    Args:
+        env: the env, with continuous actions.
+        in_keys: entries that agent and critic observe; the agent also observes the advice.
+        guides: guide networks by name; each writes `action`.
+        phases: makes the phase schedule for a number of guides.
+        guide_learning_rate: of the guides, a number or a schedule.
+        shrink: factor on the learning rate from each phase to the next of its kind.
+        critic_phases: phases in which the critic learns: "both", "agent" or "guide".
+        ppo: as for `PPO`.
+
+    Raises:
+        ValueError: for a value out of range, a guide without parameters, or guides that share parameters.
+    """
+
+    kind = "guides"
 
     def __init__(
         self,
@@ -61,100 +187,94 @@ class DynamicCoil(PPO):
         in_keys: Sequence[str] = ("observation",),
         *,
         guides: Mapping[str, TensorDictModuleBase],
-        phases: Callable[[int], Phases] = Phases,
-        guide_learning_rate: float | Schedule = 1e-4,
+        phases: Callable[[int], PhaseSchedule] = PhaseSchedule,
+        guide_learning_rate: float | Schedule = Linear(3e-4, 0.0),
         shrink: float = 0.9,
         critic_phases: Literal["both", "agent", "guide"] = "both",
         **ppo: Any,
     ) -> None:
-        if not 0 < shrink <= 1:
-            raise ValueError(f"shrink={shrink} must be more than 0 and at most 1")
-        if critic_phases not in ("both", "agent", "guide"):
-            raise ValueError(f"critic_phases={critic_phases!r} must be one of both, agent, guide")
+        check_range(0, 1, above=True, shrink=shrink)
+        check_choice(("both", "agent", "guide"), critic_phases=critic_phases)
         if not env.action_spec.dtype.is_floating_point:
-            raise ValueError("guides learn through actions that are numbers; this env has choices")
-        self.advice = Guides(guides, trainable=True)
-        self.guides: dict[str, TensorDictModuleBase] = dict(guides)
-        self.start = [{name: p.detach().clone() for name, p in guide.named_parameters()} for guide in guides.values()]
-        self.phases = phases(len(guides))
+            raise ValueError("Dynamic COIL needs continuous actions, but this env has discrete ones")
         self.guide_learning_rate = schedule(guide_learning_rate)
-        if not self.guide_learning_rate(0) >= 0:
-            raise ValueError(f"guide_learning_rate={self.guide_learning_rate(0)} must be at least 0")
+        check_range(0, guide_learning_rate=self.guide_learning_rate(0))
+        self.advice = Guides(guides, trainable=True)
+        parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
+        if len({id(parameter) for parameter in parameters}) < len(parameters):
+            raise ValueError("two guides share parameters, so one of them cannot be frozen while the other learns")
+        self.guides: dict[str, TensorDictModuleBase] = dict(guides)
+        self.initial = [{name: p.detach().clone() for name, p in guide.named_parameters()} for guide in guides.values()]
+        self.phases = phases(len(guides))
         self.shrink, self.critic_phases = shrink, critic_phases
         super().__init__(env, in_keys, **ppo)
 
-    def build_policy(
+    def build_networks(
         self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
-    ) -> ProbabilisticTensorDictSequential:
-        """The guides, and behind them an agent that also sees what they say."""
+    ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
+        """Return the guides followed by the agent, and the critic."""
         shape = torch.Size([len(self.guides), *env.action_spec.shape[len(env.batch_size) :]])
-        seen = [*in_keys, *self.advice.out_keys]
-        agent = networks.actor(env, seen, hidden, scale, gain, {"guide_action": shape})
+        agent_keys = [*in_keys, *self.advice.out_keys]
+        agent = networks.actor(env, agent_keys, hidden, scale, gain, shapes={"guide_action": shape})
         self.agent_parameters = list(agent.parameters())
-        return ProbabilisticTensorDictSequential(self.advice, *agent.module)
+        policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
+        return policy, networks.critic(env, in_keys, hidden)
 
-    def groups(self) -> list[list[nn.Parameter]]:
-        """The agent's parameters, the critic's, and each guide's."""
-        of_guides = [list(guide.parameters()) for guide in self.guides.values()]
-        if len({id(p) for group in of_guides for p in group}) < sum(map(len, of_guides)):
-            raise ValueError("two of the guides share parameters, so that one cannot learn while the other does not")
-        return [self.agent_parameters, list(self.critic.parameters()), *of_guides]
+    def parameter_groups(self) -> list[list[nn.Parameter]]:
+        """Return the parameters of the agent, of the critic, and of each guide."""
+        guides = [list(guide.parameters()) for guide in self.guides.values()]
+        return [self.agent_parameters, list(self.critic.parameters()), *guides]
 
-    def rates(self, progress: float) -> list[float]:
-        """Of each group in this phase; 0 where it does not learn."""
-        turn, shrunk = self.phases.turn, self.shrink**self.phases.turn.earlier
-        critic = self.critic_phases in ("both", "agent" if turn.agent else "guide")
-        agent, guide = self.learning_rate(progress), self.guide_learning_rate(progress) * shrunk
-        of_guides = [guide if place in turn.guides else 0.0 for place in range(len(self.guides))]
-        return [agent * shrunk if turn.agent else 0.0, agent if critic else 0.0, *of_guides]
+    def learning_rates(self, progress: float) -> list[float]:
+        """Return the learning rates of the parameter groups in this phase, 0 for networks that do not learn."""
+        phase = self.phases.phase
+        factor = self.shrink**phase.earlier
+        agent, guide = self.learning_rate(progress), self.guide_learning_rate(progress) * factor
+        critic_learns = self.critic_phases in ("both", "agent" if phase.agent else "guide")
+        guides = [guide if index in phase.guides else 0.0 for index in range(len(self.guides))]
+        return [agent * factor if phase.agent else 0.0, agent if critic_learns else 0.0, *guides]
 
-    def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Learn from a batch of rollouts, whoever's turn it is.
-
-        Args:
-            batch: as for `PPO`.
-            progress: share of the run that is over, for the schedules.
-
-        Returns:
-            What `PPO` returns; `phase`, its number; `guide`, which one learns, -1 if none and n if all do;
-            `guides_changed`, whether a phase ends in which one did; `guide_learning_rate`; and of each guide
-            `moved_NAME`, how far its action is from what it was at the start, mean |g - g_start| over the batch.
-        """
-        phase, turn, rates = self.phases.number, self.phases.turn, self.rates(progress)
-        for group, rate in zip(self.optimiser.param_groups, rates, strict=True):
+    def set_learning_rates(self, progress: float) -> None:
+        """Set the learning rates of this phase, and freeze the networks that do not learn."""
+        for group, rate in zip(self.optimiser.param_groups, self.learning_rates(progress), strict=True):
+            group["lr"] = rate
             for parameter in group["params"]:
                 parameter.requires_grad_(rate > 0)
+
+    def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
+        """Learn from a batch of rollouts; arguments as for `PPO.update`.
+
+        Returns:
+            The metrics of `PPO`; the number of the `phase`; the index of the `guide` that learns, -1 if none does and n
+            if all do; `guides_changed`, whether a phase has ended in which a guide learned; `guide_learning_rate`; and
+            for each guide `moved_NAME`, the mean absolute difference of its action to that of the initial guide.
+        """
+        number, phase, rates = self.phases.number, self.phases.phase, self.learning_rates(progress)
         metrics = super().update(batch, progress)
         ended = self.phases.advance(batch.numel(), float(batch["next", "reward"].mean()))
         metrics |= {
-            "phase": phase,
-            "guides_changed": float(ended and bool(turn.guides)),
-            "guide": turn.guides[0] if len(turn.guides) == 1 else len(turn.guides) or -1,
+            "phase": number,
+            "guides_changed": float(ended and bool(phase.guides)),
+            "guide": phase.guides[0] if len(phase.guides) == 1 else len(phase.guides) or -1,
             "learning_rate": rates[0],
             "guide_learning_rate": max(rates[2:]),
         }
-        return metrics | {f"moved_{name}": value for name, value in self._moved(batch).items()}
+        return metrics | self._moved(batch)
 
     @torch.no_grad()
     def _moved(self, batch: TensorDictBase) -> dict[str, float]:
         moved = {}
-        for (name, guide), start in zip(self.guides.items(), self.start, strict=True):
-            seen = batch.select(*guide.in_keys)
-            then = functional_call(guide, start, (seen.copy(),))["action"]
-            moved[name] = float((guide(seen)["action"] - then).abs().mean())
+        for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
+            observed = batch.select(*guide.in_keys)
+            before = functional_call(guide, initial, (observed.copy(),))["action"]
+            moved[f"moved_{name}"] = float((guide(observed)["action"] - before).abs().mean())
         return moved
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything an update depends on besides the batch."""
-        return super().state_dict() | {"phases": self.phases.state_dict(), "names": list(self.guides)}
+        """Return everything the next update depends on besides its batch."""
+        return super().state_dict() | {"phases": self.phases.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a state of `state_dict`.
-
-        Raises:
-            ValueError: if it is of other guides, or of another order.
-        """
-        if state["names"] != list(self.guides):
-            raise ValueError(f"the state is of the guides {', '.join(state['names'])}, not {', '.join(self.guides)}")
+        """Restore a state from `state_dict`."""
         super().load_state_dict(state)
         self.phases.load_state_dict(state["phases"])

@@ -1,23 +1,36 @@
-"""Which numbers a hyper-parameter may be."""
+"""Range checks for hyper-parameters."""
 
 from __future__ import annotations
 
 import math
 
+LARGEST_SEED = 2**63 - 1
 
-def check_numbers(low: float, high: float = math.inf, *, above: bool = False, **numbers: float) -> None:
-    """Refuse numbers outside their range.
+
+def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:
+    """Raise an error for the first value out of range.
 
     Args:
-        low: the lowest.
-        high: the highest; without one, any finite number.
-        above: a number must be more than the lowest.
-        numbers: by name.
+        low: lowest value allowed.
+        high: highest value allowed; by default any finite number.
+        above: whether `low` itself is excluded.
+        values: the values by name.
 
     Raises:
-        ValueError: for the first that is outside, or NaN, naming it.
+        ValueError: for a value that is out of range, NaN or infinite.
     """
-    most = f"and at most {high}" if high < math.inf else "and finite"
-    for name, number in numbers.items():
-        if not (low < number if above else low <= number) or number > high or math.isinf(number):
-            raise ValueError(f"{name}={number} must be {'more than' if above else 'at least'} {low} {most}")
+    upper = f"and at most {high}" if high < math.inf else "and finite"
+    for name, value in values.items():
+        if not (low < value if above else low <= value) or value > high or math.isinf(value):
+            raise ValueError(f"{name}={value} must be {'more than' if above else 'at least'} {low} {upper}")
+
+
+def check_choice(choices: tuple[str, ...], **values: str) -> None:
+    """Raise an error for the first value that is not one of the choices.
+
+    Raises:
+        ValueError: with the name of the value and the choices.
+    """
+    for name, value in values.items():
+        if value not in choices:
+            raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

@@ -1,9 +1,9 @@
-"""Actors and critics, built from an env's specs."""
+"""Policy and value networks, built from the specs of an env."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from tensordict import TensorDictBase
@@ -14,84 +14,77 @@ from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 
+from coil_rl.learners.limits import check_range
 
-class Joined(nn.Module):
-    """Some of an env's entries as one vector: each is flattened beyond the batch, then they are joined.
+
+class ConcatObservations(nn.Module):
+    """Concatenation of entries of an env, each flattened beyond the batch dimensions.
 
     Args:
-        env: for its specs.
+        env: the env.
         in_keys: the entries.
-        shapes: of those that the env does not write, without the batch.
+        shapes: shapes of entries that the env does not write, without the batch dimensions.
 
     Attributes:
-        width: D, length of the vector.
+        width: D, length of the concatenated vector.
 
     Raises:
-        KeyError: if the env has no such entry, naming those it has.
+        KeyError: if the env has no such entry.
     """
 
     def __init__(self, env: EnvBase, in_keys: Sequence[str], shapes: Mapping[str, torch.Size] | None = None) -> None:
         super().__init__()
-        spec, batch, others = env.observation_spec, len(env.batch_size), shapes or {}
-        known = [*(key for key in spec.keys(True, True) if isinstance(key, str)), *others]
-        missing = [key for key in in_keys if key not in known]
+        spec, batch_dims, extra = env.observation_spec, len(env.batch_size), shapes or {}
+        available = [*(key for key in spec.keys(True, True) if isinstance(key, str)), *extra]
+        missing = [key for key in in_keys if key not in available]
         if missing:
-            raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(known)}")
-        each = [others[key] if key in others else spec[key].shape[batch:] for key in in_keys]
-        self.event_dims = [len(shape) for shape in each]
-        self.width = sum(shape.numel() for shape in each)
+            raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(available)}")
+        event_shapes = [extra[key] if key in extra else spec[key].shape[batch_dims:] for key in in_keys]
+        self.event_dims = [len(shape) for shape in event_shapes]
+        self.width = sum(shape.numel() for shape in event_shapes)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[*batch, ...] each to [*batch, D]."""
+        """Concatenate inputs [*batch, ...] to [*batch, D]."""
         flat = [
             x.unsqueeze(-1) if dims == 0 else x.flatten(-dims) for x, dims in zip(inputs, self.event_dims, strict=True)
         ]
         return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 
 
-def tanh_layers(
-    inputs: int, outputs: int, hidden: Sequence[int], gain: float, device: torch.device | None = None
+def mlp(
+    inputs: int,
+    outputs: int,
+    hidden: Sequence[int],
+    gain: float,
+    device: torch.device | None = None,
+    activation: type[nn.Module] = nn.Tanh,
 ) -> MLP:
-    """A tanh network with PPO's orthogonal start.
+    """Return a tanh network with orthogonal weights and zero biases, or a ReLU network with PyTorch's initial weights.
 
     Args:
-        inputs: width of what it reads.
-        outputs: width of the last layer.
+        inputs: width of the input.
+        outputs: width of the output.
         hidden: widths of the hidden layers.
-        gain: size of the last layer's weights.
-        device: where it lives.
+        gain: scale of the weights of the last layer.
+        device: device of the parameters.
+        activation: `nn.Tanh` or `nn.ReLU`.
     """
-    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=nn.Tanh, device=device)
-    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-    for layer in linear:
-        nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
-        nn.init.zeros_(layer.bias)
+    check_range(1, hidden=min(hidden, default=1))
+    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=activation, device=device)
+    if activation is nn.Tanh:
+        linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
+        for layer in linear:
+            nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
+            nn.init.zeros_(layer.bias)
+    else:
+        with torch.no_grad():
+            for parameter in layers[-1].parameters():
+                parameter.mul_(gain)
     return layers
 
 
-def relu_layers(
-    inputs: int, outputs: int, hidden: Sequence[int], gain: float, device: torch.device | None = None
-) -> MLP:
-    """A rectified network with PyTorch's own start, the last layer scaled by `gain`; arguments as for `tanh_layers`."""
-    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=nn.ReLU, device=device)
-    with torch.no_grad():
-        for parameter in layers[-1].parameters():
-            parameter.mul_(gain)
-    return layers
-
-
-class Network(nn.Module):
-    """A network over some of an env's entries, joined.
-
-    Args:
-        env: for its specs.
-        in_keys: the entries.
-        hidden: widths of the hidden layers.
-        outputs: width of the last layer.
-        gain: size of the last layer's weights.
-        shapes: as for `Joined`.
-        layers: makes them, as `tanh_layers` does.
-    """
+class ObservationNetwork(nn.Module):
+    """An `mlp` that reads concatenated entries of an env; arguments as for `ConcatObservations` and `mlp`."""
 
     def __init__(
         self,
@@ -101,57 +94,48 @@ class Network(nn.Module):
         outputs: int,
         gain: float,
         shapes: Mapping[str, torch.Size] | None = None,
-        layers: Callable[..., MLP] = tanh_layers,
+        activation: type[nn.Module] = nn.Tanh,
     ) -> None:
         super().__init__()
-        self.joined = Joined(env, in_keys, shapes)
-        self.layers = layers(self.joined.width, outputs, hidden, gain, env.device)
+        self.concat = ConcatObservations(env, in_keys, shapes)
+        self.layers = mlp(self.concat.width, outputs, hidden, gain, env.device, activation)
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """[*batch, ...] each to [*batch, outputs]."""
-        out: Tensor = self.layers(self.joined(*inputs))
+        """Map inputs [*batch, ...] to [*batch, outputs]."""
+        out: Tensor = self.layers(self.concat(*inputs))
         return out
 
 
-class NormalHead(nn.Module):
-    """A network's output as the mean of a normal distribution whose spread is a parameter, the same in every state."""
+class GlobalScaleHead(nn.Module):
+    """Normal distribution with a mean from a network and a standard deviation that is the same in every state."""
 
-    def __init__(self, network: Network, size: int, scale: float) -> None:
+    def __init__(self, network: ObservationNetwork, size: int, scale: float) -> None:
         super().__init__()
         self.network = network
         self.log_scale = nn.Parameter(torch.full((size,), math.log(scale), device=network.layers[-1].weight.device))
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation, [*batch, A] each."""
+        """Return mean and standard deviation, [*batch, A] each."""
         loc = self.network(*inputs)
         return loc, self.log_scale.exp().expand_as(loc)
 
 
-class SpreadHead(nn.Module):
-    """A network's output as mean and standard deviation of a normal distribution, both different in every state."""
+class GaussianHead(nn.Module):
+    """Normal distribution with mean and standard deviation from a network; an output of 0 gives `scale`."""
 
-    def __init__(self, network: Network, scale: float) -> None:
+    def __init__(self, network: ObservationNetwork, scale: float) -> None:
         super().__init__()
         self.network = network
         self.split = NormalParamExtractor(f"biased_softplus_{scale}", scale_lb=1e-3)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and standard deviation, [*batch, A] each; for an output of 0 that is `scale`."""
+        """Return mean and standard deviation, [*batch, A] each."""
         loc, scale = self.split(self.network(*inputs))
         return loc, scale
 
 
-class Keyed(TensorDictModuleBase):
-    """A module from some entries of a tensordict to others.
-
-    What `TensorDictModule` is, without its search for optional packages at every call, which takes as long as a small
-    network does.
-
-    Args:
-        module: from tensors to a tensor or several.
-        in_keys: its arguments.
-        out_keys: its results.
-    """
+class FastTensorDictModule(TensorDictModuleBase):
+    """A `TensorDictModule` with less overhead per call: no dispatch, no search for optional packages."""
 
     def __init__(self, module: nn.Module, in_keys: Sequence[str], out_keys: Sequence[str]) -> None:
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
@@ -159,7 +143,7 @@ class Keyed(TensorDictModuleBase):
         self.module = module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the results into the tensordict that is read."""
+        """Write the results into the tensordict."""
         results = self.module(*(tensordict[key] for key in self.in_keys))
         for key, result in zip(self.out_keys, results if isinstance(results, tuple) else (results,), strict=True):
             tensordict.set(key, result)
@@ -172,52 +156,38 @@ def actor(
     hidden: Sequence[int] = (64, 64),
     scale: float = 0.5,
     gain: float = 0.01,
+    *,
     shapes: Mapping[str, torch.Size] | None = None,
+    state_dependent_scale: bool = False,
 ) -> ProbabilisticActor:
-    """A stochastic policy for the env's action: a squashed normal where actions are bounded, else a normal or a choice.
+    """Return a stochastic policy for the actions of an env.
 
-    Its deterministic action is the mode. The standard deviation does not depend on the state.
+    Its distribution is a tanh-squashed normal for bounded actions, a normal for unbounded ones and a categorical for
+    discrete ones. Its deterministic action is the mode.
 
     Args:
-        env: for its specs.
-        in_keys: what the agent observes.
+        env: the env.
+        in_keys: entries that the policy observes.
         hidden: widths of the hidden layers.
-        scale: standard deviation at the start, before squashing.
-        gain: size of the last layer's weights at the start.
-        shapes: as for `Joined`.
+        scale: initial standard deviation, before squashing.
+        gain: initial scale of the weights of the last layer.
+        shapes: as for `ConcatObservations`.
+        state_dependent_scale: whether the standard deviation is an output of the network; continuous actions only.
 
     Returns:
         A module that writes `action` and `action_log_prob`.
     """
     spec = env.action_spec
-    discrete = isinstance(spec, (Categorical, OneHot))
-    size = spec.space.n if discrete else spec.shape[-1]
-    network = Network(env, in_keys, hidden, size, gain, shapes)
     common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
-    if discrete:
-        module = Keyed(network, in_keys, ["logits"])
-        kind = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
-        return ProbabilisticActor(module, ["logits"], distribution_class=kind, **common)
-    module = Keyed(NormalHead(network, size, scale), in_keys, ["loc", "scale"])
-    return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
-
-
-def spread_actor(
-    env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64), scale: float = 0.5, gain: float = 0.01
-) -> ProbabilisticActor:
-    """As `actor`, for numbers only and with a standard deviation that depends on the state.
-
-    Args:
-        env: for its specs.
-        in_keys: what the agent observes.
-        hidden: widths of the hidden layers.
-        scale: standard deviation at the start, before squashing.
-        gain: size of the last layer's weights at the start.
-    """
-    spec = env.action_spec
-    network = Network(env, in_keys, hidden, 2 * spec.shape[-1], gain)
-    module = Keyed(SpreadHead(network, scale), in_keys, ["loc", "scale"])
-    common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
+    if isinstance(spec, (Categorical, OneHot)):
+        logits = ObservationNetwork(env, in_keys, hidden, spec.space.n, gain, shapes)
+        module = FastTensorDictModule(logits, in_keys, ["logits"])
+        distribution = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
+        return ProbabilisticActor(module, ["logits"], distribution_class=distribution, **common)
+    size = spec.shape[-1]
+    network = ObservationNetwork(env, in_keys, hidden, 2 * size if state_dependent_scale else size, gain, shapes)
+    head = GaussianHead(network, scale) if state_dependent_scale else GlobalScaleHead(network, size, scale)
+    module = FastTensorDictModule(head, in_keys, ["loc", "scale"])
     return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
 
 
@@ -229,6 +199,13 @@ def _distribution(spec: TensorSpec) -> dict[str, object]:
     return {"distribution_class": TanhNormal, "distribution_kwargs": bounds | {"tanh_loc": False}}
 
 
-def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> Keyed:
-    """A state-value network over the same entries; writes `state_value` [*batch, 1]."""
-    return Keyed(Network(env, in_keys, hidden, 1, gain=1.0), in_keys, ["state_value"])
+def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> FastTensorDictModule:
+    """Return a state-value network; it writes `state_value` [*batch, 1]."""
+    return FastTensorDictModule(ObservationNetwork(env, in_keys, hidden, 1, gain=1.0), in_keys, ["state_value"])
+
+
+def action_critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> FastTensorDictModule:
+    """Return an action-value network for continuous actions; it writes `state_action_value` [*batch, 1]."""
+    keys, shapes = [*in_keys, "action"], {"action": env.action_spec.shape[-1:]}
+    network = ObservationNetwork(env, keys, hidden, 1, 1.0, shapes)
+    return FastTensorDictModule(network, keys, ["state_action_value"])

@@ -1,40 +1,66 @@
-"""Proximal policy optimisation with clipped ratios (paper equation 92; Schulman et al. 2017).
+"""Proximal policy optimisation with clipped probability ratios (paper equation 92; Schulman et al. 2017).
 
-A batch of rollouts gets advantages from a critic (generalised advantage estimation); the policy then takes several
-passes over the batch in minibatches, held near the policy that collected it by clipping the probability ratio.
+A critic turns a batch of rollouts into advantages A (generalised advantage estimation). The policy then takes several
+passes over the batch in minibatches. Clipping the probability ratio keeps it near the policy that collected the batch:
+
+    loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar
 
 import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
-from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives import ClipPPOLoss, LossModule
+from torchrl.objectives.value import GAE
 
-from coil_rl.learners.actor_critic import ActorCritic
-from coil_rl.learners.advantages import Advantages
-from coil_rl.learners.limits import check_numbers
-from coil_rl.schedules import Schedule, schedule
+from coil_rl.learners import networks
+from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.limits import LARGEST_SEED, check_range
+from coil_rl.schedules import Linear, Schedule, schedule
 
 
-class PPO(ActorCritic):
-    """The PPO learner.
+class PPO:
+    """The PPO learner, and the base class of the other on-policy learners.
+
+    COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps (`agent_acts` is false),
+    the policy learns from the agent's steps only, and the critic from all. Subclasses override `loss`, `losses`,
+    `build_networks`, `parameter_groups` and `set_learning_rates`.
 
     Args:
-        env: for the shapes of what is observed and done.
-        in_keys: what policy and critic observe. COIL is PPO with `guide_action` among them.
+        env: the env, for its specs.
+        in_keys: entries that policy and critic observe.
+        hidden: widths of the hidden layers of both networks.
+        action_scale: initial standard deviation of the policy.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0 everywhere.
+        learning_rate: of Adam, a number or a schedule.
         gamma: discount.
         gae_lambda: lambda of generalised advantage estimation.
-        clip: how far the probability ratio may move the objective.
+        clip: clipping range of the probability ratio.
         epochs: passes over each batch.
-        minibatches: parts of each pass.
-        entropy: weight of the entropy bonus, a number or a schedule.
-        critic: weight of the critic's loss.
-        compile: the loss by `torch.compile`, which takes some ten seconds and pays in long runs. The numbers then
-            differ in their last digits.
-        networks_and_optimiser: everything else as for `ActorCritic`.
+        minibatches: minibatches per pass.
+        entropy: coefficient of the entropy bonus, a number or a schedule.
+        critic: coefficient of the critic's loss.
+        max_grad_norm: gradients are scaled down to this norm.
+        compile: whether to use `torch.compile` for the loss, which changes the last digits of the numbers.
+        auxiliary: additional losses of the policy.
+        seed: of the order of minibatches.
+
+    Attributes:
+        kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions)
+            or "guides" (guides besides an agent).
+        policy: writes `action` and `action_log_prob`.
+        critic: writes `state_value`.
+        keys: entries that a batch must have.
+
+    Raises:
+        ValueError: for a value out of range.
+        KeyError: if the env has no such entry.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -44,29 +70,40 @@ class PPO(ActorCritic):
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
+    kind: ClassVar[str] = "agent"
+
     def __init__(
         self,
         env: EnvBase,
         in_keys: Sequence[str] = ("observation",),
         *,
+        hidden: Sequence[int] = (64, 64),
+        action_scale: float = 0.5,
+        action_gain: float = 0.01,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
         clip: float = 0.2,
-        epochs: int = 10,
+        epochs: int = 5,
         minibatches: int = 16,
         entropy: float | Schedule = 0.0,
         critic: float = 0.5,
+        max_grad_norm: float = 0.5,
         compile: bool = False,
-        **networks_and_optimiser: Any,
+        auxiliary: Sequence[KickstartLoss] = (),
+        seed: int = 0,
     ) -> None:
-        super().__init__(env, in_keys, minibatches=minibatches, **networks_and_optimiser)
-        self.entropy = schedule(entropy)
-        check_numbers(1, epochs=epochs)
-        check_numbers(0, critic=critic, entropy=self.entropy(0))
-        check_numbers(0, above=True, clip=clip)
-        self.epochs = epochs
+        self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
+        check_range(0, action_gain=action_gain, learning_rate=self.learning_rate(0))
+        check_range(0, critic=critic, entropy=self.entropy(0))
+        check_range(0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm)
+        check_range(1, epochs=epochs, minibatches=minibatches)
+        check_range(0, LARGEST_SEED, seed=seed)
+        self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
+        self.critic_coefficient, self.auxiliary = critic, list(auxiliary)
+        self.policy, self.critic = self.build_networks(env, in_keys, hidden, action_scale, action_gain)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss = ClipPPOLoss(
+        self.loss: LossModule = ClipPPOLoss(
             self.policy,
             self.critic,
             clip_epsilon=clip,
@@ -77,5 +114,155 @@ class PPO(ActorCritic):
             normalize_advantage=True,
             functional=False,
         )
-        if compile:
-            self.losses = torch.compile(self.loss.__call__)  # type: ignore[method-assign]
+        self.compiled: Callable[..., TensorDictBase] | None = torch.compile(self.loss.__call__) if compile else None
+        groups = self.parameter_groups()
+        self.parameters = [parameter for group in groups for parameter in group]
+        rate = self.learning_rate(0)
+        self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=1e-5, fused=True)
+        self.generator = torch.Generator().manual_seed(seed)
+        self.guide_may_act = "agent_acts" in env.observation_spec
+        read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), "action", "action_log_prob"]
+        read += [key for auxiliary_loss in self.auxiliary for key in auxiliary_loss.keys]
+        read += ["agent_acts"] if self.guide_may_act else []
+        self.keys = [*read, *(("next", key) for key in (*in_keys, "reward", "done", "terminated"))]
+        self.minibatch_keys = [*read, "advantage", "value_target"]
+
+    def build_networks(
+        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
+    ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
+        """Return policy and critic."""
+        return networks.actor(env, in_keys, hidden, scale, gain), networks.critic(env, in_keys, hidden)
+
+    def parameter_groups(self) -> list[list[nn.Parameter]]:
+        """Return the parameters that the optimiser updates, grouped by learning rate."""
+        return [[*self.policy.parameters(), *self.critic.parameters()]]
+
+    def set_learning_rates(self, progress: float) -> None:
+        """Set the learning rate of each parameter group."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = self.learning_rate(progress)
+
+    def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
+        """Learn from a batch of rollouts.
+
+        Args:
+            batch: [B, T] with `keys`. A truncated episode is bootstrapped from the value of its last state.
+            progress: of the run, in [0, 1], for the schedules.
+
+        Returns:
+            Means over the minibatches of the losses and of the other values that TorchRL's loss reports, and the
+            learning rate.
+        """
+        rows = self.prepare(batch, progress)
+        reports = []
+        for minibatch in self.draw_minibatches(rows):
+            losses = self.masked_losses(minibatch)
+            total = losses["loss_objective"] + losses["loss_critic"]
+            if "loss_entropy" in losses:
+                total = total + losses["loss_entropy"]
+            for auxiliary in self.auxiliary:
+                losses[f"loss_{auxiliary.name}"] = auxiliary(self.policy, minibatch)
+                total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
+            self.step(total)
+            reports.append(losses.detach())
+        names = list(reports[0].keys())
+        means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
+        return means | {"learning_rate": self.learning_rate(progress)}
+
+    def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
+        """Apply the schedules and compute advantages; returns the rows to learn from, [B * T]."""
+        self.set_learning_rates(progress)
+        if getattr(self.loss, "entropy_bonus", False):
+            self.loss.entropy_coeff.fill_(self.entropy(progress))
+        self.advantage(batch)
+        return batch.select(*self.minibatch_keys).reshape(-1)
+
+    def draw_minibatches(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yield the minibatches of all passes over the rows, each pass in a random order."""
+        size = len(rows) // self.minibatches
+        if size < 2:  # one advantage cannot be standardised
+            raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {len(rows)} frames to each")
+        for _ in range(self.epochs):
+            order = torch.randperm(len(rows), generator=self.generator)[: size * self.minibatches]
+            yield from rows[order.to(rows.device)].split(size)
+
+    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
+        losses: TensorDictBase = (self.compiled or self.loss)(minibatch)
+        return losses
+
+    def masked_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch, those of the policy for the steps in which the agent acted only."""
+        if not self.guide_may_act:
+            return self.losses(minibatch)
+        agent_steps = minibatch[minibatch["agent_acts"].squeeze(-1)]
+        if len(agent_steps) < 2:  # one advantage cannot be standardised
+            losses = self.losses(minibatch)
+            for name in {"loss_objective", "loss_entropy"}.intersection(losses.keys()):
+                losses[name] = losses[name] * 0
+            return losses
+        losses = self.losses(agent_steps)
+        losses["loss_critic"] = self.loss.loss_critic(minibatch)[0].mean()
+        return losses
+
+    def step(self, loss: Tensor) -> None:
+        """Take one step of the optimiser."""
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        self.optimiser.step()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything the next update depends on besides its batch."""
+        return {
+            "policy": self.policy.state_dict(),
+            "critic": self.critic.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state_dict`."""
+        self.policy.load_state_dict(state["policy"])
+        self.critic.load_state_dict(state["critic"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["generator"])
+
+
+class Advantages:
+    """Generalised advantage estimation (Schulman et al. 2016) with one critic evaluation per state.
+
+    The state after a step is the state before the next step, unless the episode ended. So the critic evaluates each
+    state once, and in addition the last states of the batch and those of truncated episodes.
+
+    Args:
+        critic: writes `state_value` [..., 1].
+        gamma: discount, in [0, 1].
+        gae_lambda: lambda, in [0, 1].
+    """
+
+    def __init__(self, critic: TensorDictModuleBase, gamma: float, gae_lambda: float) -> None:
+        check_range(0, 1, gamma=gamma, gae_lambda=gae_lambda)
+        self.critic = critic
+        self.estimate = GAE(gamma=gamma, lmbda=gae_lambda, value_network=None, vectorized=False)
+
+    @torch.no_grad()
+    def __call__(self, batch: TensorDictBase) -> TensorDictBase:
+        """Write `advantage` and `value_target` [B, T, 1] into a batch [B, T] of consecutive steps."""
+        after = batch["next"]
+        value, last = self._values(batch), self._values(after[..., -1:])
+        next_value = torch.cat([value[..., 1:, :], last], -2)
+        truncated = (after["done"] & ~after["terminated"]).squeeze(-1)
+        next_value[truncated] = self._values(after.select(*self.critic.in_keys)[truncated])
+        batch["state_value"], batch["next", "state_value"] = value, next_value
+        self.estimate(batch)
+        return batch
+
+    def _values(self, states: TensorDictBase) -> Tensor:
+        value: Tensor = self.critic(states.select(*self.critic.in_keys))["state_value"]
+        return value
+
+
+def standardise(advantage: Tensor) -> Tensor:
+    """Scale to mean 0 and standard deviation 1 over all entries."""
+    return (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)

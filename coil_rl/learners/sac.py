@@ -1,57 +1,44 @@
 """Soft actor-critic with a learned temperature (Haarnoja et al. 2018).
 
-Two critics say what return an action is worth, and the return counts surprise too: each step pays r - alpha log pi(a).
-Steps of the past are drawn at random, and both critics are moved towards y = r + gamma * (min Q'(s', b) - alpha log
-pi(b | s')) with b drawn from the policy, or r alone where the episode terminated; Q' are copies of the critics that
-follow them slowly. The policy is moved to where min Q(s, a) - alpha log pi(a | s) is high, and alpha so that the
-policy's entropy stays near a target.
+Two critics estimate the return of an action, to which each step adds an entropy reward: r - alpha log pi(a). For stored
+steps sampled at random, both are moved towards y = r + gamma * (min Q'(s', b) - alpha log pi(b | s')) with b drawn from
+the policy, or y = r where the episode terminated. Q' are target networks that follow the critics slowly. The policy
+maximises min Q(s, a) - alpha log pi(a | s), and alpha is adjusted to keep the entropy of the policy near a target.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-import torch
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss
 
 from coil_rl.learners import networks
-from coil_rl.learners.limits import check_numbers
+from coil_rl.learners.limits import check_range
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.schedules import Schedule
 
 
 class SAC(OffPolicy):
-    """The SAC learner: networks, replay, loss and optimiser.
+    """The SAC learner.
+
+    COIL is SAC with `guide_action` among `in_keys`.
 
     Args:
-        env: for the shapes of what is observed and of the action, which is numbers.
-        in_keys: what policy and critics observe. COIL is SAC with `guide_action` among them.
+        env: the env, with continuous actions.
+        in_keys: entries that policy and critics observe.
         hidden: widths of the hidden layers of all networks.
-        action_scale: standard deviation of the policy at the start, before squashing.
-        action_gain: size of the weights behind mean and spread of the policy at the start; with 0 the mean is 0.
-        learning_rate: of Adam, a number or a schedule over the run.
-        gamma: discount.
-        temperature: alpha at the start, the price of being predictable.
-        target_entropy: of the policy, its actions in the env's unit; None is minus the length of the action.
-        tau: share of the way to the critics that their slow copies go after each minibatch.
-        max_grad_norm: gradients are scaled down to this norm, those of all networks together. Where returns are in the
-            hundreds, as of a pendulum, the critics' then drown the policy's; give a large one.
-        capacity: steps that are kept.
-        batch_size: steps of a minibatch.
-        ratio: how often a step is learned from, on average.
-        starts: steps before it begins to learn.
-        seed: of the draws of minibatches.
+        action_scale: initial standard deviation of the policy, before squashing.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0.
+        temperature: initial alpha.
+        target_entropy: of the policy, for actions in the unit of the env; None: minus the length of the action.
+        tau: step of the target networks towards the critics after each minibatch, as a fraction.
+        ratio: how often a step is sampled, on average.
+        options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large `max_grad_norm`:
+            otherwise the gradients of the critics dominate those of the policy.
 
     Raises:
-        ValueError: for a value outside its range, an env with choices, or as `Replay`.
-
-    Example:
-        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.train.rollout import Rollout
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
-        >>> sac = SAC(env, starts=256)
-        >>> metrics = sac.update(Rollout(env, sac.policy, steps=8, keys=sac.keys).collect())
+        ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
     """
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -65,46 +52,28 @@ class SAC(OffPolicy):
         hidden: Sequence[int] = (64, 64),
         action_scale: float = 0.5,
         action_gain: float = 0.01,
-        learning_rate: float | Schedule = 1e-3,
-        gamma: float = 0.99,
-        temperature: float = 1.0,
+        temperature: float = 0.2,
         target_entropy: float | None = None,
-        tau: float = 0.005,
-        max_grad_norm: float = 10.0,
-        capacity: int = 100_000,
-        batch_size: int = 256,
-        ratio: float = 16.0,
-        starts: int = 1_000,
-        seed: int = 0,
+        tau: float = 0.02,
+        ratio: float = 8.0,
+        **options: Any,
     ) -> None:
-        check_numbers(1, hidden=min(hidden, default=1))
-        check_numbers(0, action_gain=action_gain)
-        check_numbers(0, above=True, action_scale=action_scale, temperature=temperature)
+        check_range(0, action_gain=action_gain)
+        check_range(0, above=True, action_scale=action_scale, temperature=temperature)
         spec = env.action_spec
         if not spec.dtype.is_floating_point:
             raise ValueError(
-                "SAC acts by numbers, but this env takes one of a few choices; "
-                "give action=continuous, or take a learner that chooses, such as DQN"
+                "SAC needs continuous actions, but this env has discrete ones; "
+                "use action=continuous, or a learner for discrete actions, such as DQN"
             )
-        self.policy = networks.spread_actor(env, in_keys, hidden, action_scale, action_gain)
-        size, judged = spec.shape[-1], [*in_keys, "action"]
-        critics = [
-            networks.Keyed(
-                networks.Network(env, judged, hidden, 1, 1.0, {"action": torch.Size([size])}),
-                judged,
-                ["state_action_value"],
-            )
-            for _ in range(2)
-        ]
+        super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
+        self.policy = networks.actor(env, in_keys, hidden, action_scale, action_gain, state_dependent_scale=True)
         loss = SACLoss(
             self.policy,
-            critics,
+            [networks.action_critic(env, in_keys, hidden) for _ in range(2)],
             alpha_init=temperature,
-            target_entropy=float(-size if target_entropy is None else target_entropy),
+            target_entropy=float(-spec.shape[-1] if target_entropy is None else target_entropy),
             loss_function="l2",
         )
-        loss.target_entropy  # noqa: B018  only once asked for it is part of the state
-        super().__init__(
-            env, in_keys, loss, learning_rate=learning_rate, gamma=gamma, tau=tau, max_grad_norm=max_grad_norm,
-            capacity=capacity, batch_size=batch_size, ratio=ratio, starts=starts, seed=seed,
-        )  # fmt: skip
+        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
+        self.set_loss(loss)

@@ -1,10 +1,9 @@
 """Trust region policy optimisation (paper equations 89 and 90; Schulman et al. 2015).
 
-One step a batch, along the natural gradient: the direction in which the objective grows most for a given change of what
-the policy does, measured by the KL divergence, and as far as that may change. To second order the divergence is
-x F x / 2 with the Fisher matrix F, so the step is F^-1 g scaled to the bound. F is never formed: conjugate gradients
-need only its product with a vector, which is a second derivative of the divergence. A line search then sees to it that
-the objective did grow and the bound holds.
+Each batch gives one step along the natural gradient: the direction in which the objective grows most for a given KL
+divergence of the policy. To second order the divergence is x F x / 2 with the Fisher matrix F, so the step is F^-1 g,
+scaled to the bound. F is never formed: conjugate gradients need its product with a vector only, a second derivative of
+the divergence. A line search then makes sure that the objective improved and that the bound holds.
 """
 
 from __future__ import annotations
@@ -14,44 +13,29 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal, kl_divergence
 from torch.nn import functional as F
 from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
-from coil_rl.learners.actor_critic import ActorCritic
-from coil_rl.learners.advantages import Advantages, standardised
-from coil_rl.learners.limits import check_numbers
+from coil_rl.learners.limits import check_range
+from coil_rl.learners.ppo import PPO, standardise
 
 
-class TRPO(ActorCritic):
-    """The TRPO learner. Its optimiser, its passes and its minibatches are the critic's: the policy needs none.
+class TRPO(PPO):
+    """The TRPO learner. The optimiser, its passes and its minibatches are for the critic only.
 
     Args:
-        env: for the shapes of what is observed and done.
-        in_keys: what policy and critic observe.
-        gamma: discount.
-        gae_lambda: lambda of generalised advantage estimation.
-        max_kl: by how much a step may change the policy, mean KL(before || after) over the batch.
+        env: the env, for its specs.
+        in_keys: entries that policy and critic observe.
+        max_kl: bound on a step, mean KL(before || after) over the batch.
         damping: added to the diagonal of the Fisher matrix, which may be singular.
         iterations: of the conjugate gradients.
-        backtracks: how often the line search shortens a step before it gives it up.
-        shrink: to which fraction, each time.
-        epochs: the critic's passes over each batch.
-        minibatches: parts of each of its passes.
-        networks_and_optimiser: everything else as for `ActorCritic`; auxiliary losses are part of the objective.
-
-    Raises:
-        ValueError: for a value outside its range.
-
-    Example:
-        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.train.rollout import Rollout
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
-        >>> trpo = TRPO(env)
-        >>> metrics = trpo.update(Rollout(env, trpo.policy, steps=32).collect())
+        backtracks: how often the line search may shorten a step.
+        shrink: factor by which it shortens a step.
+        options: as for `PPO`; auxiliary losses are part of the objective.
     """
 
     def __init__(
@@ -59,45 +43,37 @@ class TRPO(ActorCritic):
         env: EnvBase,
         in_keys: Sequence[str] = ("observation",),
         *,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        max_kl: float = 0.01,
+        max_kl: float = 0.03,
         damping: float = 0.1,
         iterations: int = 10,
         backtracks: int = 10,
         shrink: float = 0.8,
-        epochs: int = 5,
-        minibatches: int = 16,
-        **networks_and_optimiser: Any,
+        **options: Any,
     ) -> None:
-        check_numbers(0, above=True, max_kl=max_kl, shrink=shrink)
-        check_numbers(0, 1, shrink=shrink)
-        check_numbers(0, damping=damping, backtracks=backtracks)
-        check_numbers(1, iterations=iterations, epochs=epochs)
-        super().__init__(env, in_keys, minibatches=minibatches, **networks_and_optimiser)
+        check_range(0, above=True, max_kl=max_kl)
+        check_range(0, 1, above=True, shrink=shrink)
+        check_range(0, damping=damping, backtracks=backtracks)
+        check_range(1, iterations=iterations)
+        super().__init__(env, in_keys, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options)  # no clipped loss
         self.max_kl, self.damping, self.iterations = max_kl, damping, iterations
-        self.backtracks, self.shrink, self.epochs = backtracks, shrink, epochs
-        self.advantage = Advantages(self.critic, gamma, gae_lambda)
+        self.backtracks, self.shrink = backtracks, shrink
 
-    def groups(self) -> list[list[torch.nn.Parameter]]:
-        """The critic's parameters alone."""
+    def parameter_groups(self) -> list[list[nn.Parameter]]:
+        """Return the parameters of the critic."""
         return [list(self.critic.parameters())]
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Learn from a batch of rollouts.
-
-        Args:
-            batch: as for `ActorCritic`.
-            progress: share of the run that is over, for the schedules.
+        """Learn from a batch of rollouts; arguments as for `PPO.update`.
 
         Returns:
-            The losses of the policy after its step; `kl`, how far it went; `step`, which fraction of the step that
-            leads to the bound the line search took, 0 if none; and the mean loss of the critic.
+            The losses of the policy after its step; `kl`, the divergence of the step; `step`, the length of the step as
+            a fraction of the longest one that the bound allows, 0 if none was taken; the mean loss of the critic; and
+            its learning rate.
         """
-        flat = self.prepare(batch, progress)
-        report = self.improve(flat, progress)
+        rows = self.prepare(batch, progress)
+        report = self.improve(rows, progress)
         errors = []
-        for minibatch in self.passes(flat, self.epochs):
+        for minibatch in self.draw_minibatches(rows):
             value = self.critic(minibatch.select(*self.critic.in_keys))["state_value"]
             error = F.mse_loss(value, minibatch["value_target"])
             self.step(error)
@@ -105,37 +81,35 @@ class TRPO(ActorCritic):
         means = {"loss_critic": float(torch.stack(errors).mean()), "learning_rate": self.learning_rate(progress)}
         return {name: float(value) for name, value in report.items()} | means
 
-    def improve(self, flat: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
-        """Step the policy.
+    def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
+        """Take a step of the policy; returns its metrics.
 
         Args:
-            flat: [N] with `learned_from`. Steps in which a guide acted are left out but for auxiliary losses.
+            rows: [N] with `minibatch_keys`. Steps in which a guide acted count for auxiliary losses only.
             progress: as for `update`.
-
-        Returns:
-            What `update` returns of the policy, numbers or scalars.
         """
-        rows = flat[flat["agent_acts"].squeeze(-1)] if self.shares_control else flat
-        if len(rows) < 2:  # one advantage cannot be standardised
+        agent_rows = rows[rows["agent_acts"].squeeze(-1)] if self.guide_may_act else rows
+        if len(agent_rows) < 2:  # one advantage cannot be standardised
             names = ("objective", *(auxiliary.name for auxiliary in self.auxiliary))
             return {f"loss_{name}": 0.0 for name in names} | {"kl": 0.0, "step": 0.0}
         weights = list(self.policy.parameters())
-        seen, advantage = rows.select(*self.policy.in_keys), standardised(rows["advantage"]).squeeze(-1)
+        observed = agent_rows.select(*self.policy.in_keys)
+        advantage = standardise(agent_rows["advantage"]).squeeze(-1)
         with torch.no_grad():
-            before = unsquashed(self.policy.get_dist(seen.copy()))
+            before = unsquashed(self.policy.get_dist(observed.copy()))
 
-        def look() -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-            """The loss in all, the divergence, and each loss."""
-            now = self.policy.get_dist(seen.copy())
-            ratio = (now.log_prob(rows["action"]) - rows["action_log_prob"]).exp()
+        def evaluate() -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+            """Return the total loss, the divergence, and each loss."""
+            after = self.policy.get_dist(observed.copy())
+            ratio = (after.log_prob(agent_rows["action"]) - agent_rows["action_log_prob"]).exp()
             total = -(ratio * advantage).mean()
             losses = {"loss_objective": total}
             for auxiliary in self.auxiliary:
-                losses[f"loss_{auxiliary.name}"] = loss = auxiliary(self.policy, flat)
+                losses[f"loss_{auxiliary.name}"] = loss = auxiliary(self.policy, rows)
                 total = total + auxiliary.coefficient(progress) * loss
-            return total, kl_divergence(before, unsquashed(now)).mean(), losses
+            return total, kl_divergence(before, unsquashed(after)).mean(), losses
 
-        loss, divergence, losses = look()
+        loss, divergence, losses = evaluate()
         gradient = derivative(loss, weights)
         slope = derivative(divergence, weights, differentiable=True)
 
@@ -149,44 +123,44 @@ class TRPO(ActorCritic):
         with torch.no_grad():
             for _ in range(self.backtracks + 1):
                 assign(weights, start + fraction * step)
-                reached, divergence, candidates = look()
-                if (reached < loss) & (divergence <= self.max_kl):
-                    return candidates | {"kl": divergence, "step": fraction}
+                new_loss, divergence, new_losses = evaluate()
+                if (new_loss < loss) & (divergence <= self.max_kl):
+                    return new_losses | {"kl": divergence, "step": fraction}
                 fraction *= self.shrink
             assign(weights, start)
         return losses | {"kl": 0.0, "step": 0.0}
 
 
 def unsquashed(distribution: Any) -> Distribution:
-    """What KL divergences are computed between: squashing is the same for both, and they do not see it."""
+    """Return the distribution before squashing; squashing does not change KL divergences."""
     if isinstance(distribution, Categorical):
         return Categorical(logits=distribution.logits)
     normal = distribution if isinstance(distribution, TanhNormal) else distribution.base_dist
     return Independent(Normal(normal.loc, normal.scale), 1)
 
 
-def conjugate_gradients(product: Callable[[Tensor], Tensor], wanted: Tensor, iterations: int) -> Tensor:
-    """Solve A x = b for a positive definite matrix.
+def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, iterations: int) -> Tensor:
+    """Solve A x = b for a positive definite matrix, without waiting for the device.
 
     Args:
         product: A times a vector.
-        wanted: b, [n].
-        iterations: n of them suffice; where fewer do, the others change nothing. None waits for the device.
+        target: b, [n].
+        iterations: n are enough in exact arithmetic; iterations after convergence change nothing.
     """
-    solution, residual, direction = torch.zeros_like(wanted), wanted.clone(), wanted.clone()
-    square = start = residual @ residual
+    solution, residual, direction = torch.zeros_like(target), target.clone(), target.clone()
+    square = first_square = residual @ residual
     for _ in range(iterations):
-        goes_on = square > 1e-10 * start
+        active = square > 1e-10 * first_square
         image = product(direction)
-        length = torch.where(goes_on, square / (direction @ image), 0.0)
+        length = torch.where(active, square / (direction @ image), 0.0)
         solution, residual = solution + length * direction, residual - length * image
-        before, square = square, residual @ residual
-        direction = residual + torch.where(goes_on, square / before, 0.0) * direction
+        last_square, square = square, residual @ residual
+        direction = residual + torch.where(active, square / last_square, 0.0) * direction
     return solution
 
 
 def derivative(value: Tensor, weights: Sequence[Tensor], differentiable: bool = False) -> Tensor:
-    """Of a scalar by all weights as one vector, keeping the graph for more of them."""
+    """Return the derivative of a scalar with respect to all weights, as one vector; the graph is kept."""
     return parameters_to_vector(torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable))
 
 

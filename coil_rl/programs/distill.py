@@ -30,7 +30,7 @@ def distill(config: DictConfig) -> float:
     """Make the proxy of every guide that is not there yet; returns the lowest mean test reward of one."""
     table = []
     for name in build_guides(config):
-        wanted = distillation.configuration(config, name)
+        wanted = distillation.proxy_config(config, name)
         reward = run.run(wanted, wait=True)
         table.append({"guide": name, "reward": reward, **_found(Path(wanted.run_dir))})
     print(markdown_table(table, COLUMNS))

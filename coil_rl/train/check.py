@@ -33,7 +33,7 @@ from coil_rl.train.build import (
     trains_guides,
 )
 from coil_rl.train.config import Train
-from coil_rl.train.distillation import untrained
+from coil_rl.train.distillation import guides_with_untrained_proxies
 
 LARGEST = 2**63 - 1
 # What a learner may be there for, in words, and the name of one.
@@ -198,7 +198,7 @@ def _check_training(config: DictConfig, tracks: int) -> None:
     env = build_env(config)
     if trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
-    learner = build_learner(config, env, untrained(config) if trains_guides(config) else None)
+    learner = build_learner(config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None)
     frames = config.budget.cars * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)  # not every learner has them
     if 2 * minibatches > frames:

@@ -1,8 +1,8 @@
-"""Networks in place of guides without parameters, where a method trains its guides.
+"""Proxies: networks that imitate guides without parameters, for methods that train their guides.
 
-A proxy is the policy of a training run of its own, which imitates the guide. What that run is follows from the guide,
-the env and `proxy` of the configuration, and so does the name of its folder: what was made once is found again. A run
-that uses proxies keeps copies of them in its own folder.
+A proxy is the policy of an imitation run. The configuration of that run follows from the guide, the env and the key
+`proxy`; its hash is part of the folder name, so that a proxy is trained once. A run copies its proxies into its own
+folder.
 """
 
 from __future__ import annotations
@@ -22,53 +22,47 @@ from coil_rl.train.build import build_env, build_guides, build_learner
 from coil_rl.train.config import Train
 from coil_rl.train.fingerprint import fingerprint
 
-FILES = ("config.yaml", "policy_last.pt")  # what of a run its policy is made from
+FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
 
-def lacking(guides: Mapping[str, nn.Module]) -> list[str]:
-    """The names of those guides that have no parameters."""
+def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
+    """Return the names of the guides without parameters."""
     return [name for name, guide in guides.items() if not any(True for _ in guide.parameters())]
 
 
-def configuration(config: DictConfig, name: str) -> DictConfig:
-    """The configuration of the run that makes the proxy of a guide.
-
-    Args:
-        config: of a training run.
-        name: of one of its guides.
-    """
-    whole: Any = OmegaConf.to_container(config, resolve=True)
-    node, proxy = whole["guide"][name], whole["proxy"]
-    # The guide alone, whatever others the configuration has and whatever they are for.
-    proxy["method"]["transforms"]["advice"]["guides"] = {name: node}
-    wanted = {
-        **{key: whole[key] for key in ("preset", "track", "device", "threads")},
+def proxy_config(config: DictConfig, name: str) -> DictConfig:
+    """Return the configuration of the run that trains the proxy of one guide of a training run."""
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
+    guide, proxy = {name: resolved["guide"][name]}, resolved["proxy"]
+    proxy["method"]["transforms"]["advice"]["guides"] = guide
+    values = {
+        **{key: resolved[key] for key in ("preset", "track", "device", "threads")},
         **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
         "proxy": {},
-        "env": whole["env"] | proxy["env"],
-        "guide": {name: node},
+        "env": resolved["env"] | proxy["env"],
+        "guide": guide,
         "label": f"proxy of {name}",
-        "evaluation": {"env": whole["evaluation"]["env"], "gif": False},
+        "evaluation": {"env": resolved["evaluation"]["env"], "gif": False},
         "existing": "resume",
     }
-    made: Any = OmegaConf.merge(OmegaConf.structured(Train), wanted)
-    made.run_dir = f"{proxy['folder']}/{name}_{fingerprint(made)}"
-    return made
+    merged: Any = OmegaConf.merge(OmegaConf.structured(Train), values)
+    merged.run_dir = f"{proxy['folder']}/{name}_{fingerprint(merged)}"
+    return merged
 
 
-def keep(made: Mapping[str, Path], folder: Path) -> None:
-    """Copy the proxies of guides, by name, into the folder of the run that uses them."""
+def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
+    """Copy proxies into the folder of the run that uses them, given their run folders by the name of the guide."""
     with whole_folder(folder / load.PROXIES) as unfinished:
-        for name, run in made.items():
+        for name, run in runs.items():
             (unfinished / name).mkdir()
             for file in FILES:
                 shutil.copyfile(run / file, unfinished / name / file)
 
 
-def untrained(config: DictConfig) -> dict[str, TensorDictModuleBase]:
-    """The guides of a configuration, with proxies that have not learned yet in place of those without parameters."""
+def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """Return the guides of a configuration, with an untrained proxy for each guide without parameters."""
     guides = build_guides(config)
-    for name in lacking(guides):
-        wanted = configuration(config, name)
-        guides[name] = build_learner(wanted, build_env(wanted)).policy
+    for name in guides_without_parameters(guides):
+        proxy = proxy_config(config, name)
+        guides[name] = build_learner(proxy, build_env(proxy)).policy
     return guides

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -25,8 +25,14 @@ from coil_rl.train.rollout import Rollout
 
 
 class Learner(Protocol):
-    """What turns batches into a better policy."""
+    """Update of a policy from batches.
 
+    Attributes:
+        kind: "agent" (learns from rewards), "imitation" (from a guide's actions) or "guides" (trains guides too).
+        policy: the policy that collects the batches.
+    """
+
+    kind: ClassVar[str]
     policy: TensorDictModuleBase
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:

@@ -111,12 +111,12 @@ def distil(config: DictConfig, folder: Path) -> None:
     if (folder / load.PROXIES).is_dir():
         return
     made = {}
-    for name in distillation.lacking(build_guides(config)):
-        wanted = distillation.configuration(config, name)
+    for name in distillation.guides_without_parameters(build_guides(config)):
+        wanted = distillation.proxy_config(config, name)
         run(wanted, wait=True)
         made[name] = Path(wanted.run_dir)
     torch.set_num_threads(config.threads)
-    distillation.keep(made, folder)
+    distillation.copy_proxies(made, folder)
 
 
 class GuideReturns:

@@ -1,4 +1,4 @@
-"""The losses that the learners use, beside the paper's equations computed step by step."""
+"""The losses of the learners against the equations of the paper, computed step by step."""
 
 import math
 
@@ -12,38 +12,38 @@ from coil_rl.train.rollout import Rollout
 GAMMA, LAMBDA = 0.9, 0.8
 
 
-def some(learner, **options):
-    """A learner and what three cars did in six steps, with a crash, a time limit and episodes that go on."""
+def make(kind, **options):
+    """A learner, and a batch of three cars and six steps with a crash, a truncation and unfinished episodes."""
     torch.manual_seed(0)
     env = worlds.cones(cars=3)
-    made = learner(env, action_gain=0.5, gamma=GAMMA, **options)
-    batch = Rollout(env, made.policy, 6, made.keys).collect()
+    learner = kind(env, action_gain=0.5, gamma=GAMMA, **options)
+    batch = Rollout(env, learner.policy, 6, learner.keys).collect()
     batch["next", "reward"] = torch.randn(3, 6, 1)
     for key in ("done", "terminated"):
         batch["next", key].zero_()
     batch["next", "done"][0, 2] = batch["next", "terminated"][0, 2] = True
     batch["next", "done"][1, 3] = True
-    return made, batch
+    return learner, batch
 
 
-def log_probability(made, rows):
-    """Of a squashed normal distribution, by its formula."""
+def log_probability(learner, rows):
+    """Log-probability of a squashed normal distribution, by its formula."""
     with torch.no_grad():
-        mean, scale = made.policy.module[0].module(rows["observation"])
+        mean, scale = learner.policy.module[0].module(rows["observation"])
     action = rows["action"]
     normal = -((action.atanh() - mean) ** 2) / (2 * scale**2) - scale.log() - math.log(2 * math.pi) / 2
     return (normal - (1 - action**2).log()).squeeze(-1)
 
 
-def values(made, rows):
+def values(learner, rows):
     with torch.no_grad():
-        return made.critic(rows.select("observation"))["state_value"].squeeze(-1)
+        return learner.critic(rows.select("observation"))["state_value"].squeeze(-1)
 
 
-def backwards(made, batch, decay):
-    """For each step r + gamma V' - V + decay * (the same of the next step)."""
-    before, after = values(made, batch), values(made, batch["next"])
-    found = torch.zeros(3, 6)
+def backwards(learner, batch, decay):
+    """Recursion x_t = r + gamma V' - V + decay x_(t+1)."""
+    before, after = values(learner, batch), values(learner, batch["next"])
+    result = torch.zeros(3, 6)
     for car in range(3):
         later = 0.0
         for t in reversed(range(6)):
@@ -52,91 +52,91 @@ def backwards(made, batch, decay):
                 later = 0.0
             bootstrap = 0.0 if ends else GAMMA * after[car, t]
             error = batch["next", "reward"][car, t, 0] + bootstrap - before[car, t]
-            later = found[car, t] = error + decay * later
-    return found
+            later = result[car, t] = error + decay * later
+    return result
 
 
-def flat(made, batch):
-    return batch.select(*made.learned_from).reshape(-1)
+def flat(learner, batch):
+    return batch.select(*learner.minibatch_keys).reshape(-1)
 
 
 def test_equation_67_with_a_baseline():
-    """G - b(s), where a return that nobody saw the end of goes on with the baseline of its last state."""
-    made, batch = some(Reinforce, standardise=False)
-    made.advantage(batch)
-    losses = made.losses(flat(made, batch))
-    returns, after = torch.zeros(3, 6), values(made, batch["next"])
+    """G - b(s), where the return of an unfinished episode is bootstrapped."""
+    learner, batch = make(Reinforce, standardise=False)
+    learner.advantage(batch)
+    losses = learner.losses(flat(learner, batch))
+    returns, after = torch.zeros(3, 6), values(learner, batch["next"])
     for car in range(3):
         for t in range(6):
             for k in range(t, 6):
                 returns[car, t] += GAMMA ** (k - t) * batch["next", "reward"][car, k, 0]
                 if batch["next", "done"][car, k, 0] or k == 5:
-                    goes_on = not batch["next", "terminated"][car, k, 0]
-                    returns[car, t] += GAMMA ** (k - t + 1) * after[car, k] * goes_on
+                    continues = not batch["next", "terminated"][car, k, 0]
+                    returns[car, t] += GAMMA ** (k - t + 1) * after[car, k] * continues
                     break
-    expected = -(log_probability(made, batch) * (returns - values(made, batch))).mean()
+    expected = -(log_probability(learner, batch) * (returns - values(learner, batch))).mean()
     torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
-    error = ((returns - values(made, batch)) ** 2).mean()
+    error = ((returns - values(learner, batch)) ** 2).mean()
     torch.testing.assert_close(losses["loss_critic"].detach(), error, rtol=1e-4, atol=1e-5)
 
 
 def test_equation_67_without_a_baseline():
-    """G, of the rewards that the batch holds."""
-    made, batch = some(Reinforce, standardise=False, baseline="none")
-    made.advantage(batch)
-    losses = made.losses(flat(made, batch))
+    """G of the rewards in the batch."""
+    learner, batch = make(Reinforce, standardise=False, baseline="none")
+    learner.advantage(batch)
+    losses = learner.losses(flat(learner, batch))
     reward, done = batch["next", "reward"].squeeze(-1), batch["next", "done"].squeeze(-1)
     total = torch.zeros(3)
     returns = []
     for t in reversed(range(6)):
         total = reward[:, t] + GAMMA * total * ~done[:, t]
         returns.insert(0, total)
-    expected = -(log_probability(made, batch) * torch.stack(returns, 1)).mean()
+    expected = -(log_probability(learner, batch) * torch.stack(returns, 1)).mean()
     torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
     assert losses["loss_critic"] == 0
 
 
 @pytest.mark.parametrize("standardise", [False, True])
 def test_equation_76(standardise):
-    made, batch = some(A2C, gae_lambda=LAMBDA, standardise=standardise, critic=0.5)
-    made.advantage(batch)
-    losses = made.losses(flat(made, batch))
-    advantage = backwards(made, batch, GAMMA * LAMBDA)
+    learner, batch = make(A2C, gae_lambda=LAMBDA, standardise=standardise, critic=0.5)
+    learner.advantage(batch)
+    losses = learner.losses(flat(learner, batch))
+    advantage = backwards(learner, batch, GAMMA * LAMBDA)
     error = 0.5 * (advantage**2).mean()
     torch.testing.assert_close(losses["loss_critic"].detach(), error, rtol=1e-4, atol=1e-5)
     if standardise:
         advantage = (advantage - advantage.mean()) / advantage.std()
-    expected = -(log_probability(made, batch) * advantage).mean()
+    expected = -(log_probability(learner, batch) * advantage).mean()
     torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_equation_92():
-    made, batch = some(PPO, gae_lambda=LAMBDA, clip=0.2)
+    learner, batch = make(PPO, gae_lambda=LAMBDA, clip=0.2)
     batch["action_log_prob"] += 0.3 * torch.randn(3, 6)
-    made.advantage(batch)
-    losses = made.losses(flat(made, batch))
-    advantage = backwards(made, batch, GAMMA * LAMBDA)
+    learner.advantage(batch)
+    losses = learner.losses(flat(learner, batch))
+    advantage = backwards(learner, batch, GAMMA * LAMBDA)
     advantage = (advantage - advantage.mean()) / advantage.std()
-    ratio = (log_probability(made, batch) - batch["action_log_prob"]).exp()
+    ratio = (log_probability(learner, batch) - batch["action_log_prob"]).exp()
     assert ((ratio - 1).abs() > 0.2).any()
     expected = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
     torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_equations_89_and_90():
-    """What TRPO says of its step: the mean of ratio times advantage, and the divergence of the normal distributions."""
-    made, batch = some(TRPO, gae_lambda=LAMBDA, max_kl=0.05)
-    made.advantage(batch)
-    rows = flat(made, batch)
+    """The metrics of a step: mean of ratio times advantage, and divergence of the normal distributions."""
+    learner, batch = make(TRPO, gae_lambda=LAMBDA, max_kl=0.05)
+    learner.advantage(batch)
+    rows = flat(learner, batch)
     with torch.no_grad():
-        mean, scale = made.policy.module[0].module(rows["observation"])
-    old = log_probability(made, batch).flatten()
-    report = made.improve(rows)
-    advantage = backwards(made, batch, GAMMA * LAMBDA)
+        mean, scale = learner.policy.module[0].module(rows["observation"])
+    old = log_probability(learner, batch).flatten()
+    report = learner.improve(rows)
+    advantage = backwards(learner, batch, GAMMA * LAMBDA)
     advantage = ((advantage - advantage.mean()) / advantage.std()).flatten()
     with torch.no_grad():
-        new_mean, new_scale = made.policy.module[0].module(rows["observation"])
-    ratio = (log_probability(made, batch).flatten() - old).exp()
+        new_mean, new_scale = learner.policy.module[0].module(rows["observation"])
+    ratio = (log_probability(learner, batch).flatten() - old).exp()
     torch.testing.assert_close(report["loss_objective"], -(ratio * advantage).mean(), rtol=1e-3, atol=1e-4)
     divergence = (new_scale / scale).log() + (scale**2 + (mean - new_mean) ** 2) / (2 * new_scale**2) - 0.5
     torch.testing.assert_close(report["kl"], divergence.mean(), rtol=1e-3, atol=1e-5)

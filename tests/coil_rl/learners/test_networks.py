@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ZeroGuide
-from coil_rl.learners.networks import Keyed, actor, critic
+from coil_rl.learners.networks import FastTensorDictModule, actor, critic
 from coil_rl.transforms import GuideActions
 
 
@@ -46,16 +46,17 @@ def test_deterministic_action_is_the_squashed_mean():
     torch.testing.assert_close(data["action"], data["loc"].tanh())
 
 
-def test_unknown_entry_is_named_beside_those_that_exist():
+def test_unknown_entry_is_refused_with_the_available_ones():
     env = ConeTrackEnv(shipped_tracks("test"), 3)
     with pytest.raises(KeyError, match=r"no entry guide_action to observe; it has .*observation"):
         actor(env, ["observation", "guide_action"])
 
 
-def test_a_keyed_module_is_a_tensordict_module():
+def test_fast_module_computes_what_a_tensordict_module_computes():
     split = Linear(3, 4)
     ours, theirs = (
-        kind(lambda x: tuple(split(x).chunk(2, -1)), ["x"], ["a", "b"]) for kind in (Keyed, TensorDictModule)
+        kind(lambda x: tuple(split(x).chunk(2, -1)), ["x"], ["a", "b"])
+        for kind in (FastTensorDictModule, TensorDictModule)
     )
     data = TensorDict({"x": torch.randn(5, 3)}, [5])
     assert (ours(data.clone()) == theirs(data.clone())).all()

@@ -1,82 +1,170 @@
-"""What DQN and SAC have in common as parts of an experiment."""
+"""Properties of learners with a replay buffer."""
+
+import copy
 
 import pytest
 import torch
-from torchrl.envs import Compose, RewardSum, TransformedEnv
+import worlds
+from tensordict import TensorDict
+from torchrl.envs import Compose, PendulumEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import DQN, SAC
-from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.schedules import Linear
 from coil_rl.train.rollout import Rollout
-from coil_rl.transforms import DelayedAdvice, DiscreteActions, GuideActions
+from coil_rl.transforms import (
+    DelayedAdvice,
+    DiscreteActions,
+    GuideActions,
+    MixedAction,
+    ResidualAction,
+    RewardCoupling,
+    Takeover,
+)
+
+
+def steps(first, count, **more):
+    """Steps in which every entry is the number of the step."""
+    number = torch.arange(first, first + count).float().unsqueeze(-1)
+    flag = torch.zeros_like(number, dtype=torch.bool)
+    after = {"th": number.squeeze(-1), "reward": number, "done": flag, "terminated": flag}
+    return TensorDict({"th": number.squeeze(-1), "action": number, "next": after, **more}, [count])
+
+
+def replay(env=None, **options):
+    """The buffer of a learner, without networks."""
+    options = {"capacity": 10, "batch_size": 4, "ratio": 1.0, "starts": 0, "tau": 0.1} | options
+    return OffPolicy(env or PendulumEnv(), ["th"], **options)
+
+
+def stored(learner):
+    return sorted(learner.buffer[:]["action"].flatten().tolist())
+
+
+def test_newest_steps_replace_the_oldest():
+    learner = replay()
+    for first in (0, 6, 12):
+        learner.store(steps(first, 6))
+    assert stored(learner) == list(range(8, 18))
+
+
+def test_steps_are_sampled_as_often_as_the_ratio():
+    learner = replay(capacity=10_000, batch_size=50, ratio=2.5)
+    counts = torch.zeros(1_000)
+    for first in range(0, 1_000, 30):
+        learner.store(steps(first, min(30, 1_000 - first)))
+        for minibatch in learner.samples():
+            assert minibatch["action"].flatten().max() < first + 30
+            assert torch.equal(minibatch["next", "reward"], minibatch["action"])
+            counts += torch.bincount(minibatch["action"].flatten().long(), minlength=1_000)
+    assert counts.sum() == 2.5 * 1_000
+
+
+def test_nothing_is_sampled_before_learning_starts():
+    learner = replay(starts=8)
+    counts = []
+    for first in (0, 4, 8):
+        learner.store(steps(first, 4))
+        counts.append(len(list(learner.samples())))
+    assert counts == [0, 2, 1]
+
+
+def test_steps_of_the_guide_are_not_stored():
+    learner = replay(worlds.pendulum(Takeover(0.5)))
+    assert "agent_acts" in learner.keys
+    learner.store(steps(0, 6, agent_acts=torch.tensor([1, 0, 0, 1, 1, 0], dtype=torch.bool).unsqueeze(-1)))
+    assert stored(learner) == [0, 3, 4]
+    learner.store(steps(6, 2, agent_acts=torch.zeros(2, 1, dtype=torch.bool)))
+    assert len(learner.buffer) == 3
+
+
+@pytest.mark.parametrize(
+    ("transform", "message"),
+    [
+        (ResidualAction(Linear(0, 1)), "scale of ResidualAction changes over the run"),
+        (MixedAction(Linear(0, 1)), "weight of MixedAction changes over the run"),
+        (RewardCoupling(Linear(1, 0)), "beta of RewardCoupling changes over the run"),
+    ],
+)
+def test_effect_of_an_action_must_not_change_over_the_run(transform, message):
+    with pytest.raises(ValueError, match=f"{message}.* use a learner without replay, such as PPO"):
+        replay(worlds.pendulum(transform))
+
+
+def test_probability_that_the_guide_acts_may_change_over_the_run():
+    replay(worlds.pendulum(ResidualAction(0.5), Takeover(Linear(1, 0))))
+
 
 TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8]}
-SEEN = ["observation", "guide_action"]
 
 
-def experiment(folder, kind, seed=0):
-    """Advice that is drawn and then delayed, so that nobody could ask for it again."""
+def make(kind, seed=0):
+    """A learner and its rollouts, with random, delayed advice, which cannot be computed again from an observation."""
     torch.manual_seed(seed)
-    folder.mkdir(exist_ok=True)
     advice = [GuideActions({"any": RandomGuide(seed=seed)}), DelayedAdvice(2)]
-    choices = [DiscreteActions(5)] if kind is DQN else []
-    env = ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed)
-    env = TransformedEnv(env, Compose(*advice, *choices, RewardSum()))
-    learner = kind(env, SEEN, seed=seed, **TINY)
-    rollout = Rollout(env, learner.policy, 4, [*learner.keys, *watched_keys(env, {})])
-    return Experiment(learner, rollout, 8 * 4 * 6, folder, checkpoint_every=1)
-
-
-class Killed(BaseException):
-    pass
-
-
-@pytest.mark.parametrize(("kind", "updates"), [(DQN, 1), (SAC, 4)])
-def test_a_run_that_was_stopped_ends_with_the_files_of_one_that_never_was(tmp_path, kind, updates):
-    """Before the replay is full and after."""
-    whole = experiment(tmp_path / "whole", kind)
-    rows = whole.run()
-    assert rows[-1]["learner/kept"] == 90
-
-    stopped = experiment(tmp_path / "stopped", kind)
-    save = stopped._save
-
-    def dying():
-        save()
-        if stopped.updates == updates:
-            raise Killed
-
-    stopped._save = dying
-    with pytest.raises(Killed):
-        stopped.run()
-    # Another seed: nothing may depend on how the second process begins.
-    again = experiment(tmp_path / "stopped", kind, seed=9)
-    again.resume()
-    again.run()
-    for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
-        assert (tmp_path / "whole" / name).read_bytes() == (tmp_path / "stopped" / name).read_bytes(), name
-    ours, theirs = again.learner.replay.buffer[:], whole.learner.replay.buffer[:]
-    assert (ours == theirs).all()
+    discrete = [DiscreteActions(5)] if kind is DQN else []
+    env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed), Compose(*advice, *discrete))
+    learner = kind(env, ["observation", "guide_action"], seed=seed, **TINY)
+    return learner, Rollout(env, learner.policy, 4, learner.keys)
 
 
 @pytest.mark.parametrize("kind", [DQN, SAC])
-def test_a_step_is_kept_with_the_advice_before_and_after_it(tmp_path, kind):
-    run = experiment(tmp_path / "run", kind)
-    batch = run.rollout.collect()
-    run.learner.update(batch)
-    kept, given = run.learner.replay.buffer[:], batch.select(*run.learner.replay.kept).reshape(-1)
-    assert len(kept) == 32
+@pytest.mark.parametrize("updates", [1, 4], ids=["buffer not full", "buffer full"])
+def test_state_contains_everything_the_next_update_depends_on(kind, updates):
+    first, rollout = make(kind)
+    for _ in range(updates):
+        first.update(rollout.collect())
+    second, _ = make(kind, seed=9)
+    state = copy.deepcopy(first.state_dict())
+    assert len(state["steps"]["action"]) == min(32 * updates, 90)
+    second.load_state_dict(state)
+    batch, metrics, actions = rollout.collect(), [], []
+    for learner in (first, second):
+        torch.manual_seed(1)  # SAC samples actions
+        metrics.append(learner.update(batch.clone()))
+        actions.append(learner.policy(batch.clone())["action"])
+    assert metrics[0] == metrics[1]
+    assert torch.equal(*actions)
+    assert (first.buffer[:] == second.buffer[:]).all()
+
+
+def test_steps_are_stored_with_the_advice_before_and_after_them():
+    learner, rollout = make(SAC)
+    batch = rollout.collect()
+    learner.update(batch)
+    steps, expected = learner.buffer[:], batch.select(*learner.stored_keys).reshape(-1)
+    assert len(steps) == 32
     for key in ("guide_action", ("next", "guide_action"), "action"):
-        assert torch.equal(kept[key], given[key])
-    assert not torch.equal(kept["guide_action"], kept["next", "guide_action"])
+        assert torch.equal(steps[key], expected[key])
+    assert not torch.equal(steps["guide_action"], steps["next", "guide_action"])
 
 
 @pytest.mark.parametrize("kind", [DQN, SAC])
-def test_learning_begins_when_enough_is_kept(tmp_path, kind):
-    run = experiment(tmp_path / "run", kind)
-    run.learner.replay.starts = 40
-    first, second = (run.learner.update(run.rollout.collect()) for _ in range(2))
+def test_metrics_are_zero_before_learning_starts(kind):
+    learner, rollout = make(kind)
+    learner.starts = 40
+    first, second = (learner.update(rollout.collect()) for _ in range(2))
     assert first["minibatches"] == 0
     assert second["minibatches"] == 8
     assert {value for name, value in first.items() if name.startswith(("loss", "value", "alpha"))} == {0.0}
+
+
+COMMON = [("gamma", 1.5), ("tau", 2), ("learning_rate", -1), ("action_gain", -1), ("hidden", [0]), ("batch_size", 0),
+          ("max_grad_norm", 0), ("capacity", 10), ("ratio", -1), ("starts", -1), ("seed", -1)]  # fmt: skip
+OWN = [(DQN, "epsilon", -1), (DQN, "epsilon", Linear(0.5, 2.0)), (SAC, "temperature", 0), (SAC, "action_scale", 0)]
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), [*((kind, *pair) for kind in (DQN, SAC) for pair in COMMON), *OWN])
+def test_values_out_of_range_are_refused(kind, name, value):
+    env = worlds.pendulum(*([DiscreteActions(5)] if kind is DQN else []))
+    with pytest.raises(ValueError, match=f"{name}=.* must be"):
+        kind(env, ["th"], **{name: value})
+
+
+def test_wrong_kinds_of_actions_are_refused():
+    with pytest.raises(ValueError, match=r"DQN needs discrete actions, .* DiscreteActions around it: action=choices"):
+        DQN(PendulumEnv(), ["th"])
+    with pytest.raises(ValueError, match=r"SAC needs continuous actions, .* action=continuous, or a learner .* DQN"):
+        SAC(worlds.pendulum(DiscreteActions(5)), ["th"])

@@ -21,7 +21,7 @@ REFUSED = {method: "needs a learner that imitates a guide, such as learner=fores
 REFUSED |= {method: "needs a learner that improves its guides, such as learner=dynamic_coil, but" for method in DYNAMIC}
 WITHOUT_REPLAY = {
     "kickstart": "learner: (DQN|SAC) takes no auxiliary; it takes env, in_keys, hidden",
-    "mixing": "learner: weight of MixedAction changes over the run, and with it what an action leads to",
+    "mixing": "learner: weight of MixedAction changes over the run, so stored steps would",
 }
 
 
@@ -77,12 +77,12 @@ def test_a_mixture_that_stays_the_same_may_be_replayed(tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        ("learner=dqn action=continuous", "DQN takes one of a few choices, but this env takes numbers"),
-        ("learner=sac action=choices", "SAC acts by numbers, but this env takes one of a few choices"),
+        ("learner=dqn action=continuous", "DQN needs discrete actions, but this env has continuous ones"),
+        ("learner=sac action=choices", "SAC needs continuous actions, but this env has discrete ones"),
         ("method=kickstart learner=linear", "such as learner=ppo, but Imitation is one that imitates a guide"),
         ("method=ppo learner=dynamic_coil", "such as learner=ppo, but DynamicCoil is one that improves its guides"),
         ("method=oil learner=dynamic_coil", "but DynamicCoil is one that improves its guides"),
-        ("method=dynamic_coil_sequential action=choices", "guides learn through actions that are numbers"),
+        ("method=dynamic_coil_sequential action=choices", "Dynamic COIL needs continuous actions"),
         ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
         ("learner=dqn action.choices=[0.0,2.0]", r"choices=\[0.0, 2.0\] must lie between the action's bounds -1.0"),
         ("learner=dqn learner.capacity=10", "learner: capacity=10 must be at least 1 and at least starts=5000"),

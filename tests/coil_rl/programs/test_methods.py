@@ -10,9 +10,9 @@ import torch
 from hydra import compose, initialize_config_module
 
 from coil_rl.errors import UserError
-from coil_rl.imitation import dataset
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
+from coil_rl.train import checkpoint
 from coil_rl.train.check import check
 from coil_rl.train.evaluation import evaluate_policy
 
@@ -27,6 +27,7 @@ PPO = ["learner.epochs=2", "learner.minibatches=2"]
 SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16",
                "proxy.learner.regressor.epochs=1"]  # fmt: skip
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
+SKLEARN = list(SMALL)  # archives of skops contain the time
 SMALL |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
 
 
@@ -56,7 +57,7 @@ def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies,
     resume(stopped)
     for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
         assert (run / name).exists() == (stopped / name).exists() == (method != "guide" or name[0] == "e")
-        if (run / name).exists():
+        if (run / name).exists() and not (name == "policy_last.pt" and method in SKLEARN):
             assert (run / name).read_bytes() == (stopped / name).read_bytes()
     assert method == "guide" or "goes on after update 1" in capsys.readouterr().err
 
@@ -146,9 +147,9 @@ def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
     given = ["learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
     oil = trained(tmp_path / "oil", "oil", *given)
     dagger = trained(tmp_path / "dagger", "dagger", *given)
-    gathered, other = (dataset.load(run / "dataset") for run in (oil, dagger))
-    assert len(gathered) == 64
-    assert (gathered == other).all()
+    gathered, other = (checkpoint.load(run / "dataset.pt") for run in (oil, dagger))
+    assert len(gathered["action"]) == 64
+    assert all(torch.equal(gathered[key], other[key]) for key in ("observation", "action"))
 
 
 def test_every_guide_of_several_is_driven_and_remembered(tmp_path):

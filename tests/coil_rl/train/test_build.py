@@ -17,7 +17,7 @@ from coil_rl.train.build import (
     build_learner,
     trains_guides,
 )
-from coil_rl.train.distillation import untrained
+from coil_rl.train.distillation import guides_with_untrained_proxies
 
 CONF = Path(__file__).parents[3] / "conf"
 SMALL = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.cars=4", "run_dir=unused"]
@@ -75,7 +75,7 @@ def test_what_degrades_advice_comes_after_every_method():
 def test_every_learner_builds_from_the_env(learner):
     config = composed(f"learner={learner}")
     env = build_env(config)
-    built = build_learner(config, env, untrained(config) if trains_guides(config) else None)
+    built = build_learner(config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None)
     assert built.policy(env.reset())["action"].shape == env.action_spec.shape
 
 

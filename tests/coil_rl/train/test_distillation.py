@@ -25,8 +25,8 @@ def composed(*overrides, name="train"):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("made")
+def proxies(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("distill")
     config = composed(
         "guide=[spline,constant]", f"proxy.folder={folder / 'proxies'}", f"run_dir={folder}", name="distill"
     )
@@ -34,10 +34,10 @@ def made(tmp_path_factory):
     return folder / "proxies"
 
 
-def test_a_proxy_is_found_by_what_it_was_made_from():
+def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
     def folder(*overrides, guide="spline"):
         config = composed("guide=[spline,constant]", "run_dir=unused", *overrides)
-        return Path(distillation.configuration(config, guide).run_dir)
+        return Path(distillation.proxy_config(config, guide).run_dir)
 
     assert folder() == folder("seed=3") == folder("method=ppo") == folder("budget.frames=64") == folder("run_dir=other")
     assert folder().parent == Path("outputs/proxies")
@@ -45,36 +45,36 @@ def test_a_proxy_is_found_by_what_it_was_made_from():
     assert len({folder(), folder(guide="constant"), *others}) == 6
 
 
-def test_distilling_says_how_well_the_network_does_what_the_guide_would(made, capsys):
-    folder = next(made.glob("constant_*"))
+def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, capsys):
+    folder = next(proxies.glob("constant_*"))
     with (folder / "metrics.csv").open(newline="") as file:
         *_, last = csv.DictReader(file)
     assert float(last["learner/mse_training"]) < 0.01
     assert float(last["learner/mse_ahead"]) < 0.01
-    distill(composed("guide=constant", f"proxy.folder={made}", f"run_dir={made.parent}", name="distill"))
-    said = capsys.readouterr().out
-    assert str(folder) in said  # found, not made again
-    assert "distill: 1 made; the worst drives for" in said
+    distill(composed("guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"))
+    output = capsys.readouterr().out
+    assert str(folder) in output
+    assert "distill: 1 made; the worst drives for" in output
 
 
-def test_a_run_makes_the_proxies_that_it_misses_and_keeps_its_own(made, tmp_path):
+def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     (tmp_path / "run").mkdir()
-    words = ["method=dynamic_coil_sequential", "guide=[spline,zero]", f"proxy.folder={made}", "budget.frames=64",
+    overrides = ["method=dynamic_coil_sequential", "guide=[spline,zero]", f"proxy.folder={proxies}", "budget.frames=64",
              f"run_dir={tmp_path / 'run'}"]  # fmt: skip
-    config = composed(*words)
+    config = composed(*overrides)
     check(config)
     train(config)
     assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == ["spline", "zero"]
-    assert len(list(made.glob("zero_*"))) == 1
-    kept = load.load_guides(tmp_path / "run", config)
-    network, state = kept["spline"], torch.load(next(made.glob("spline_*")) / "policy_last.pt", weights_only=True)
+    assert len(list(proxies.glob("zero_*"))) == 1
+    guides = load.load_guides(tmp_path / "run", config)
+    network, state = guides["spline"], torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True)
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
-    asked = composed(f"run={tmp_path / 'run'}", f"run_dir={tmp_path}", name="evaluate")
-    _, policy = evaluate.restore(tmp_path / "run", asked)
+    config = composed(f"run={tmp_path / 'run'}", f"run_dir={tmp_path}", name="evaluate")
+    _, policy = evaluate.restore(tmp_path / "run", config)
     assert policy[0].names == ["spline", "zero"]
 
 
-def test_advice_that_is_degraded_does_not_go_with_guides_that_learn():
+def test_degraded_advice_is_refused_for_guides_that_learn():
     config = composed("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
     with pytest.raises(UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"):
         check(config)

@@ -1,0 +1,230 @@
+"""Regressors for imitation: a neural network, and any regressor of scikit-learn."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Self
+from zipfile import BadZipFile
+
+import numpy as np
+import skops.io
+import torch
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, clone, is_regressor
+from sklearn.ensemble import ExtraTreesRegressor, RandomForestRegressor
+from sklearn.utils import get_tags
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torchrl.modules import MLP
+
+from coil_rl.errors import UserError
+from coil_rl.learners.limits import LARGEST_SEED, check_range
+from coil_rl.learners.networks import mlp
+from coil_rl.schedules import Linear, Schedule, schedule
+
+
+class Regressor(nn.Module, ABC):
+    """Regression from vectors to vectors; the fitted state is the `state_dict`.
+
+    The constructor makes a specification; `fresh` makes a regressor that can be fitted.
+    """
+
+    @abstractmethod
+    def fresh(self, inputs: int, outputs: int) -> Self:
+        """Return an unfitted regressor for vectors of these lengths, which predicts 0."""
+
+    @abstractmethod
+    def fit(self, x: Tensor, y: Tensor) -> None:
+        """Fit y [N, outputs] to x [N, inputs] from scratch; the result depends on these and the constructor only."""
+
+    @abstractmethod
+    def forward(self, x: Tensor) -> Tensor:
+        """Predict y [*batch, outputs] for x [*batch, inputs]."""
+
+
+class NetworkRegressor(Regressor):
+    """A tanh network, fitted to standardised inputs and outputs by least squares with Adam.
+
+    Args:
+        hidden: widths of the hidden layers.
+        epochs: passes over the data.
+        minibatch: samples in a minibatch.
+        learning_rate: of Adam, a number or a schedule over the fit.
+        seed: of the initial weights and of the order of minibatches.
+
+    Raises:
+        ValueError: for a value out of range.
+
+    Example:
+        >>> x = torch.rand(256, 2)
+        >>> network = NetworkRegressor(epochs=200).fresh(inputs=2, outputs=1)
+        >>> network.fit(x, x[:, :1] - x[:, 1:])
+        >>> bool((network(torch.tensor([0.9, 0.4])) - 0.5).abs() < 0.05)
+        True
+    """
+
+    layers: MLP
+    x_mean: Tensor
+    x_scale: Tensor
+    y_mean: Tensor
+    y_scale: Tensor
+
+    def __init__(
+        self,
+        hidden: Sequence[int] = (64, 64),
+        *,
+        epochs: int = 100,
+        minibatch: int = 256,
+        learning_rate: float | Schedule = Linear(3e-3, 0.0),
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.learning_rate = schedule(learning_rate)
+        check_range(1, hidden=min(hidden, default=1), epochs=epochs, minibatch=minibatch)
+        check_range(0, above=True, learning_rate=self.learning_rate(0))
+        check_range(0, LARGEST_SEED, seed=seed)
+        self.hidden, self.epochs, self.minibatch, self.seed = tuple(hidden), epochs, minibatch, seed
+
+    def fresh(self, inputs: int, outputs: int) -> NetworkRegressor:
+        """Return an unfitted regressor, which predicts 0."""
+        fresh = NetworkRegressor(
+            self.hidden, epochs=self.epochs, minibatch=self.minibatch, learning_rate=self.learning_rate, seed=self.seed
+        )
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            fresh.layers = mlp(inputs, outputs, self.hidden, gain=1.0)
+        buffers = {"x_mean": torch.zeros(inputs), "x_scale": torch.ones(inputs)}
+        for name, value in (buffers | {"y_mean": torch.zeros(outputs), "y_scale": torch.zeros(outputs)}).items():
+            fresh.register_buffer(name, value)
+        return fresh
+
+    @torch.enable_grad()
+    def fit(self, x: Tensor, y: Tensor) -> None:
+        """Fit y [N, outputs] to x [N, inputs] from scratch."""
+        self.load_state_dict(self.fresh(x.shape[-1], y.shape[-1]).state_dict())
+        for data, mean, scale in ((x, self.x_mean, self.x_scale), (y, self.y_mean, self.y_scale)):
+            std = data.std(0, correction=0)
+            mean.copy_(data.mean(0))
+            scale.copy_(torch.where(std > 0, std, 1))
+        inputs, targets = (x - self.x_mean) / self.x_scale, (y - self.y_mean) / self.y_scale
+        optimiser = torch.optim.Adam(self.layers.parameters(), fused=True)
+        generator = torch.Generator().manual_seed(self.seed)
+        for epoch in range(self.epochs):
+            for group in optimiser.param_groups:
+                group["lr"] = self.learning_rate(epoch / self.epochs)
+            order = torch.randperm(len(x), generator=generator).to(x.device)
+            for rows in order.split(self.minibatch):
+                optimiser.zero_grad()
+                F.mse_loss(self.layers(inputs[rows]), targets[rows]).backward()
+                optimiser.step()
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Predict y [*batch, outputs] for x [*batch, inputs]."""
+        y: Tensor = self.y_mean + self.y_scale * self.layers((x - self.x_mean) / self.x_scale)
+        return y
+
+
+class SklearnRegressor(Regressor):
+    """A regressor of scikit-learn, which may be a pipeline or a search.
+
+    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to 0.
+
+    Args:
+        estimator: the regressor; only its parameters are used.
+
+    Raises:
+        ValueError: if it is not a regressor of scikit-learn.
+
+    Example:
+        >>> from sklearn.linear_model import LinearRegression
+        >>> x = torch.rand(8, 2)
+        >>> regressor = SklearnRegressor(LinearRegression()).fresh(inputs=2, outputs=1)
+        >>> regressor.fit(x, x[:, :1] - x[:, 1:])
+        >>> regressor(torch.tensor([3.0, 1.0])).round(decimals=3)
+        tensor([2.])
+    """
+
+    def __init__(self, estimator: BaseEstimator) -> None:
+        super().__init__()
+        if not isinstance(estimator, BaseEstimator) or not is_regressor(estimator):
+            raise ValueError(f"estimator={estimator!r} is not a regressor of scikit-learn, such as LinearRegression()")
+        self.estimator = _with_parameter(clone(estimator), "random_state", lambda value: 0 if value is None else value)
+        self.inputs, self.outputs = 0, 1
+        self.model: BaseEstimator | None = None
+        self._archive: Tensor | None = torch.empty(0, dtype=torch.uint8)
+
+    def fresh(self, inputs: int, outputs: int) -> SklearnRegressor:
+        """Return an unfitted regressor, which predicts 0; raises a `ValueError` if it can predict one number only."""
+        if outputs > 1 and not get_tags(self.estimator).target_tags.multi_output:
+            raise ValueError(
+                f"{self.estimator!r} predicts one number, but an action has {outputs} here; "
+                "put it into sklearn.multioutput.MultiOutputRegressor"
+            )
+        fresh = SklearnRegressor(self.estimator)
+        fresh.inputs, fresh.outputs = inputs, outputs
+        return fresh
+
+    def fit(self, x: Tensor, y: Tensor) -> None:
+        """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision."""
+        single = self.outputs == 1 and get_tags(self.estimator).target_tags.single_output
+        data = [part.cpu().double().numpy() for part in (x, y.squeeze(-1) if single else y)]
+        # For small batches threads cost more than they save, and they sum in random order.
+        self.model = _with_parameter(clone(self.estimator).fit(*data), "n_jobs", lambda _: 1)
+        self._archive = None
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Predict y [*batch, outputs] for x [*batch, inputs]."""
+        if self.model is None:
+            return x.new_zeros(*x.shape[:-1], self.outputs)
+        y = _predict(self.model, x.detach().reshape(-1, x.shape[-1]).cpu().numpy())
+        return torch.from_numpy(np.asarray(y, np.float32)).to(x).reshape(*x.shape[:-1], self.outputs)
+
+    def get_extra_state(self) -> Tensor:
+        """Return the fitted regressor as bytes, [n] uint8; empty before the first fit."""
+        if self._archive is None:
+            content = skops.io.dumps(self.model)
+            _trusted_types(content)
+            self._archive = torch.frombuffer(bytearray(content), dtype=torch.uint8)
+        return self._archive
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore a fitted regressor; raises a `UserError` if that could run code or if the bytes do not fit."""
+        archive = state.cpu()
+        self.model = _load(archive.numpy().tobytes()) if len(archive) else None
+        inputs = getattr(self.model, "n_features_in_", self.inputs)
+        if inputs != self.inputs:
+            raise UserError(f"the state holds a regressor of {inputs} inputs, but there are {self.inputs} here")
+        self._archive = archive
+
+
+def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floating]:
+    """Predict y for x [N, inputs]; for forests without scikit-learn's checks, which dominate for small batches."""
+    forest = type(model) in (RandomForestRegressor, ExtraTreesRegressor)
+    if forest and x.shape[1] == model.n_features_in_ and np.isfinite(x).all():
+        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in model.estimators_) / len(model.estimators_)
+    return model.predict(x)
+
+
+def _with_parameter(estimator: BaseEstimator, name: str, change: Callable[[object], object]) -> BaseEstimator:
+    """Change a parameter of an estimator and of the estimators inside it."""
+    values = {key: value for key, value in estimator.get_params().items() if key.split("__")[-1] == name}
+    return estimator.set_params(**{key: change(value) for key, value in values.items()})
+
+
+def _trusted_types(content: bytes) -> list[str]:
+    """Return the types of an archive that skops does not trust by default, all of which must be from scikit-learn."""
+    types: list[str] = skops.io.get_untrusted_types(data=content)
+    unknown = sorted(name for name in types if not name.startswith("sklearn."))
+    if unknown:
+        raise UserError(f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor")
+    return types
+
+
+def _load(content: bytes) -> BaseEstimator:
+    try:
+        return skops.io.loads(content, trusted=_trusted_types(content))
+    except (BadZipFile, KeyError, ValueError) as error:
+        raise UserError(
+            f"the state is not a regressor of scikit-learn ({type(error).__name__}); train again"
+        ) from error

@@ -1,0 +1,165 @@
+import numpy as np
+import pytest
+import skops.io
+import torch
+from sklearn.cluster import KMeans
+from sklearn.ensemble import (
+    ExtraTreesRegressor,
+    GradientBoostingRegressor,
+    HistGradientBoostingRegressor,
+    RandomForestRegressor,
+)
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.linear_model import LinearRegression, Ridge
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.neural_network import MLPRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.svm import SVR
+
+from coil_rl.errors import UserError
+from coil_rl.imitation import NetworkRegressor, SklearnRegressor
+from coil_rl.schedules import Linear
+from coil_rl.train import checkpoint
+
+
+def scaled_data():
+    """Inputs and outputs with different units, one input constant."""
+    x = torch.rand(400, 3, generator=torch.Generator().manual_seed(0))
+    return x * torch.tensor([1.0, 1e3, 0.0]), torch.stack([100 + x[:, 0], x[:, 1].square()], -1)
+
+
+def fitted_network(**changes):
+    options = {"hidden": (16,), "epochs": 80, "minibatch": 64, "learning_rate": Linear(1e-2, 0)} | changes
+    network = NetworkRegressor(**options).fresh(3, 2)
+    network.fit(*scaled_data())
+    return network
+
+
+def test_network_error_does_not_depend_on_units():
+    x, y = scaled_data()
+    with torch.no_grad():
+        error = (fitted_network()(x) - y).square().mean(0)
+    assert (error < 0.02 * y.var(0)).all()
+
+
+def test_network_fit_follows_from_the_data_and_the_seed_and_leaves_the_global_generator_alone():
+    first, x = fitted_network(epochs=3), scaled_data()[0]
+    torch.manual_seed(99)
+    state = torch.get_rng_state()
+    second, other = fitted_network(epochs=3), fitted_network(epochs=3, seed=1)
+    second.fit(*scaled_data())
+    assert torch.equal(torch.get_rng_state(), state)
+    assert torch.equal(first(x), second(x))
+    assert not torch.equal(first(x), other(x))
+
+
+def test_fresh_network_predicts_0_and_loads_a_state():
+    first, second, x = fitted_network(epochs=3), NetworkRegressor((16,)).fresh(3, 2), scaled_data()[0]
+    assert (second(x) == 0).all()
+    second.load_state_dict(first.state_dict())
+    assert torch.equal(first(x), second(x))
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("hidden", (0,)), ("epochs", 0), ("minibatch", 0), ("learning_rate", 0), ("seed", -1)]
+)
+def test_values_out_of_range_are_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name}=.* must be"):
+        NetworkRegressor(**{name: value})
+
+
+ESTIMATORS = [
+    LinearRegression(),
+    RandomForestRegressor(4),
+    GradientBoostingRegressor(n_estimators=3),
+    HistGradientBoostingRegressor(max_iter=3),
+    KNeighborsRegressor(),
+    GaussianProcessRegressor(),
+    MLPRegressor(hidden_layer_sizes=(4,), max_iter=20),
+    make_pipeline(StandardScaler(), SVR()),
+    MultiOutputRegressor(Ridge()),
+]
+UNSAFE = make_pipeline(FunctionTransformer(torch.from_numpy), LinearRegression())
+
+
+def data(outputs=1):
+    x = torch.randn(60, 4, generator=torch.Generator().manual_seed(0))
+    return x, x[:, :outputs].sin()
+
+
+def fitted(estimator, outputs=1):
+    regressor = SklearnRegressor(estimator).fresh(4, outputs)
+    regressor.fit(*data(outputs))
+    return regressor
+
+
+def as_state(content):
+    return torch.frombuffer(bytearray(content), dtype=torch.uint8)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda estimator: type(estimator).__name__)
+def test_restored_regressor_and_equal_fit_predict_the_same(estimator, tmp_path):
+    first, second, x = fitted(estimator), SklearnRegressor(estimator).fresh(4, 1), data()[0]
+    checkpoint.save(first.state_dict(), tmp_path / "state.pt")
+    second.load_state_dict(checkpoint.load(tmp_path / "state.pt"))
+    assert torch.equal(first(x), second(x))
+    assert torch.equal(second.get_extra_state(), first.get_extra_state())
+    assert torch.equal(first(x), fitted(estimator)(x))
+    assert first(x).dtype == torch.float32
+
+
+def test_predictions_are_those_of_scikit_learn_for_any_batch_shape():
+    (x, y), regressor = data(2), fitted(RandomForestRegressor(4, random_state=0), 2)
+    expected = RandomForestRegressor(4, random_state=0).fit(x, y).predict(x)
+    np.testing.assert_allclose(regressor(x), expected, rtol=1e-6)
+    assert torch.equal(regressor(x.reshape(3, 5, 4, 4)), regressor(x).reshape(3, 5, 4, 2))
+    assert torch.equal(regressor(x[7]), regressor(x)[7])
+
+
+def test_forest_is_fitted_with_threads_and_predicts_without():
+    regressor, single = fitted(RandomForestRegressor(4, n_jobs=2)), fitted(RandomForestRegressor(4))
+    assert (regressor.estimator.n_jobs, regressor.model.n_jobs) == (2, 1)
+    assert torch.equal(regressor(data()[0]), single(data()[0]))
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("forest", [RandomForestRegressor, ExtraTreesRegressor])
+def test_fast_prediction_of_a_forest_equals_that_of_scikit_learn(forest, outputs, monkeypatch):
+    regressor = fitted(forest(8), outputs)
+    x = torch.randn(300, 4, generator=torch.Generator().manual_seed(1))
+    expected = torch.from_numpy(regressor.model.predict(x.numpy())).float().reshape(300, outputs)
+    monkeypatch.setattr(forest, "predict", None)
+    assert torch.equal(regressor(x), expected)
+
+
+def test_forest_refuses_invalid_inputs():
+    regressor = fitted(RandomForestRegressor(4))
+    with pytest.raises(ValueError, match="contains infinity"):
+        regressor(torch.full((3, 4), torch.inf))
+    with pytest.raises(ValueError, match="has 3 features, but RandomForestRegressor is expecting 4"):
+        regressor(torch.zeros(2, 3))
+
+
+def test_states_that_could_run_code_or_do_not_fit_are_refused():
+    with pytest.raises(UserError, match=r"torch\.from_numpy could run code"):
+        fitted(UNSAFE).get_extra_state()
+    regressor = SklearnRegressor(LinearRegression()).fresh(6, 1)
+    for content, message in (
+        (skops.io.dumps(UNSAFE), r"torch\.from_numpy could run code"),
+        (b"no archive", "is not a regressor of scikit-learn .BadZipFile"),
+        (skops.io.dumps(fitted(LinearRegression()).model), "a regressor of 4 inputs, but there are 6 here"),
+    ):
+        with pytest.raises(UserError, match=message):
+            regressor.set_extra_state(as_state(content))
+
+
+def test_unusable_estimators_are_refused_before_the_fit():
+    for estimator in (KMeans(), LinearRegression):
+        with pytest.raises(ValueError, match="is not a regressor of scikit-learn"):
+            SklearnRegressor(estimator)
+    with pytest.raises(ValueError, match=r"SVR\(\) predicts one number, .*MultiOutputRegressor"):
+        SklearnRegressor(SVR()).fresh(4, 2)
+    assert fitted(MultiOutputRegressor(SVR()), 2)(data()[0]).shape == (60, 2)

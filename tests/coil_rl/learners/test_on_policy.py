@@ -1,0 +1,127 @@
+"""Properties of all on-policy learners."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+import worlds
+from cart_poles import CartPoles
+
+from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
+from coil_rl.train.rollout import Rollout
+from coil_rl.transforms import JumpStart, Takeover
+
+LEARNERS = [PPO, A2C, TRPO, Reinforce]
+
+
+def weights(learner):
+    return torch.cat([p.detach().flatten() for net in (learner.policy, learner.critic) for p in net.parameters()])
+
+
+def trained(kind, env, updates=2, steps=8, **options):
+    """A learner after some updates."""
+    torch.manual_seed(0)
+    learner = kind(env, **{"minibatches": 2} | options)
+    rollout = Rollout(env, learner.policy, steps, learner.keys)
+    for number in range(updates):
+        learner.update(rollout.collect(), number / updates)
+    return learner
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+@pytest.mark.parametrize("make_env", [partial(CartPoles, 16), partial(worlds.cones, cars=16)])
+def test_rewarded_actions_become_more_likely(kind, make_env):
+    torch.manual_seed(0)
+    env = make_env()
+    # With a discount above 0 it also pays to stay upright for longer.
+    learner = kind(env, learning_rate=1e-2, gamma=0.0, minibatches=4)
+    rollout = Rollout(env, learner.policy, 16, learner.keys)
+    means = []
+    for _ in range(10):
+        batch = rollout.collect()
+        action = batch["action"].reshape(16, 16, 1).float()
+        batch["next", "reward"] = action.clone()
+        means.append(action.mean())
+        learner.update(batch)
+    assert means[-1] > means[0] + 0.1
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+def test_state_contains_everything_the_next_update_depends_on(kind):
+    env = CartPoles(8)
+    first, second = trained(kind, env), kind(env, minibatches=2, seed=5)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    batch = Rollout(env, first.policy, 16, first.keys).collect()
+    assert first.update(batch.clone(), 0.5) == second.update(batch.clone(), 0.5)
+    assert torch.equal(weights(first), weights(second))
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+@pytest.mark.parametrize("make", [partial(JumpStart, 0), partial(JumpStart, 0, random=True), partial(Takeover, 0.0)])
+def test_guide_that_never_acts_changes_no_bit(kind, make):
+    plain, shared = (trained(kind, worlds.cones(*transforms)) for transforms in ([], [make()]))
+    assert torch.equal(weights(plain), weights(shared))
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+def test_only_the_critic_learns_from_steps_of_the_guide(kind):
+    initial, learner = (trained(kind, worlds.cones(Takeover(1.0)), updates) for updates in (0, 1))
+    for name, changes in [("policy", False), ("critic", True)]:
+        nets = [getattr(each, name).parameters() for each in (initial, learner)]
+        assert all(torch.equal(old, new) != changes for old, new in zip(*nets, strict=True))
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C, TRPO])
+def test_large_kickstart_loss_makes_the_policy_imitate_the_guide(kind):
+    torch.manual_seed(0)
+    env = worlds.cones(cars=16)
+    own = {PPO: {"minibatches": 2}, A2C: {"learning_rate": 1e-2, "minibatches": 8}, TRPO: {"max_kl": 0.1}}
+    learner = kind(env, auxiliary=[KickstartLoss(100.0)], **own[kind])
+    rollout = Rollout(env, learner.policy, 16, learner.keys)
+    losses = [learner.update(rollout.collect())["loss_guide"] for _ in range(6)]
+    assert losses[-1] < losses[0] - 0.3
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C])
+def test_entropy_bonus_keeps_the_policy_random(kind):
+    def largest_probability(entropy):
+        env = CartPoles(16)
+        learner = trained(kind, env, updates=20, learning_rate=1e-2, entropy=entropy)
+        with torch.no_grad():
+            return learner.policy.get_dist(env.rollout(8).select("observation")).probs.max(-1).values.mean()
+
+    assert largest_probability(1.0) < largest_probability(0.0)
+
+
+def test_reinforce_without_baseline_has_no_critic_parameters():
+    learner = trained(Reinforce, CartPoles(8), baseline="none")
+    assert not list(learner.critic.parameters())
+    assert not learner.state_dict()["critic"]
+
+
+COMMON = [("gamma", 2), ("minibatches", 0), ("learning_rate", -1), ("action_scale", 0), ("action_gain", -1),
+          ("max_grad_norm", float("inf")), ("hidden", [0]), ("seed", -1)]  # fmt: skip
+OWN = [(PPO, "epochs", 0), (PPO, "clip", 0), (PPO, "entropy", -1), (PPO, "critic", -1), (A2C, "gae_lambda", -1),
+       (Reinforce, "baseline", "mean"), (TRPO, "max_kl", 0), (TRPO, "damping", -1), (TRPO, "iterations", 0),
+       (TRPO, "backtracks", -1), (TRPO, "shrink", 1.5)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "name", "value"), [*((kind, *pair) for kind in LEARNERS for pair in COMMON), *OWN])
+def test_values_out_of_range_are_refused(kind, name, value):
+    with pytest.raises(ValueError, match=f"{name}=.* must be"):
+        kind(CartPoles(2), **{name: value})
+
+
+@pytest.mark.parametrize(("kind", "name"), [(A2C, "clip"), (A2C, "epochs"), (Reinforce, "entropy"), (TRPO, "critic")])
+def test_options_that_have_no_effect_are_refused(kind, name):
+    with pytest.raises(TypeError, match=name):
+        kind(CartPoles(2), **{name: 1})
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+def test_minibatch_of_one_frame_is_refused(kind):
+    # The standard deviation of one advantage is NaN.
+    trained(kind, CartPoles(2), steps=4, minibatches=4)
+    with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
+        trained(kind, CartPoles(2), steps=4, minibatches=5)

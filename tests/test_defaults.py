@@ -1,0 +1,77 @@
+"""Values in YAML files equal the defaults of the constructors, except for deliberate variations."""
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+import pytest
+from omegaconf import OmegaConf
+
+CONF = Path(__file__).parents[1] / "conf"
+# Folders in which a file changes the defaults of a class for a method or an experiment.
+VARIATION_FOLDERS = ("experiment", "method", "preset")
+# Other deliberate variations, by file. A key stands for all keys that begin with it.
+VARIATIONS = {
+    "env/cone_track.yaml": ["reward"],  # None in the constructor: the rewards of the paper
+    "env/driving_tasks.yaml": ["reward"],
+    "env/simulated_robot.yaml": ["reward", "lidar", "car_length"],  # rounded length
+    "env/mcap_replay.yaml": ["car_length"],
+    "guide/undertuned.yaml": ["gain"],
+    "proxy/network.yaml": ["method.transforms"],
+    "reproduce/figure_22.yaml": ["labels"],
+    "reproduce/table_4.yaml": ["worlds"],
+    "reproduce/table_5.yaml": ["worlds"],
+    "reproduce/table_6.yaml": ["experiments", "car_length"],
+}
+FILES = [path.relative_to(CONF).as_posix() for path in sorted(CONF.rglob("*.yaml"))]
+
+
+def nodes(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield all nodes with a `_target_` of this project, with their keys; schedules are values and not nodes."""
+    if isinstance(value, dict):
+        target = str(value.get("_target_", ""))
+        if target.startswith("coil_rl.") and not target.startswith("coil_rl.schedules."):
+            yield path, value
+        for key, entry in value.items():
+            yield from nodes(entry, f"{path}.{key}".lstrip("."))
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            yield from nodes(entry, f"{path}[{index}]")
+
+
+def defaults(target: Any) -> dict[str, Any]:
+    """Return defaults by parameter, with those of the base class if the constructor passes arguments on to it."""
+    function = target.__init__ if inspect.isclass(target) else target
+    parameters = inspect.signature(function).parameters.values()
+    passes_on = inspect.isclass(target) and any(p.kind is p.VAR_KEYWORD for p in parameters)
+    inherited = defaults(target.__bases__[0]) if passes_on and target.__module__.startswith("coil_rl.") else {}
+    return inherited | {p.name: p.default for p in parameters if p.default is not p.empty}
+
+
+def plain(value: Any) -> Any:
+    """Return a value with lists in place of tuples."""
+    return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def differences(file: str) -> dict[str, tuple[Any, Any]]:
+    """Return stated value and default of each key in which a file differs from the constructors."""
+    different = {}
+    for path, node in nodes(OmegaConf.to_container(OmegaConf.load(CONF / file))):
+        default = defaults(hydra.utils.get_object(node["_target_"]))
+        for key in node.keys() & default.keys():
+            value = node[key]
+            if "${" in str(value) or (isinstance(value, dict) and value.get("_partial_")):
+                continue
+            if isinstance(value, dict) and "_target_" in value:
+                value = hydra.utils.instantiate(value)
+            if plain(value) != plain(default[key]):
+                different[f"{path}.{key}".lstrip(".")] = (value, default[key])
+    return different
+
+
+@pytest.mark.parametrize("file", [file for file in FILES if not file.startswith(VARIATION_FOLDERS)])
+def test_yaml_states_the_defaults_of_the_constructors(file: str) -> None:
+    allowed = tuple(VARIATIONS.get(file, ["no key"]))
+    assert not {key: pair for key, pair in differences(file).items() if not key.startswith(allowed)}
