@@ -68,6 +68,8 @@ class Imitation:
         >>> metrics = learner.update(Rollout(env, learner.policy, steps=20, keys=learner.keys).collect())
     """
 
+    kind = "imitation"
+
     def __init__(
         self,
         env: EnvBase,

@@ -39,6 +39,8 @@ class A2C(ActorCritic):
         >>> metrics = a2c.update(Rollout(env, a2c.policy, steps=8).collect())
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

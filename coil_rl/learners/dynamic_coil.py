@@ -55,6 +55,8 @@ class DynamicCoil(PPO):
         >>> metrics = learner.update(Rollout(env, learner.policy, steps=32).collect())
     """
 
+    kind = "guides"
+
     def __init__(
         self,
         env: EnvBase,

@@ -44,6 +44,8 @@ class PPO(ActorCritic):
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

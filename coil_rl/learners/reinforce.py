@@ -47,6 +47,8 @@ class Reinforce(ActorCritic):
         >>> metrics = reinforce.update(Rollout(env, reinforce.policy, steps=32).collect())
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

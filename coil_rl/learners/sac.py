@@ -54,6 +54,8 @@ class SAC(OffPolicy):
         >>> metrics = sac.update(Rollout(env, sac.policy, steps=8, keys=sac.keys).collect())
     """
 
+    kind = "agent"
+
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
     reported = (*minimised, "alpha", "entropy")
 

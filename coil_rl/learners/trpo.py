@@ -54,6 +54,8 @@ class TRPO(ActorCritic):
         >>> metrics = trpo.update(Rollout(env, trpo.policy, steps=32).collect())
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

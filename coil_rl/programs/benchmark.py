@@ -24,7 +24,7 @@ from coil_rl.errors import UserError
 from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.train.build import learner_kind
-from coil_rl.train.versions import versions
+from coil_rl.train.run_folder import versions
 
 SETTINGS = ("device", "threads", "seed", "seconds", "repeats", "starts", "quick", "parts", "preset", "guide", "learner")
 

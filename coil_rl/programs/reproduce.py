@@ -13,15 +13,14 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 from tqdm import tqdm
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, did_you_mean
 from coil_rl.files import write_text
 from coil_rl.programs import app, sweeps
 from coil_rl.report.runs import read_runs
 from coil_rl.reproduce import Result, Runs, pages
-from coil_rl.signature import near
 from coil_rl.train.build import build
-from coil_rl.train.check import check_keys
-from coil_rl.train.versions import versions
+from coil_rl.train.check import check_values
+from coil_rl.train.run_folder import versions
 
 KINDS = ("table", "figure", "claim")
 LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
@@ -85,7 +84,7 @@ def chosen(config: DictConfig) -> list[str]:
         for one in given if isinstance(given, ListConfig) else [] if given is None else [given]:
             asked = f"{kind}={one}"
             if asked not in known:
-                raise UserError(f"{asked} cannot be made; there are {', '.join(known)}{near(asked, known)}")
+                raise UserError(f"{asked} cannot be made; there are {', '.join(known)}{did_you_mean(asked, known)}")
             wanted.append(known[asked])
     if not wanted:
         raise UserError(f"nothing is asked for; give one of {', '.join(known)}, or several, or all=true")
@@ -115,14 +114,14 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    check_keys(config)
+    check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and ask for several as in table=[1,4]")
     if config.threads < 1:
         raise UserError(f"threads={config.threads} must be at least 1")
     if config.budget not in config.budgets:
         known = list(config.budgets)
-        raise UserError(f"budget={config.budget} must be one of {', '.join(known)}{near(config.budget, known)}")
+        raise UserError(f"budget={config.budget} must be one of {', '.join(known)}{did_you_mean(config.budget, known)}")
     if (seeds := config.budgets[config.budget].seeds) < 1:
         raise UserError(f"budgets.{config.budget}.seeds={seeds} must be at least 1")
     chosen(config)

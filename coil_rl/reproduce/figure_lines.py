@@ -19,8 +19,8 @@ from coil_rl.reproduce.figure_lines_picture import draw_straightened
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.train import load
 from coil_rl.train.build import build, build_env
+from coil_rl.train.evaluate_run import drive_guides
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
-from coil_rl.train.guide_drives import drive_guides
 
 COLUMNS = {
     "driver": ("driver", ""),

@@ -21,7 +21,7 @@ from coil_rl.reproduce.table_6_page import page
 from coil_rl.reproduce.table_6_picture import draw_drives
 from coil_rl.robot.drives import Driver, agent_of, record
 from coil_rl.train.build import build_guides
-from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.evaluate_run import driver_names
 from coil_rl.train.load import read_config
 
 

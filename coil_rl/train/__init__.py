@@ -1,1 +1,1 @@
-"""A training run: configuration, building of parts, rollouts, updates, evaluation, checkpoints and the run folder."""
+"""Training runs: configuration, construction of the parts, rollouts, updates, evaluation, checkpoints, run folders."""

@@ -19,8 +19,7 @@ from torch import nn
 from coil_rl.files import whole_folder
 from coil_rl.train import load
 from coil_rl.train.build import build_env, build_guides, build_learner
-from coil_rl.train.config import Train
-from coil_rl.train.fingerprint import fingerprint
+from coil_rl.train.config import TrainConfig, fingerprint
 
 FILES = ("config.yaml", "policy_last.pt")  # what of a run its policy is made from
 
@@ -51,7 +50,7 @@ def configuration(config: DictConfig, name: str) -> DictConfig:
         "evaluation": {"env": whole["evaluation"]["env"], "gif": False},
         "existing": "resume",
     }
-    made: Any = OmegaConf.merge(OmegaConf.structured(Train), wanted)
+    made: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), wanted)
     made.run_dir = f"{proxy['folder']}/{name}_{fingerprint(made)}"
     return made
 

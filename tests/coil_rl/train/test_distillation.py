@@ -54,7 +54,7 @@ def test_distilling_says_how_well_the_network_does_what_the_guide_would(made, ca
     distill(composed("guide=constant", f"proxy.folder={made}", f"run_dir={made.parent}", name="distill"))
     said = capsys.readouterr().out
     assert str(folder) in said  # found, not made again
-    assert "distill: 1 made; the worst drives for" in said
+    assert "distill: made 1; the lowest mean reward is" in said
 
 
 def test_a_run_makes_the_proxies_that_it_misses_and_keeps_its_own(made, tmp_path):
