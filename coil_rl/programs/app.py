@@ -70,13 +70,7 @@ def check_run(config: DictConfig) -> None:
 
 
 def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check_run) -> None:
-    """Run a task as a program, after a check of its configuration.
-
-    Args:
-        task: gets the configuration.
-        config_name: of the root configuration, and of the program.
-        check: raises a `UserError` if the task cannot be done.
-    """
+    """Run a task as a program after a check of its configuration; `config_name` is also the name of the program."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
     _new_folders.clear()

@@ -45,12 +45,7 @@ class Sweep:
 
 
 def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> Sweep:
-    """Return the runs of an experiment with other seeds. Hydra must be initialised.
-
-    Args:
-        experiment: name of its file.
-        overrides: of all its runs, as on the command line.
-        seeds: instead of those in the file.
+    """Return the runs of an experiment file with overrides and other seeds. Hydra must be initialised.
 
     Raises:
         UserError: if the file defines no sweep, or an override does not fit one of its runs.
@@ -73,14 +68,10 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
 
 
 def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
-    """Run the sweep unless all its runs are finished.
-
-    Args:
-        sweep: of an experiment whose file sets `existing=resume`.
-        launcher: overrides of Hydra's launcher.
+    """Run a sweep, with overrides of Hydra's launcher, unless all its runs are finished.
 
     Raises:
-        UserError: if the sweep ends before all runs are finished.
+        UserError: if it ends before all runs are finished.
     """
     if not sweep.missing:
         return

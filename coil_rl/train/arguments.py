@@ -19,16 +19,13 @@ STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=Fal
 def check_arguments(
     target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
 ) -> None:
-    """Raise an error if a call of the target with the arguments of a node would fail.
+    """Raise a `UserError` for an unknown or missing argument, or one that does not fit its annotation.
 
     Args:
-        target: class or function. Arguments without an annotation are not checked.
+        target: class or function.
         node: arguments; `_target_` and `_partial_` are ignored.
         name: key of the node, for the message.
         program: names of the arguments that the program adds.
-
-    Raises:
-        UserError: for an unknown or missing argument, or a value of the wrong type.
     """
     title = getattr(target, "__name__", str(target))
     given = {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
@@ -74,13 +71,7 @@ def _check_type(value: Any, annotation: Any, name: str) -> None:
 
 
 def validation_message(error: ValidationError, value: Any, name: str = "") -> str:
-    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value.
-
-    Args:
-        error: raised by the validation of the value.
-        value: as it was validated.
-        name: key of the value; empty for the root.
-    """
+    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value; `name` is the key of the value."""
     details = [(_path(detail["loc"], value), detail) for detail in error.errors(include_url=False)]
     path = max((path for path, _ in details), key=len)
     expected = []

@@ -17,16 +17,16 @@ from coil_rl.transforms import GuideActions
 
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
-    """Instantiate a node of the configuration after a check of its arguments.
+    """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
 
     Args:
-        node: with a `_target_`; nodes inside it are instantiated too.
+        node: with a `_target_`.
         name: key of the node, for the message.
         expected: type of the result.
         arguments: added by the program.
 
     Raises:
-        UserError: if the target does not exist, refuses an argument or a value, or returns another type.
+        UserError: if the target does not exist, refuses an argument, or returns another type.
     """
     node = check_node(node, name, arguments)
     try:
@@ -47,15 +47,12 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
 
 
 def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
-    """Return a node with all references resolved, after a check of its arguments and those of nodes inside it.
+    """Return a node with its references resolved after the checks of `build`, without building anything.
 
     Args:
         node: as in `build`.
         name: as in `build`.
         program: names of the arguments that the program adds.
-
-    Raises:
-        UserError: as `build`, without building anything.
     """
     if isinstance(node, (DictConfig, ListConfig)):
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
@@ -95,7 +92,7 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
     Args:
         config: with `env`, `method`, `degrade` and `action`.
         overrides: of `env`.
-        advice: key in `evaluation.advice` of a transform that degrades the advice, after all others.
+        advice: key in `evaluation.advice` of one more transform of the advice.
 
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
@@ -104,16 +101,7 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
 
 
 def add_transforms(config: DictConfig, env: EnvBase, *, advice: str | None = None) -> EnvBase:
-    """Return an env with the transforms of a configuration.
-
-    Args:
-        config: with `method`, `degrade` and `action`.
-        env: without transforms.
-        advice: as in `build_env`.
-
-    Raises:
-        UserError: as `build`, and if the transforms do not fit together.
-    """
+    """Return an env with the transforms of a configuration; arguments and errors as in `build_env`."""
     return _transformed(env, build_transforms(config, advice), "method.transforms")
 
 
@@ -183,10 +171,10 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
-    """Return the learner of a configuration; it observes the entries of `method.observes` and `also_observes`.
+    """Return the learner of a configuration, which observes `method.observes` and `also_observes`.
 
     Args:
-        config: with `learner`, `method` and `also_observes`.
+        config: with these and `learner`.
         env: with its transforms.
         guides: for a learner that trains guides.
     """

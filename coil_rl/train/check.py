@@ -46,14 +46,7 @@ LARGEST_BATCH = 2**28
 
 
 def check(config: DictConfig) -> None:
-    """Raise an error for a configuration that cannot be run to its end.
-
-    Args:
-        config: of a program that drives; a `TrainConfig` also trains.
-
-    Raises:
-        UserError: for the first mistake.
-    """
+    """Raise a `UserError` for the first mistake in the configuration of a program that drives, and perhaps trains."""
     check_values(config)
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
@@ -78,14 +71,7 @@ def check(config: DictConfig) -> None:
 
 
 def check_values(config: DictConfig) -> None:
-    """Raise an error for unknown keys, and for numbers and choices that are out of range.
-
-    Args:
-        config: of any program.
-
-    Raises:
-        UserError: for the first of them.
-    """
+    """Raise a `UserError` for an unknown key, or a value out of range, in the configuration of any program."""
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     schema: Any = OmegaConf.get_type(config)
     try:
@@ -142,16 +128,7 @@ def _check_guides(config: DictConfig, tracks: dict[str, int]) -> None:
 
 
 def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
-    """Raise an error for a guide that cannot act in an env.
-
-    Args:
-        guide: any.
-        env: any.
-        name: key of the guide, for the message.
-
-    Raises:
-        UserError: if the env lacks an entry that the guide reads, or the shape of its action is wrong.
-    """
+    """Raise a `UserError` if the env lacks an entry that the guide reads, or the guide's action has a wrong shape."""
     data = env.reset()
     for key in guide.in_keys:
         if key not in data.keys(True):
@@ -171,9 +148,7 @@ def _check_drive(config: DictConfig, split: str, tracks: int, build_drive: Calla
 
 def _check_training(config: DictConfig, tracks: int) -> None:
     if not config.method.observes:
-        raise UserError(
-            "method.observes=[]: the agent has no observations; give entries of the env, or null for no agent"
-        )
+        raise UserError("method.observes=[]: the agent has no observations; give some, or null for no agent")
     env = build_env(config)
     if trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
@@ -214,11 +189,7 @@ def _dotted(key: str | Iterable[Any]) -> str:
 
 
 def make_folder(folder: Path) -> None:
-    """Make the folder of a run.
-
-    Raises:
-        UserError: if it cannot be made or written to.
-    """
+    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK):

@@ -41,15 +41,10 @@ class Learner(Protocol):
 
 
 class Probe(Protocol):
-    """Expensive measurement: before the first update, after the last one, and when guides have changed.
+    """Expensive measurement before the first update and after the last one."""
 
-    Attributes:
-        each_phase: measure after each update with the metric `guides_changed`.
-        names: of the numbers.
-    """
-
-    each_phase: bool
-    names: list[str]
+    each_phase: bool  # also after each update with the metric `guides_changed`
+    names: list[str]  # of the numbers
 
     def __call__(self) -> dict[str, float]:
         """Return the numbers by name."""
@@ -101,11 +96,7 @@ class Experiment:
         self.rows: list[dict[str, float]] = []
 
     def resume(self) -> None:
-        """Continue from the last intact checkpoint of the folder, or from the beginning if there is none.
-
-        Raises:
-            UserError: if the checkpoints are damaged, or `metrics.csv` lacks rows.
-        """
+        """Continue from the last intact checkpoint of the folder, or from the beginning if there is none yet."""
         state = checkpoint.load_newest(self.folder)
         if state is not None:
             self.load_state_dict(state)
@@ -114,10 +105,7 @@ class Experiment:
         print(f"{self.folder} continues {where}", file=sys.stderr)
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
-        """Train to the end and return the rows of `metrics.csv`.
-
-        Args:
-            guide_return: shown beside the return of the agent.
+        """Train to the end and return the rows of `metrics.csv`; `guide_return` is shown beside the agent's.
 
         Raises:
             UserError: if a number of the env, the losses or the weights is NaN.
@@ -247,14 +235,10 @@ def check_weights(state: Any, update: int, name: str = "learner") -> None:
 
 
 class Metrics:
-    """Log of a run: rows in a CSV file and in a TorchRL logger.
+    """Log of a run: rows in a CSV file and in any TorchRL logger.
 
     After a resume the rows since the checkpoint are written again. They are removed from the CSV file and from
     TensorBoard first; other loggers may show a point twice, with the same value.
-
-    Args:
-        path: of the CSV file.
-        logger: any TorchRL logger.
     """
 
     def __init__(self, path: Path, logger: Any | None = None) -> None:
@@ -283,11 +267,7 @@ class Metrics:
             self.tensorboard.flush()
 
     def truncate(self, count: int) -> list[dict[str, float]]:
-        """Remove all rows except the first ones, and return these.
-
-        Raises:
-            UserError: if there are fewer.
-        """
+        """Remove all rows except the first ones and return these; raise a `UserError` if there are fewer."""
         lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
         if len(lines) <= count and count:
             raise UserError(

@@ -23,7 +23,7 @@ def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "la
         folder: of the run.
         config: of the run.
         env: with the transforms of the run.
-        which: `last`, or `best`: the one with the highest mean return of a training batch.
+        which: `last`, or `best` (highest mean return of a training batch).
 
     Raises:
         UserError: if there is no such policy, or it does not fit the configuration.
@@ -48,16 +48,12 @@ def weights_file(folder: Path, which: str = "last") -> Path:
 def load_policy_in_env(
     folder: Path, config: DictConfig, env: EnvBase, which: str = "last"
 ) -> tuple[EnvBase, TensorDictModuleBase]:
-    """Return another env with the guides and transforms of a run, and the policy of the run.
+    """Return any env with the guides and transforms of a run, and the policy of the run.
 
-    Args:
-        folder: of the run.
-        config: of the run; its own `env` and tracks are not built.
-        env: without transforms, of any batch size.
-        which: as in `load_policy`.
+    The own env and tracks of the run are not built. Arguments and errors are those of `load_policy`.
 
     Raises:
-        UserError: as `load_policy`; if the run has no agent, or its agent cannot act in this env.
+        UserError: also if the run has no agent, or its agent cannot act in this env.
     """
     if config.method.observes is None:
         raise UserError(f"{folder} has no agent: its guide drives alone; give that guide instead")
@@ -69,15 +65,7 @@ def load_policy_in_env(
 
 
 def load_guides(folder: Path, config: DictConfig) -> dict[str, TensorDictModuleBase]:
-    """Return the initial guides of a run that trains its guides: the proxy of a guide if there is one.
-
-    Args:
-        folder: of the run.
-        config: of the run.
-
-    Raises:
-        UserError: if a proxy cannot be loaded.
-    """
+    """Return the initial guides of a run that trains its guides: the proxy of a guide if there is one."""
     guides = build_guides(config)
     for name in guides:
         proxy = folder / PROXIES / name

@@ -25,12 +25,8 @@ from coil_rl.train.run_folder import begin, holds, is_evaluated, locked
 def run(config: DictConfig, *, wait: bool = False) -> float:
     """Do a run, or resume it if `existing=resume`, and return the mean test reward of the deterministic agent.
 
-    Args:
-        config: of the run.
-        wait: while another process uses the folder.
-
     Raises:
-        UserError: if the folder cannot be used.
+        UserError: if the folder holds another run, or another process uses it and `wait` is not set.
     """
     folder = Path(config.run_dir)
     with locked(folder, wait=wait):
@@ -106,12 +102,7 @@ def _distil(config: DictConfig, folder: Path) -> None:
 
 
 class GuideReturns:
-    """Mean return of each guide of a learner on the training tracks; a `Probe` of `Experiment`.
-
-    Args:
-        config: of the run.
-        guides: by name, with their present parameters.
-    """
+    """Mean return of each guide of a learner on the training tracks, with its present parameters; a `Probe`."""
 
     def __init__(self, config: DictConfig, guides: Mapping[str, TensorDictModuleBase]) -> None:
         self.config, self.guides = config, guides
@@ -119,7 +110,7 @@ class GuideReturns:
         self.names = [f"guide/{name}" for name in guides]
 
     def __call__(self) -> dict[str, float]:
-        """Return the numbers of the log."""
+        """Return the means by their names in the log."""
         return dict(zip(self.names, _guide_returns(self.config, self.guides).values(), strict=True))
 
 

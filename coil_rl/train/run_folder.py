@@ -29,14 +29,10 @@ PACKAGES = (
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Lock a run folder against other processes until the block or this process ends.
-
-    Args:
-        folder: of the run; it is made.
-        wait: for another process that holds the lock, instead of raising an error.
+    """Make a run folder and lock it until the block or this process ends.
 
     Raises:
-        UserError: if another process holds the lock.
+        UserError: if another process holds the lock, unless `wait` is set.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -48,11 +44,7 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def begin(config: DictConfig, folder: Path) -> None:
-    """Write the versions and the configuration of a new run.
-
-    Raises:
-        UserError: if the folder already holds a run.
-    """
+    """Write the versions and the configuration of a new run; raise a `UserError` if there is a run already."""
     if (folder / "config.yaml").exists():
         raise UserError(
             f"{folder} already holds a run; resume it with coil-train resume={folder}, "
@@ -94,11 +86,7 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
 
 
 def holds(folder: Path, config: DictConfig) -> bool:
-    """Return whether the folder holds a run with this configuration.
-
-    Raises:
-        UserError: if it holds a run with another one, with the first value that differs.
-    """
+    """Return whether the folder holds a run; raise a `UserError` if that has another configuration."""
     if not (folder / "config.yaml").exists():
         return False
     saved, requested = (

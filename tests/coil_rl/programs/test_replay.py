@@ -187,7 +187,7 @@ def test_of_a_recording_cut_at_60_percent_what_is_readable_is_replayed_and_count
         ("", "recording must be given: write recording=VALUE"),
         ("recording=null", "recording must be an MCAP file or a rosbag2 directory"),
         ("recording=[]", "env: recordings is empty; give at least one"),
-        ("recording=5", "env: recordings=5 must be"),
+        ("recording=5", "env.recordings=5 must be"),
         ("recording=missing.mcap", "missing.mcap cannot be read (No such file or directory)"),
         ("recording=[drive.mcap,drive.mcap]", "drive.mcap twice; leave one out"),
         ("recording=text.mcap", "text.mcap is not an MCAP file"),
