@@ -30,7 +30,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import coil_rl.train.config  # noqa: F401  registers the root configurations and resolvers
+import coil_rl.train  # noqa: F401  registers the root configurations
 from coil_rl.errors import UserError, sentence
 
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first

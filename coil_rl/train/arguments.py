@@ -48,26 +48,36 @@ def check_arguments(
 
 
 def _check_type(value: Any, annotation: Any, name: str) -> None:
-    """Validate what YAML can hold; the result of a nested `_target_` is not known yet."""
     if annotation is inspect.Parameter.empty or isinstance(annotation, str):
         return
-    value = _without_targets(value)
     try:
         adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=STRICT)
     except (PydanticUserError, SchemaError):  # an annotation that cannot be checked
         return
-    for each in (value, _with_tuples(value)):
-        try:
-            if each is not _TARGET:
-                adapter.validate_python(each)
-        except ValidationError as error:
-            failure = error
-        else:
-            break
-    else:
-        raise UserError(validation_message(failure, value, name))
+    if (known := _known(value, list)) is _TARGET:
+        return
+    try:
+        adapter.validate_python(known)
+    except ValidationError as error:
+        try:  # strict pydantic accepts no list for a tuple, and YAML has no tuples
+            adapter.validate_python(_known(value, tuple))
+        except ValidationError:
+            raise UserError(validation_message(error, known, name)) from None
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise UserError(f"{name}={value} must be an integer of 64 bits")
+
+
+_TARGET = object()
+
+
+def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any:
+    """Return a value without nodes inside it that have a `_target_`, whose results are not known yet."""
+    if isinstance(value, Mapping):
+        entries = {key: _known(entry, sequence) for key, entry in value.items()}
+        return _TARGET if "_target_" in value else {k: entry for k, entry in entries.items() if entry is not _TARGET}
+    if isinstance(value, list):
+        return sequence(entry for entry in (_known(entry, sequence) for entry in value) if entry is not _TARGET)
+    return value
 
 
 def validation_message(error: ValidationError, value: Any, name: str = "") -> str:
@@ -101,27 +111,6 @@ def _path(location: Iterable[int | str], value: Any) -> tuple[int | str, ...]:
             path.append(part)
             value = value[part]
     return tuple(path)
-
-
-_TARGET = object()
-
-
-def _without_targets(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        if "_target_" in value:
-            return _TARGET
-        kept = {key: _without_targets(entry) for key, entry in value.items()}
-        return {key: entry for key, entry in kept.items() if entry is not _TARGET}
-    if isinstance(value, list):
-        return [entry for entry in map(_without_targets, value) if entry is not _TARGET]
-    return value
-
-
-def _with_tuples(value: Any) -> Any:
-    # In its strict mode pydantic takes no list for a tuple, and YAML has no tuples.
-    if isinstance(value, Mapping):
-        return {key: _with_tuples(entry) for key, entry in value.items()}
-    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:

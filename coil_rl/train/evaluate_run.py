@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from coil_rl.files import write_text
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
-from coil_rl.train.build import build, build_env, build_guided_env, env_node
+from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node
 from coil_rl.train.evaluation import PER_STEP, EvaluationResult, evaluate_policy, summarise
 
 COLUMNS = {
@@ -117,30 +117,20 @@ def drive_guides(
         names: of the tracks.
         guides: instead of those of the configuration, whose results are cached.
     """
-    if guides:
-        return _drive_guides(config, overrides, names, guides)
-    nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
-    return dict(_drive_configured(OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), tuple(names)))
+    if not guides:
+        nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+        return dict(_drive_configured(OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), tuple(names)))
+    env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
+    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+        result = evaluate_policy(env, policy, names=names, tick=bar.update)
+    return dict(zip(driver_names(guides), result.split(len(guides)), strict=True))
 
 
 # The runs of a sweep share their guides.
 @lru_cache(maxsize=64)
 def _drive_configured(nodes: str, names: tuple[str, ...]) -> dict[str, EvaluationResult]:
     config: Any = OmegaConf.create(nodes)
-    return _drive_guides(config, {}, names)
-
-
-def _drive_guides(
-    config: DictConfig,
-    overrides: Mapping[str, Any],
-    names: Sequence[str],
-    guides: Mapping[str, TensorDictModuleBase] | None = None,
-) -> dict[str, EvaluationResult]:
-    env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
-    drivers = driver_names(guides or config.guide)
-    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
-        result = evaluate_policy(env, policy, names=names, tick=bar.update)
-    return dict(zip(drivers, result.split(len(drivers)), strict=True))
+    return drive_guides(config, {}, names, build_guides(config))
 
 
 def driver_names(guides: Iterable[str]) -> list[str]:

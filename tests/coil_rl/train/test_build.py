@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.testing import check_env, check_guide
@@ -87,30 +86,10 @@ def test_every_track_group_has_tracks(track):
     assert min(len(build(node.train, "track.train")), len(build(node.test, "track.test"))) >= fewest
 
 
-def test_evaluate_composes():
-    assert composed(name="evaluate").run is None
-
-
-def test_unknown_argument_is_refused():
-    node = OmegaConf.create({"_target_": "coil_rl.guides.ZeroGuide", "sise": 1})
-    with pytest.raises(UserError, match="guide: ZeroGuide takes no sise; it takes size, in_key, out_key"):
-        build(node, "guide")
-
-
 def test_unknown_argument_of_a_nested_node_is_refused():
     node = {"_target_": "coil_rl.learners.PPO", "learning_rate": {"_target_": "coil_rl.schedules.Linear", "begin": 0}}
     with pytest.raises(UserError, match=r"learner\.learning_rate: Linear takes no begin; it takes start, end, until"):
         build(node, "learner")
-
-
-def test_unknown_target_is_refused():
-    with pytest.raises(UserError, match=r"guide: there is no 'coil_rl\.guides\.Oracle'"):
-        build({"_target_": "coil_rl.guides.Oracle"}, "guide")
-
-
-def test_wrong_value_is_refused():
-    with pytest.raises(UserError, match=r"env\.spline='round' must be 'cubic' or 'quadratic'"):
-        build_env(composed("env.spline=round"))
 
 
 def test_overrides_of_the_env_do_not_change_the_configuration():
