@@ -21,7 +21,7 @@ from benchmarks.process import measure_processes
 from benchmarks.timing import Row
 from benchmarks.training import measure_one_car, measure_sb3, measure_shares, measure_training
 from coil_rl.errors import UserError
-from coil_rl.train.versions import versions
+from coil_rl.train.run_folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "processes": ("Start-up and memory of fresh processes", measure_processes),

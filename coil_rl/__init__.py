@@ -1,1 +1,77 @@
-"""Reinforcement learning with guide policies."""
+"""Reinforcement learning with guide policies.
+
+The names in `__all__` are the public API. They are imported on first use, so that `import coil_rl` is fast.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
+    from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
+    from coil_rl.envs import McapReplayEnv as McapReplayEnv
+    from coil_rl.envs import SimulatedRobotEnv as SimulatedRobotEnv
+    from coil_rl.envs import Track as Track
+    from coil_rl.envs import load_track as load_track
+    from coil_rl.envs import load_tracks as load_tracks
+    from coil_rl.envs import random_tracks as random_tracks
+    from coil_rl.envs import shipped_tracks as shipped_tracks
+    from coil_rl.errors import UserError as UserError
+    from coil_rl.guides import ConstantGuide as ConstantGuide
+    from coil_rl.guides import RandomGuide as RandomGuide
+    from coil_rl.guides import SplineGuide as SplineGuide
+    from coil_rl.guides import ZeroGuide as ZeroGuide
+    from coil_rl.guides.learned import LearnedGuide as LearnedGuide
+    from coil_rl.imitation import Imitation as Imitation
+    from coil_rl.learners import A2C as A2C
+    from coil_rl.learners import DQN as DQN
+    from coil_rl.learners import PPO as PPO
+    from coil_rl.learners import SAC as SAC
+    from coil_rl.learners import TRPO as TRPO
+    from coil_rl.learners import DynamicCoil as DynamicCoil
+    from coil_rl.learners import Reinforce as Reinforce
+    from coil_rl.testing import check_env as check_env
+    from coil_rl.testing import check_guide as check_guide
+    from coil_rl.testing import check_transform as check_transform
+    from coil_rl.train.evaluation import evaluate_policy as evaluate_policy
+    from coil_rl.train.load import load_policy as load_policy
+    from coil_rl.train.load import load_policy_in_env as load_policy_in_env
+    from coil_rl.train.rollout import Rollout as Rollout
+    from coil_rl.train.run_folder import read_config as read_config
+    from coil_rl.transforms import DiscreteActions as DiscreteActions
+    from coil_rl.transforms import GuideActions as GuideActions
+    from coil_rl.transforms import JumpStart as JumpStart
+    from coil_rl.transforms import MixedAction as MixedAction
+    from coil_rl.transforms import ResidualAction as ResidualAction
+    from coil_rl.transforms import RewardCoupling as RewardCoupling
+
+_NAMES = {
+    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track load_track load_tracks "
+    "random_tracks shipped_tracks",
+    "coil_rl.errors": "UserError",
+    "coil_rl.guides": "ConstantGuide RandomGuide SplineGuide ZeroGuide",
+    "coil_rl.guides.learned": "LearnedGuide",
+    "coil_rl.imitation": "Imitation",
+    "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
+    "coil_rl.testing": "check_env check_guide check_transform",
+    "coil_rl.train.evaluation": "evaluate_policy",
+    "coil_rl.train.load": "load_policy load_policy_in_env",
+    "coil_rl.train.rollout": "Rollout",
+    "coil_rl.train.run_folder": "read_config",
+    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling",
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
+__all__ = sorted(_MODULES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

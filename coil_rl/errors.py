@@ -1,5 +1,69 @@
-"""The one exception that programs turn into a sentence."""
+"""User errors, and messages of one sentence for them."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 
 class UserError(Exception):
-    """Something a person gave is wrong; the message says what, what was expected and what to do."""
+    """A mistake in the input of the user. The message states what is wrong, what is expected and what to do."""
+
+
+def did_you_mean(given: str, known: Iterable[str]) -> str:
+    """Return `; did you mean X?` with the most similar known name, or an empty string."""
+    similar = difflib.get_close_matches(given, list(known), n=1)
+    return f"; did you mean {similar[0]}?" if similar else ""
+
+
+def sentence(error: BaseException) -> str:
+    """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
+    cause = error.__cause__
+    if isinstance(error, UserError):
+        return " ".join(str(error).split())
+    if isinstance(error, MissingConfigException):
+        return _unknown_file(error)
+    if isinstance(error, OSError):
+        return f"{error.filename} cannot be used ({error.strerror}); choose another folder with hydra.run.dir=FOLDER"
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
+    for key_error in (error, cause):
+        if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
+            return _unknown_key(key_error)
+    if isinstance(error, MissingMandatoryValue) and error.full_key:
+        return f"{error.full_key} must be given: write {error.full_key}=VALUE"
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return f"{error.full_key}: {_first_paragraph(error)}"
+    if isinstance(cause, OmegaConfBaseException):
+        return f"{_first_paragraph(error)}: {_first_paragraph(cause)}"
+    return _first_paragraph(error)
+
+
+def _unknown_file(error: MissingConfigException) -> str:
+    group, _, name = (error.missing_cfg_file or "").rpartition("/")
+    if not group:
+        return _first_paragraph(error)
+    options = sorted(error.options or [])
+    choices = f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
+    return f"there is no {group}={name}{choices}"
+
+
+def _unknown_key(error: OmegaConfBaseException) -> str:
+    key, parent = str(error.full_key or error.key), error.parent_node
+    known = (
+        [str(name) for name in parent if name not in ("hydra", "defaults")] if isinstance(parent, DictConfig) else []
+    )
+    node = key.rpartition(".")[0] or "the configuration"
+    add = f"; +{key}=VALUE adds it" if parent is not None and OmegaConf.get_type(parent) is dict else ""
+    return f"there is no key {key}; {node} has {', '.join(known)}{add}{did_you_mean(str(error.key), known)}"
+
+
+def _first_paragraph(error: BaseException) -> str:
+    # Indented lines hold OmegaConf's internals.
+    lines = str(error).partition("\n\n")[0].splitlines()
+    kept = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "\t", "See http"))]
+    return " ".join(kept) or type(error).__name__

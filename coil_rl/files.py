@@ -1,4 +1,4 @@
-"""Files and folders that appear whole or not at all, also where the process is killed or the power fails."""
+"""Atomic writes: files and folders appear complete or not at all, also if the process is killed."""
 
 from __future__ import annotations
 
@@ -12,17 +12,13 @@ from pathlib import Path
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A name to write to; it becomes `path` when the block ends, or vanishes if the block raises.
+    """Yield a temporary path with the same suffix that becomes `path` at the end of the block.
 
-    Args:
-        path: the file to be; its folder is made, an older file is replaced.
-
-    Yields:
-        A name in the same folder and with the same ending, by which image writers choose their format.
+    Parents are made and an older file is replaced. If the block raises, the temporary file is removed.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    unfinished = _temporary(path)
     try:
         yield unfinished
         _to_disk(unfinished)
@@ -33,27 +29,23 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """A file of text, which ends with its last line, written as by `whole_file`."""
+    """Write a text file with exactly one line break at its end, as `whole_file`."""
     with whole_file(path) as unfinished:
         unfinished.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
 
 
 @contextmanager
 def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A folder to write files into; it becomes `path` when the block ends, or vanishes if the block raises.
+    """Yield a temporary folder that becomes `path` at the end of the block.
 
-    Args:
-        path: the folder to be, which may not exist or be empty; its parents are made.
-
-    Yields:
-        An empty folder beside it.
+    Parents are made. If the block raises, the temporary folder is removed.
 
     Raises:
-        OSError: if there is something at `path`.
+        OSError: if `path` exists and is not an empty folder.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    unfinished = _temporary(path)
     unfinished.mkdir()
     try:
         yield unfinished
@@ -65,17 +57,21 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(unfinished, ignore_errors=True)
 
 
-def folder_to_disk(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk."""
-    if os.name != "nt":  # where a folder cannot be opened
-        _to_disk(folder)
-
-
 def remove_unfinished(folder: Path) -> None:
-    """Remove what killed processes had not finished writing; nobody else may be writing there now."""
+    """Remove the temporary files of killed processes; no other process may be writing there."""
     for path in folder.iterdir():
         if re.fullmatch(r"\..+\.\d+(\.\w+)?", path.name):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+
+def folder_to_disk(folder: Path) -> None:
+    """Wait until the entries of a folder are on the disk."""
+    if os.name != "nt":  # Windows cannot open a folder
+        _to_disk(folder)
+
+
+def _temporary(path: Path) -> Path:
+    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
 def _to_disk(path: Path) -> None:

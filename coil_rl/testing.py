@@ -1,4 +1,4 @@
-"""The contracts of guides, transforms and envs as checks, for our own tests and for those of other people's parts."""
+"""Contract checks of envs, guides and transforms, for tests of your own parts."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs
 
 
 def check_env(env: EnvBase, steps: int = 10) -> None:
-    """Specs hold in rollouts, numbers are finite, and a partial reset leaves the other rows as they were.
+    """Check that data fits the specs, numbers are finite, and a partial reset does not change other rows.
 
     Raises:
-        AssertionError: by `check_env_specs`, where specs and data differ.
-        ValueError: for the other two, naming the entry.
+        AssertionError: by TorchRL's `check_env_specs`.
+        ValueError: for the other two, with the entry.
     """
     check_env_specs(env)
     rollout = env.rollout(steps, break_when_any_done=False)
@@ -35,32 +35,32 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
 def check_guide(
     guide: TensorDictModuleBase, data: TensorDictBase, action_key: NestedKey = "action", tolerance: float = 0.0
 ) -> None:
-    """The guide writes a finite action for each row, leaves its input alone, and answers each row by itself.
+    """Check that a guide writes finite actions, does not change its input, and treats each row independently.
 
     Args:
-        guide: one that does not draw random numbers.
-        data: [B], what an env wrote.
-        action_key: where the action is expected.
-        tolerance: how much other rows may change an action; a network rounds differently in a larger batch.
+        guide: without random numbers.
+        data: [B], written by an env.
+        action_key: of the action.
+        tolerance: allowed effect of other rows; a network rounds differently in another batch.
 
     Raises:
-        ValueError: naming what does not hold.
+        ValueError: for the first property that does not hold.
     """
     if action_key not in guide.out_keys:
         raise ValueError(f"the guide writes {guide.out_keys}, not {action_key!r}")
-    given = data.select(*guide.in_keys)
-    kept = given.clone()
+    inputs = data.select(*guide.in_keys)
+    copy = inputs.clone()
     with torch.no_grad():
-        together = guide(given.copy())[action_key]
-        alone = torch.cat([guide(given[row : row + 1].copy())[action_key] for row in range(len(given))])
+        together = guide(inputs.copy())[action_key]
+        alone = torch.cat([guide(inputs[row : row + 1].copy())[action_key] for row in range(len(inputs))])
     if not together.isfinite().all():
         raise ValueError("the guide's action is not finite")
-    if not (given == kept).all():
-        raise ValueError("the guide changed what it was given")
+    if not (inputs == copy).all():
+        raise ValueError("the guide changed its input")
     if not torch.allclose(together, alone, rtol=0, atol=tolerance):
         raise ValueError("the guide's action for a row depends on the other rows")
 
 
 def check_transform(env: EnvBase, transform: Transform) -> None:
-    """An env with the transform around it is still an env: see `check_env`."""
+    """Check an env with a transform; see `check_env`."""
     check_env(TransformedEnv(env, transform))

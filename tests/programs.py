@@ -1,4 +1,4 @@
-"""The console programs, in this process or in one of their own, and the smallest run of all of coil-train."""
+"""Helpers that call the console programs, and the arguments of a very small run."""
 
 import contextlib
 import importlib
@@ -21,12 +21,11 @@ def command(name, *arguments):
 
 
 def environment(cwd):
-    # One after the other, as PYTHONPATH may hold packages that the tests were given.
     return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")])}
 
 
 def program(name, *arguments, cwd, code=0):
-    """What a program does as a person starts it, in a process of its own; importing PyTorch takes it seconds."""
+    """Run a program in a process of its own, which takes seconds to import PyTorch."""
     done = subprocess.run(
         command(name, *arguments),
         cwd=cwd,
@@ -41,7 +40,7 @@ def program(name, *arguments, cwd, code=0):
 
 
 def called(name, *arguments, cwd=".", code=0):
-    """The same in this process; None is any exit code."""
+    """Run a program in this process; `code=None` accepts any exit code."""
     out, error, ended, given = io.StringIO(), io.StringIO(), 0, sys.argv
     sys.argv = [name, *arguments]
     try:

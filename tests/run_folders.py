@@ -1,4 +1,4 @@
-"""Folders such as coil-train leaves them, made in no time."""
+"""Run folders as coil-train writes them, without a run."""
 
 import json
 import math
@@ -22,7 +22,7 @@ OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0,
 def driven(
     driver: str, rewards: Mapping[str, float], actions: str = "deterministic", advice: str = "", **others: float
 ) -> list[Row]:
-    """The rows of one driver: a row per track, and their mean."""
+    """Return the rows of one driver: a row per track, and their mean."""
     row = {"driver": driver, "advice": advice, "actions": actions}
     rows = [row | {"track": track, "reward": reward} | OTHERS | others for track, reward in rewards.items()]
     return [*rows, rows[0] | {"track": "mean", "reward": sum(rewards.values()) / len(rewards)}]
@@ -36,7 +36,7 @@ def make_run(
     needs_guide: bool | None = True,
     guide: float = 300.0,
 ) -> Path:
-    """A run; without rows it is not finished."""
+    """Write a run; without rows it is not finished."""
     folder.mkdir(parents=True)
     config = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
@@ -51,7 +51,7 @@ def make_run(
 
 
 def make_sweep(folder: Path) -> Path:
-    """Three seeds of coil, which beats its guide, and of ppo, which beats coil; two further runs are not finished."""
+    """Write three seeds of coil, better than its guide, and of ppo, better than coil; two more runs are unfinished."""
     guide = driven("guide", {"a": 500.0, "b": 600.0})
     for seed in range(3):
         coil = [
@@ -75,7 +75,7 @@ def make_sweep(folder: Path) -> Path:
 
 
 def make_untrained_run(folder: Path, *overrides: str) -> Path:
-    """A run as far as other programs read it: its configuration and a policy, which has learned nothing."""
+    """Write the configuration and the untrained policy of a run."""
     folder.mkdir()
     torch.manual_seed(0)
     with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
@@ -83,7 +83,7 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
     if config.method.observes is not None:
         policy = build_learner(config, build_env(config)).policy
         checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
-    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    kept.logger = None
-    OmegaConf.save(kept, folder / "config.yaml")
+    saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    saved.logger = None
+    OmegaConf.save(saved, folder / "config.yaml")
     return folder

@@ -16,6 +16,6 @@ MODULES = [
 
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_in_docstrings_run(name):
-    failures, tried = doctest.testmod(importlib.import_module(name))
-    assert tried
+    failures, examples = doctest.testmod(importlib.import_module(name))
+    assert examples
     assert not failures

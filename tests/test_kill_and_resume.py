@@ -3,5 +3,5 @@ import pytest
 
 
 @pytest.mark.slow
-def test_killed_runs_end_as_if_they_had_never_been_stopped(tmp_path):
+def test_killed_and_resumed_runs_end_like_an_uninterrupted_one(tmp_path):
     assert kill_and_resume.main(["--kills", "3", "--folder", str(tmp_path)]) == 0

@@ -25,9 +25,9 @@ def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A copy of the sources as Git checks them out where links do not exist: small text files in their place.
+    """Return a copy of the sources in which the links are small text files, as Git writes them on Windows.
 
-    One nested YAML and one track are planted, so that the globs are tried whatever the project ships today.
+    A nested YAML and a track are added to test the globs.
     """
     tree = tmp_path_factory.mktemp("packaging") / "tree"
     ignore = shutil.ignore_patterns(
@@ -59,7 +59,7 @@ def installed(wheel: Path) -> Path:
     return target
 
 
-def test_wheel_holds_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
+def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
     patterns = {"coil_rl": ["*.py", "*.json", "py.typed"], "envs": ["*.py", "*.json", "tracks/**/*.csv"]}
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"]}
     expected = {
@@ -73,17 +73,16 @@ def test_wheel_holds_exactly_the_sources_and_their_data(tree: Path, wheel: Path)
     assert {"coil_rl/py.typed", "coil_rl/conf/a/b/planted.yaml", "coil_rl/envs/tracks/a/planted.csv"} <= names
 
 
-def test_wheel_takes_one_import_name_only(wheel: Path) -> None:
+def test_wheel_has_one_import_name(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
 
 
-def test_installed_wheel_imports_and_its_programs_run_from_another_folder(installed: Path, tmp_path: Path) -> None:
+def test_installed_wheel_runs_from_another_folder(installed: Path, tmp_path: Path) -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for target in scripts.values():
         module = target.removesuffix(":main")
         assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
-    # One process for both, because importing PyTorch takes it seconds.
     program = """
 import importlib.resources
 import coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms
@@ -99,10 +98,10 @@ main()
     outside = [line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())]
     assert (len(lines), outside) == (5, [])
     assert all(Path(line).is_file() for line in lines)
-    assert "test_3" in out, "the shipped tracks should have come from the wheel"
+    assert "test_3" in out, "the shipped tracks are missing in the wheel"
 
 
-def test_every_dependency_has_one_exact_version_in_its_range() -> None:
+def test_every_dependency_is_pinned_within_its_range() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = dict(line.split("==") for line in lines if not line.startswith("#"))

@@ -1,4 +1,4 @@
-"""Envs with a guide, for tests of what uses its advice."""
+"""Small envs with a guide."""
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -10,19 +10,19 @@ from coil_rl.transforms import GuideActions
 
 
 def cones(*transforms, cars=6) -> TransformedEnv:
-    """Cars with the spline guide's advice."""
+    """Return cars with the advice of the spline guide."""
     env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6)
     return TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), *transforms))
 
 
 def pendulum(*transforms) -> TransformedEnv:
-    """One pendulum, no batch, its torque in [-2, 2]; the guide damps it."""
+    """Return one pendulum without a batch, torque in [-2, 2]; the guide damps it."""
     damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
     return TransformedEnv(PendulumEnv(), Compose(GuideActions({"damp": damp}), *transforms))
 
 
 def carts(*transforms, categorical=True) -> TransformedEnv:
-    """Two carts that are pushed left or right; the guide pushes to where the pole leans."""
+    """Return two cart poles with two discrete actions; the guide pushes to where the pole leans."""
 
     def lean(observation):
         choice = (observation[..., 2] > 0).long()
@@ -36,5 +36,5 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
 
 def everywhere(*transforms) -> list[TransformedEnv]:
-    """Each of these worlds with the transforms that the given functions make for it."""
+    """Return each of these envs with the transforms of some factories."""
     return [world(*(make() for make in transforms)) for world in (cones, pendulum, carts)]

@@ -54,6 +54,8 @@ class DQN(OffPolicy):
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
+    kind = "agent"
+
     minimised = reported = ("loss",)
 
     def __init__(

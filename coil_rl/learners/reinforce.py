@@ -37,6 +37,8 @@ class Reinforce(PPO):
         options: as for `PPO`.
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

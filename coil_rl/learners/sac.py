@@ -41,6 +41,8 @@ class SAC(OffPolicy):
         ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
     """
 
+    kind = "agent"
+
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
     reported = (*minimised, "alpha", "entropy")
 

@@ -38,6 +38,8 @@ class TRPO(PPO):
         options: as for `PPO`; auxiliary losses are part of the objective.
     """
 
+    kind = "agent"
+
     def __init__(
         self,
         env: EnvBase,

@@ -1,59 +1,108 @@
-"""What all programs share: Hydra, and one sentence instead of a traceback for what a person got wrong."""
+"""Frame of the console programs: Hydra composes the configuration, and a mistake of the user becomes one sentence.
+
+A program imports torch, and whatever imports it, inside its functions. Help texts and wrong overrides then take a
+second:
+
+    def train(config: DictConfig) -> float:
+        from coil_rl.train.run import run
+
+        return run(config)
+"""
 
 from __future__ import annotations
 
 import functools
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from pathlib import Path
+from typing import Any, NoReturn
 
 import hydra
 import yaml
 from hydra._internal.utils import get_args_parser
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.errors import UserError
-from coil_rl.programs.refusal import refuse
-from coil_rl.train.check import check
+import coil_rl.train  # noqa: F401  registers the root configurations
+from coil_rl.errors import UserError, sentence
+
+_new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 
 
-def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check) -> None:
-    """Run a task under Hydra as a program, after a check of its configuration."""
+class NewFolders(Callback):
+    """Record the folders that Hydra is about to make, because it makes them before the configuration is checked."""
+
+    def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Record the folder of a run."""
+        _record(config, "hydra.run.dir")
+
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Record the folder of a sweep."""
+        _record(config, "hydra.sweep.dir")
+
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Record the folder of a job of a sweep."""
+        folder = Path(config.hydra.runtime.output_dir)
+        if folder.parent in _new_folders and folder not in _new_folders:
+            _new_folders.insert(0, folder)
+
+
+def _record(config: DictConfig, key: str) -> None:
+    try:
+        folder = Path(str(OmegaConf.select(config, key))).absolute()
+    except OmegaConfBaseException:
+        return  # Hydra raises the same error next
+    _new_folders[:] = [place for place in (folder, *folder.parents) if not place.exists()]
+
+
+def check_run(config: DictConfig) -> None:
+    """Check everything that a run needs; see `coil_rl.train.check.check`."""
+    from coil_rl.train.check import check
+
+    check(config)
+
+
+def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check_run) -> None:
+    """Run a task as a program after a check of its configuration; `config_name` is also the name of the program."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
+    _new_folders.clear()
     _check_options(config_name)
-    of_task: list[Exception] = []
+    bugs: list[Exception] = []
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
         try:
             check(config)
             return task(config)
+        except (UserError, OmegaConfBaseException) as error:
+            refuse(config_name, error)  # here, because Hydra prints a line of its own for an error of the task
         except Exception as error:
-            of_task.append(error)
+            bugs.append(error)
             raise
 
     with program(config_name):
         try:
             hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
         except (HydraException, ValueError, OSError, yaml.YAMLError) as error:
-            # Until the task runs there is only what was given to go wrong; in it, the same error is a bug of ours.
-            if error in of_task:
+            # Outside of the task these errors come from the command line and the configuration files.
+            if error in bugs:
                 raise
             refuse(config_name, error)
 
 
 @contextmanager
 def program(name: str) -> Iterator[None]:
-    """Around all that a process does: one sentence on standard error instead of a traceback.
+    """End the process with one sentence on standard error instead of a traceback.
 
-    A mistake in what was given ends the process with exit code 2, Ctrl-C and SIGTERM with 130.
+    The exit code is 2 for a mistake of the user, and 130 for Ctrl-C and SIGTERM.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
@@ -66,12 +115,23 @@ def program(name: str) -> Iterator[None]:
         sys.exit(130)
 
 
+def refuse(name: str, error: Exception) -> NoReturn:
+    """End the program with one sentence and exit code 2, and remove new folders that hold no files of the task."""
+    for folder in _new_folders:
+        inside = [path for path in folder.rglob("*") if not path.is_dir()]
+        if all(path.name == "multirun.yaml" or path.parent.name == ".hydra" for path in inside):
+            shutil.rmtree(folder, ignore_errors=True)
+    _new_folders.clear()
+    print(f"{name}: {sentence(error)}", file=sys.stderr)
+    sys.exit(2)
+
+
 def _check_options(config_name: str) -> None:
     """Refuse unknown options, for which argparse would print its whole usage."""
     parser = get_args_parser()
 
     def error(message: str) -> None:
-        refuse(config_name, UserError(f"{message}; options such as -m come first, then KEY=VALUE (see --hydra-help)"))
+        refuse(config_name, UserError(f"{message}; options such as -m come first, then KEY=VALUE (see --help)"))
 
     vars(parser)["error"] = error
     for override in parser.parse_args().overrides:

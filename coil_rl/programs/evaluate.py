@@ -1,21 +1,24 @@
-"""`coil-evaluate`: drive a trained run beside its guide, or a guide alone, over the test tracks."""
+"""`coil-evaluate`: evaluate the policy of a run beside its guides, or guides alone, on the test tracks."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.programs import app
-from coil_rl.train.build import build_env
-from coil_rl.train.evaluate_run import evaluate_run, outcome
-from coil_rl.train.load import load_policy, read_config
+
+if TYPE_CHECKING:
+    from torch import nn
 
 
 def evaluate(config: DictConfig) -> float:
-    """Judge what the configuration names; returns the mean reward of its deterministic policy."""
+    """Evaluate the configured run or guides, and return the mean reward of the deterministic policy."""
+    import torch
+
+    from coil_rl.train.evaluate_run import evaluate_run, report_outcome
+
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
@@ -23,17 +26,21 @@ def evaluate(config: DictConfig) -> float:
     if config.run is not None:
         config, agent = restore(Path(config.run), config)
     evaluate_run(config, agent, folder, seed)
-    return outcome(folder)
+    return report_outcome(folder)
 
 
-def restore(run: Path, asked: DictConfig) -> tuple[DictConfig, torch.nn.Module | None]:
-    """The configuration of a run, with the tracks and the evaluation that were asked for, and its policy.
+def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
+    """Return the configuration of a run with the requested tracks and evaluation, and its policy.
 
     Raises:
-        UserError: if the folder holds no run, or one that does not fit together.
+        UserError: if the folder holds no complete run.
     """
-    resolved: Any = OmegaConf.to_container(asked, resolve=True)
-    # The run was trained with advice of its own; this is what else to show it.
+    from coil_rl.train.build import build_env
+    from coil_rl.train.load import load_policy
+    from coil_rl.train.run_folder import read_config
+
+    resolved: Any = OmegaConf.to_container(requested, resolve=True)
+    # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] |= resolved["degrade"]
     config = read_config(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
     if config.method.observes is None:

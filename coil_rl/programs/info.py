@@ -1,12 +1,12 @@
-"""`coil-info`: what to paste into a bug report."""
+"""`coil-info`: print the versions that a bug report needs."""
 
 from __future__ import annotations
 
-from coil_rl.train.versions import versions
+from coil_rl.train.run_folder import versions
 
 
 def main() -> None:
-    """Print the versions of everything that matters, one a line."""
+    """Print a version a line."""
     found = versions()
     width = max(map(len, found))
     for name, version in found.items():

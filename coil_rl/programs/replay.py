@@ -32,7 +32,7 @@ from coil_rl.replay.tables import extent, farthest, notes
 from coil_rl.report import write_csv
 from coil_rl.train import load
 from coil_rl.train.build import build, build_guides
-from coil_rl.train.check import check_guide, check_values, make_folder
+from coil_rl.train.check import check_guide_in_env, check_values, make_folder
 
 Runs = Mapping[str, tuple[Path, DictConfig]]
 
@@ -84,7 +84,7 @@ def find_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policie
     """
     guides = build_guides(config) if config.guide else {}
     for name, guide in guides.items():
-        check_guide(guide, env, f"guide.{name}")
+        check_guide_in_env(guide, env, f"guide.{name}")
     folders = [Path(run).expanduser() for run in config.runs]
     if twice := repeated([str(folder.resolve()) for folder in folders]):
         raise UserError(f"runs names {twice} twice; leave one out")

@@ -12,15 +12,14 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, did_you_mean
 from coil_rl.files import write_text
 from coil_rl.programs import app
 from coil_rl.report import Interval, draw_curve_grid, draw_intervals, draw_learning_curves, page, write_csv
 from coil_rl.report.comparison import Comparison, compare
 from coil_rl.report.runs import GUIDE, Run, read_runs
 from coil_rl.report.statistics import iqm
-from coil_rl.signature import near
-from coil_rl.train.check import check_keys
+from coil_rl.train.check import check_values
 
 ACTIONS = {"deterministic": ("deterministic",), "sampled": ("sampled",), "both": ("deterministic", "sampled")}
 USUAL = "ppo"  # what improvement is over, unless it is said
@@ -95,7 +94,7 @@ def _against(asked: str | None, found: Mapping[str, Comparison]) -> str | None:
         return USUAL if USUAL in labels else None
     known = [*labels, GUIDE]
     if asked not in known:
-        there_are = f"there are {', '.join(known)}{near(asked, known)}"
+        there_are = f"there are {', '.join(known)}{did_you_mean(asked, known)}"
         raise UserError(f"against={asked} is no label of a finished run; {there_are}")
     return asked
 
@@ -113,11 +112,13 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, what is wrong.
     """
-    check_keys(config)
+    check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("a report is made once; leave out -m, and give several folders as folder=[ONE,OTHER]")
     if config.actions not in ACTIONS:
-        raise UserError(f"actions={config.actions} must be one of {', '.join(ACTIONS)}{near(config.actions, ACTIONS)}")
+        raise UserError(
+            f"actions={config.actions} must be one of {', '.join(ACTIONS)}{did_you_mean(config.actions, ACTIONS)}"
+        )
     for key, (low, high) in LIMITS.items():
         if not low <= config[key] <= high:
             raise UserError(f"{key}={config[key]} must be between {low} and {high}")

@@ -11,9 +11,8 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
-from coil_rl.signature import near
 
 if TYPE_CHECKING:
     from coil_rl.reproduce import Result, Runs
@@ -30,7 +29,7 @@ def reproduce(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.reproduce import Result, pages
     from coil_rl.train.build import build
-    from coil_rl.train.versions import versions
+    from coil_rl.train.run_folder import versions
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
@@ -85,7 +84,7 @@ def requested(config: DictConfig) -> list[str]:
         values = config[kind] if isinstance(config[kind], ListConfig) else [config[kind]]
         for key in (f"{kind}={value}" for value in values if value is not None):
             if key not in available:
-                raise UserError(f"{key} does not exist; there are {', '.join(available)}{near(key, available)}")
+                raise UserError(f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}")
             names.append(available[key])
     if not names:
         raise UserError(f"nothing is requested; give one of {', '.join(available)}, or several, or all=true")
@@ -110,16 +109,16 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: for the first mistake.
     """
-    from coil_rl.train.check import check_keys
+    from coil_rl.train.check import check_values
 
-    check_keys(config)
+    check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and request several as in table=[1,4]")
     if config.threads < 1:
         raise UserError(f"threads={config.threads} must be at least 1")
     if config.budget not in config.budgets:
         names = list(config.budgets)
-        raise UserError(f"budget={config.budget} must be one of {', '.join(names)}{near(config.budget, names)}")
+        raise UserError(f"budget={config.budget} must be one of {', '.join(names)}{did_you_mean(config.budget, names)}")
     if (seeds := config.budgets[config.budget].seeds) < 1:
         raise UserError(f"budgets.{config.budget}.seeds={seeds} must be at least 1")
     requested(config)

@@ -19,7 +19,7 @@ from coil_rl.reproduce import Result
 from coil_rl.robot.drives import Driver, agent_of, record
 from coil_rl.train.build import build, build_bare_env, build_guided_env, build_guides
 from coil_rl.train.check import check as check_common
-from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.evaluate_run import driver_names
 from coil_rl.train.load import read_config
 
 # From each step, in the order in which they build on each other, to what it leaves.

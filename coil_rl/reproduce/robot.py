@@ -21,7 +21,7 @@ from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, 
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
 from coil_rl.robot.drives import Driver, agent_of, record
 from coil_rl.train.build import build_guides
-from coil_rl.train.guide_drives import driver_names
+from coil_rl.train.evaluate_run import driver_names
 from coil_rl.train.load import read_config
 
 PAPER_ROBOT: dict[str, dict[str, Any]] = {

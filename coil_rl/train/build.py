@@ -1,4 +1,4 @@
-"""From a configuration to objects: the one place that wires the parts together and calls `instantiate`."""
+"""Construction of the env, the guides and the learner of a configuration; the only caller of `instantiate`."""
 
 from __future__ import annotations
 
@@ -12,127 +12,111 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.signature import check_call, shown, takes
+from coil_rl.train.arguments import check_arguments, yaml_text
 from coil_rl.transforms import GuideActions
 
 
-def build(node: Any, name: str, kind: type | None = None, **given: Any) -> Any:
-    """Instantiate a node of the configuration after checking it against what its target takes.
+def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
+    """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
 
     Args:
-        node: has a `_target_`; nodes inside it are instantiated too.
-        name: what a person calls this node, for the message.
-        kind: what it must make, if not just anything.
-        given: arguments that do not come from the configuration.
+        node: with a `_target_`.
+        name: key of the node, for the message.
+        expected: type of the result.
+        arguments: added by the program.
 
     Raises:
-        UserError: if the node has no `_target_`, if that does not exist, does not take a key or a value, or makes
-            something else.
+        UserError: if the target does not exist, refuses an argument, or returns another type.
     """
-    node = check_node(node, name, given)
+    node = check_node(node, name, arguments)
     try:
-        built = hydra.utils.instantiate(node, **given, _convert_="all")
+        built = hydra.utils.instantiate(node, **arguments, _convert_="all")
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, OSError)):
-            said = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
-            raise UserError(f"{name}: {' '.join(str(said).split())}") from error
-        if cause is None:  # Hydra itself will not call this target
-            raise UserError(f"{name}: {' '.join(str(error).split())}") from error
+            message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
+            raise UserError(f"{name}: {message}") from error
+        if cause is None:  # Hydra itself refuses to call the target
+            raise UserError(f"{name}: {error}") from error
         if isinstance(cause, MemoryError) or "allocate" in str(cause):
             raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         raise
-    if kind is not None and not isinstance(built, kind):
-        raise UserError(f"{name}: {node['_target_']} makes {type(built).__name__}, but {kind.__name__} is wanted")
+    if expected is not None and not isinstance(built, expected):
+        raise UserError(f"{name}: {node['_target_']} makes {type(built).__name__}, not {expected.__name__}")
     return built
 
 
-def check_node(node: Any, name: str, given: Iterable[str] = ()) -> dict[str, Any]:
-    """The node with all references resolved, if it and the nodes inside it are calls that can be made.
+def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
+    """Return a node with its references resolved after the checks of `build`, without building anything.
 
     Args:
-        node: as for `build`.
-        name: as for `build`.
-        given: the names of what `build` is given besides.
-
-    Raises:
-        UserError: as `build`, without building anything.
+        node: as in `build`.
+        name: as in `build`.
+        program: names of the arguments that the program adds.
     """
     if isinstance(node, (DictConfig, ListConfig)):
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     if not isinstance(node, Mapping) or "_target_" not in node:
-        raise UserError(f"{name}={shown(node)} names nothing to build; give it a _target_, the full name of a class")
-    _check(node, name, given)
+        raise UserError(f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or function")
+    _check(node, name, program)
     return dict(node)
 
 
-def _check(node: Any, name: str, given: Iterable[str] = ()) -> None:
+def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
     if isinstance(node, Mapping):
         for key, value in node.items():
             _check(value, f"{name}.{key}")
         if "_target_" in node:
-            check_call(_target(node["_target_"], name), node, name, given)
+            check_arguments(_target(node["_target_"], name), node, name, program)
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(value, f"{name}[{index}]")
 
 
-def _target(target: Any, name: str) -> Callable[..., Any]:
+def _target(path: Any, name: str) -> Callable[..., Any]:
     try:
-        found = hydra.utils.get_object(target)
+        target = hydra.utils.get_object(path)
     except Exception as error:
-        raise UserError(f"{name}: there is no {target!r}; is it spelt right, and its package installed?") from error
-    if not callable(found):
-        raise UserError(f"{name}: {target} is {found!r}, which cannot be called; give a class or a function")
-    called: Callable[..., Any] = found
-    return called
+        raise UserError(
+            f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
+        ) from error
+    if not callable(target):
+        raise UserError(f"{name}: {path} is {target!r}, which cannot be called; give a class or a function")
+    function: Callable[..., Any] = target
+    return function
 
 
 def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
-    """The env of a configuration as its agent sees it, which also adds up the task's reward as `episode_reward`.
+    """Return the env of a configuration with all transforms; it also writes the sum of rewards, `episode_reward`.
 
     Args:
         config: with `env`, `method`, `degrade` and `action`.
-        overrides: what to change in `env`.
-        advice: which of `evaluation.advice` comes last, and degrades the advice once more.
+        overrides: of `env`.
+        advice: key in `evaluation.advice` of one more transform of the advice.
 
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
     """
-    return as_its_agent_sees(config, build_bare_env(config, overrides), advice=advice)
+    return add_transforms(config, build_bare_env(config, overrides), advice=advice)
 
 
-def as_its_agent_sees(config: DictConfig, env: EnvBase, *, advice: str | None = None) -> EnvBase:
-    """Any env with the transforms of a configuration around it.
-
-    Args:
-        config: with `method`, `degrade` and `action`.
-        env: without transforms.
-        advice: as for `build_env`.
-
-    Raises:
-        UserError: as `build`, and if the transforms do not fit together.
-    """
+def add_transforms(config: DictConfig, env: EnvBase, *, advice: str | None = None) -> EnvBase:
+    """Return an env with the transforms of a configuration; arguments and errors as in `build_env`."""
     return _transformed(env, build_transforms(config, advice), "method.transforms")
 
 
 def _transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
-    # The sum comes first, before a method changes what the agent is paid.
+    # The sum comes first, before a method changes the reward.
     env = TransformedEnv(env, Compose(RewardSum(), *transforms))
     try:
-        env.observation_spec  # noqa: B018  transforms look at what stands before them once they are asked
+        env.observation_spec  # noqa: B018  transforms check the specs when these are computed
     except (KeyError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0]}") from error
     return env
 
 
 def build_transforms(config: DictConfig, advice: str | None = None) -> list[Transform]:
-    """The transforms of a method, those that degrade what its guides say, if it asks any, and what makes choices of it.
-
-    Args:
-        config: with `method`, `degrade` and `action`.
-        advice: as in `build_env`.
-    """
+    """Return the transforms of the method, of `degrade` if the method has any, of `advice` and of `action`."""
     transforms = build_all(config.method.transforms, "method.transforms")
     if transforms:
         transforms += build_all(config.degrade, "degrade")
@@ -144,20 +128,19 @@ def build_transforms(config: DictConfig, advice: str | None = None) -> list[Tran
 
 
 def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
-    """Transforms in the order in which they stand in the configuration."""
+    """Return transforms in the order of the configuration."""
     return [build(node, f"{name}.{key}", Transform) for key, node in nodes.items()]
 
 
 def build_guided_env(
     config: DictConfig, overrides: Mapping[str, Any], guides: Mapping[str, TensorDictModuleBase] | None = None
 ) -> tuple[EnvBase, TensorDictModuleBase]:
-    """The env of a configuration, and a policy by which its guides drive there, degraded as the configuration says.
+    """Return the env of a configuration, and a policy that follows its guides, with degraded advice.
 
     Args:
         config: with `env`, `guide` and `degrade`.
-        overrides: what to change in `env`, with `num_cars`. There are so many cars for each guide, the first guide's
-            first.
-        guides: others than those of the configuration.
+        overrides: of `env`, with `num_cars`: the number of cars for each guide. Those of the first guide come first.
+        guides: instead of those of the configuration.
 
     Raises:
         UserError: as `build_env`.
@@ -170,17 +153,17 @@ def build_guided_env(
 
 
 def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
-    """The env of a configuration without any transform; `overrides` as in `build_env`."""
+    """Return the env of a configuration without transforms."""
     env: EnvBase = build(env_node(config, overrides), "env", EnvBase)
     return env
 
 
 def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """The node `env` of a configuration with all references resolved; `overrides` as in `build_env`."""
-    with open_dict(config):  # which keys the env takes is its own to say
+    """Return the node `env` with overrides and all references resolved."""
+    with open_dict(config):  # `build` checks the keys
         node = OmegaConf.merge(config.env, dict(overrides or {}))
         for key, value in (overrides or {}).items():
-            # What another target takes is not what the one before took.
+            # The arguments of another target replace those of the first one.
             if isinstance(value, (Mapping, DictConfig)) and "_target_" in value:
                 OmegaConf.update(node, key, value, merge=False)
     resolved: Any = OmegaConf.to_container(node, resolve=True)
@@ -188,42 +171,38 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
-    """The learner of a configuration, observing what its method and `also_observes` say of this env.
+    """Return the learner of a configuration, which observes `method.observes` and `also_observes`.
 
     Args:
-        config: with `learner`, `method` and `also_observes`.
-        env: as its agent sees it.
-        guides: those that it trains, if it does.
+        config: with these and `learner`.
+        env: with its transforms.
+        guides: for a learner that trains guides.
     """
-    given: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
-    return build(config.learner, "learner", env=env, in_keys=[*config.method.observes, *config.also_observes], **given)
-
-
-def trains_guides(config: DictConfig) -> bool:
-    """Whether the learner of a configuration asks for guides, to improve them."""
-    return learner_kind(config) == "guides"
+    arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
+    keys = [*config.method.observes, *config.also_observes]
+    return build(config.learner, "learner", env=env, in_keys=keys, **arguments)
 
 
 def learner_kind(config: DictConfig) -> str:
-    """What the learner of a configuration does, going by what it asks for.
+    """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`."""
+    kind: str = getattr(_target(config.learner.get("_target_"), "learner"), "kind", "agent")
+    return kind
 
-    Returns:
-        `guides` if it improves guides beside an agent, `imitation` if it asks where the advice is, to imitate it, or
-        else `agent`.
-    """
-    asked = takes(_target(config.learner.get("_target_"), "learner"))
-    return "guides" if "guides" in asked else "imitation" if "advice_key" in asked else "agent"
+
+def trains_guides(config: DictConfig) -> bool:
+    """Return whether the learner of a configuration trains guides besides the agent."""
+    return learner_kind(config) == "guides"
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
-    """The guides of a configuration by name, in its order.
+    """Return the guides of a configuration by name.
 
     Raises:
-        UserError: as `build`, and if there is none, or one without a name.
+        UserError: as `build`, and if there is no guide, or one without a name.
     """
     if "_target_" in config.guide:
         raise UserError(
-            "guide: a guide needs a name, so that others can stand beside it: let its file begin with "
+            "guide: a guide needs a name, because there may be several: begin its file with "
             "# @package guide.NAME, or give +guide.NAME._target_"
         )
     if not config.guide:

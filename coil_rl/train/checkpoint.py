@@ -1,4 +1,4 @@
-"""Files that hold states: whole, unaltered and free of code, or refused."""
+"""Checkpoint files: complete, unaltered and free of code, or refused."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ DIGITS = 64  # of a SHA-256
 
 
 def save(state: Any, path: Path) -> None:
-    """Write a state so that at every moment either the old file or the new one is there.
+    """Write a state atomically.
 
-    The file is what `torch.save` makes, a zip archive, with the SHA-256 of all before it as the archive's comment:
-    `torch.load` still reads it, and the sum cannot be another file's.
+    The file is the zip archive of `torch.save` with the SHA-256 of its content as the archive's comment, so that
+    `torch.load` can read it too.
     """
     content = _content(state)
     with whole_file(path) as unfinished:
@@ -29,26 +29,24 @@ def save(state: Any, path: Path) -> None:
 
 
 def load(path: Path, device: str = "cpu") -> Any:
-    """Read a state, running no code from the file.
+    """Read a state without running code from the file.
 
     Raises:
-        UserError: if there is no such file, or it is not to a byte what `save` wrote.
+        UserError: if there is no such file, or it is not exactly what `save` wrote.
     """
     if not path.is_file():
         raise UserError(f"there is no file {path}; give the folder of a run that coil-train has finished")
     content = path.read_bytes()
-    if _sum(content[:-DIGITS]) != content[-DIGITS:]:
-        raise UserError(f"{path} is not a whole checkpoint: its checksum does not fit; train again or use another")
+    if _checksum(content[:-DIGITS]) != content[-DIGITS:]:
+        raise UserError(f"{path} is damaged: its checksum is wrong; train again or use another")
     try:
         return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
     except Exception as error:
-        raise UserError(
-            f"{path} is not a whole checkpoint ({type(error).__name__}); train again or use another"
-        ) from error
+        raise UserError(f"{path} is damaged ({type(error).__name__}); train again or use another") from error
 
 
 def save_newest(state: Any, folder: Path) -> None:
-    """Write a run's checkpoint and keep the one before it; at every moment one of the two is whole."""
+    """Write the checkpoint of a run and keep the previous one; at any moment one of the two is intact."""
     content = _content(state)
     with whole_file(folder / NEWEST) as unfinished:
         unfinished.write_bytes(content)
@@ -57,15 +55,13 @@ def save_newest(state: Any, folder: Path) -> None:
 
 
 def load_newest(folder: Path) -> Any | None:
-    """A run's newest checkpoint; if it is broken, the one before it, which then takes its name.
-
-    Says on standard error if it had to go back.
+    """Return the newest checkpoint of a run, or the previous one if it is damaged, which is reported on standard error.
 
     Returns:
-        The state; None if the run was stopped before its first checkpoint.
+        The state; None before the first checkpoint.
 
     Raises:
-        UserError: if what there is cannot be used.
+        UserError: if both are damaged.
     """
     newest, previous = folder / NEWEST, folder / PREVIOUS
     if not newest.exists() and not previous.exists():
@@ -78,11 +74,11 @@ def load_newest(folder: Path) -> Any | None:
             state = load(previous)
         except UserError:
             raise UserError(
-                f"neither {newest} nor {previous} is a whole checkpoint; "
+                f"both {newest} and {previous} are damaged; "
                 "put one of them back from a copy, or train again in another folder"
             ) from error
-    print(f"{reason.split(';')[0]}; going back to {previous.name}", file=sys.stderr)
-    # Or else the next rotation would replace the good one by the broken one.
+    print(f"{reason.split(';')[0]}; using {previous.name}", file=sys.stderr)
+    # Otherwise the next checkpoint would replace the intact file by the damaged one.
     previous.replace(newest)
     folder_to_disk(folder)
     return state
@@ -91,10 +87,10 @@ def load_newest(folder: Path) -> Any | None:
 def _content(state: Any) -> bytes:
     buffer = io.BytesIO()
     torch.save(state, buffer)
-    # The last two bytes of an archive without a comment are the comment's length.
+    # The last two bytes of an archive without a comment are the length of the comment.
     archive = buffer.getvalue()[:-2] + DIGITS.to_bytes(2, "little")
-    return archive + _sum(archive)
+    return archive + _checksum(archive)
 
 
-def _sum(content: bytes) -> bytes:
+def _checksum(content: bytes) -> bytes:
     return hashlib.sha256(content).hexdigest().encode()

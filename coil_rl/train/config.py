@@ -1,93 +1,114 @@
-"""The root of every program's configuration, typed, so that a misspelt top-level key fails at once."""
+"""Typed root configurations of the programs, and the fingerprint of a run.
+
+The types of the fields are checked by OmegaConf, their ranges by pydantic (`coil_rl.train.check.check_values`).
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
-from omegaconf import MISSING, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
+from pydantic import ConfigDict, Field, GetPydanticSchema
+from pydantic_core import core_schema
 
-from coil_rl.train.fingerprint import fingerprint
-
-# Two runs started within a microsecond of each other still get folders of their own.
-OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
-# What a table has entries for, as part of a label: ${names:${degrade},intact}
-OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, table)) or none, replace=True)
-# What a run is, as part of the name of its folder: ${label}_seed${seed}_${fingerprint:}
-OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
+LARGEST = 2**63 - 1
+# Keys in which two runs with the same numbers may differ.
+IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults")
 
 
-def agent_label(*, _root_: Any) -> str:
-    """What an agent is called: by its method, and by its learner where that is neither PPO nor the method's own."""
-    name = str(_root_.method.name)
-    if OmegaConf.is_missing(_root_, "learner") or _root_.method.learner != "agent":
-        return name
-    kind = str(_root_.learner.get("_target_", "")).rpartition(".")[2].lower()
-    if kind in ("", "ppo"):
-        return name
-    return kind if name == "ppo" else f"{name}_{kind}"
+def one_of(*choices: str) -> GetPydanticSchema:
+    """Return the schema of a string with a few possible values; OmegaConf supports no `Literal`."""
+    return GetPydanticSchema(lambda *_: core_schema.literal_schema(list(choices)))
 
 
-OmegaConf.register_new_resolver("agent_label", agent_label, replace=True)
+# Most upper limits only prevent that a typing error fills the memory.
+Seed = Annotated[int, Field(ge=0, le=LARGEST)]
+Positive = Annotated[int, Field(ge=1, le=LARGEST)]
+Threads = Annotated[int, Field(ge=1, le=1024)]
+Cars = Annotated[int, Field(ge=1, le=2**20)]
+Steps = Annotated[int, Field(ge=1, le=2**16)]
+Repeats = Annotated[int, Field(ge=1, le=10_000)]
+WhichPolicy = Annotated[str, one_of("last", "best")]
 
 
-@dataclass
-class Budget:
-    """How much experience a run collects, and how much of it between two updates."""
+class NodeConfig:
+    """Base of all typed nodes."""
 
-    frames: int = 1
-    cars: int = MISSING
-    steps: int = 1
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
 
 @dataclass
-class Evaluation:
-    """How a policy is judged."""
+class BudgetConfig(NodeConfig):
+    """Amount of experience: frames in total, and cars and steps per batch."""
+
+    frames: Positive = 1
+    cars: Cars = MISSING
+    steps: Steps = 1
+
+
+@dataclass
+class EvaluationConfig(NodeConfig):
+    """Evaluation of a policy."""
 
     env: dict[str, Any] = field(default_factory=dict)
     advice: dict[str, Any] = field(default_factory=dict)
-    repeats: int = 5
-    policy: str = "last"
-    guides: str = "phases"
+    repeats: Repeats = 5
+    policy: WhichPolicy = "last"
+    guides: Annotated[str, one_of("phases", "ends")] = "phases"
     gif: bool = True
 
 
 @dataclass
-class Method:
-    """What the agent learns from, if there is an agent, and by what kind of learner."""
+class MethodConfig(NodeConfig):
+    """Observations and transforms of the agent, and the kind of its learner. `observes: null` means no agent."""
 
     name: str = MISSING
     observes: list[str] | None = MISSING
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
-    learner: str = "agent"
+    learner: Annotated[str, one_of("agent", "imitation", "guides")] = "agent"
 
 
 @dataclass
-class Common:
-    """What every program that drives has."""
+class ProgramConfig(NodeConfig):
+    """Base of the root configurations: Hydra's help text and callback of this project."""
 
-    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
+    defaults: list[Any] = field(
+        default_factory=lambda: [
+            {"override /hydra/help": "program"},
+            {"override /hydra/callbacks": "program"},
+            "_self_",
+        ]
+    )
+
+
+@dataclass
+class DrivingConfig(ProgramConfig):
+    """Configuration that all programs share that drive cars."""
+
     preset: dict[str, Any] = MISSING
     track: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
     degrade: dict[str, Any] = field(default_factory=dict)
-    method: Method = field(default_factory=Method)
+    method: MethodConfig = field(default_factory=MethodConfig)
     also_observes: list[str] = field(default_factory=list)
     action: dict[str, Any] = field(default_factory=dict)
-    budget: Budget = field(default_factory=Budget)
-    evaluation: Evaluation = field(default_factory=Evaluation)
-    seed: int = 0
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    seed: Seed = 0
     device: str = "cpu"
-    threads: int = 2
+    threads: Threads = 2
     run_dir: str = MISSING
 
 
 @dataclass
-class Train(Common):
+class TrainConfig(DrivingConfig):
     """Configuration of `coil-train`."""
 
     label: str = MISSING
@@ -95,71 +116,31 @@ class Train(Common):
     logger: dict[str, Any] | None = None
     proxy: dict[str, Any] = field(default_factory=dict)
     watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
-    checkpoint_every: int = 10
-    existing: str = "refuse"
+    checkpoint_every: Positive = 10
+    existing: Annotated[str, one_of("refuse", "resume")] = "refuse"
     resume: str | None = None
 
 
 @dataclass
-class Evaluate(Common):
+class EvaluateConfig(DrivingConfig):
     """Configuration of `coil-evaluate`."""
 
     run: str | None = None
 
 
 @dataclass
-class Report:
-    """Configuration of `coil-report`."""
-
-    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
-    folder: Any = MISSING
-    actions: str = "deterministic"
-    against: str | None = None
-    resamples: int = 2000
-    seed: int = 0
-
-
-@dataclass
-class Listen(Common):
+class ListenConfig(DrivingConfig):
     """Configuration of `coil-listen`."""
 
     run: str = MISSING
-    donors: int = 16
-    turn_radius: float = 10.0
-    approach: float = 4.0
-    bin: float = 1.0
+    donors: Repeats = 16
+    turn_radius: Annotated[float, Field(ge=0.5, le=1000)] = 10.0
+    approach: Annotated[float, Field(ge=0.1, le=100)] = 4.0
+    bin: Annotated[float, Field(ge=0.1, le=100)] = 1.0
 
 
 @dataclass
-class Replay:
-    """Configuration of `coil-replay`."""
-
-    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
-    recording: Any = MISSING
-    runs: list[str] = field(default_factory=list)
-    policy: str = "last"
-    strict: bool = False
-    preset: dict[str, Any] = MISSING
-    env: dict[str, Any] = MISSING
-    guide: dict[str, Any] = field(default_factory=dict)
-    seed: int = 0
-    device: str = "cpu"
-    threads: int = 1
-    run_dir: str = MISSING
-
-
-@dataclass
-class RunsBudget:
-    """How many runs results are made from, and what they are given."""
-
-    seeds: int = MISSING
-    note: str | None = None
-    every: list[str] = field(default_factory=list)
-    only: dict[str, list[str]] = field(default_factory=dict)
-
-
-@dataclass
-class Robot(Common):
+class RobotConfig(DrivingConfig):
     """Configuration of `coil-robot`."""
 
     steps: list[str] = MISSING
@@ -170,18 +151,55 @@ class Robot(Common):
 
 
 @dataclass
-class Reproduce:
+class ReplayConfig(ProgramConfig):
+    """Configuration of `coil-replay`."""
+
+    recording: Any = MISSING
+    runs: list[str] = field(default_factory=list)
+    policy: WhichPolicy = "last"
+    strict: bool = False
+    preset: dict[str, Any] = MISSING
+    env: dict[str, Any] = MISSING
+    guide: dict[str, Any] = field(default_factory=dict)
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 1
+    run_dir: str = MISSING
+
+
+@dataclass
+class ReportConfig(ProgramConfig):
+    """Configuration of `coil-report`."""
+
+    folder: Any = MISSING
+    actions: Annotated[str, one_of("deterministic", "sampled", "both")] = "deterministic"
+    against: str | None = None
+    resamples: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
+    seed: Seed = 0
+
+
+@dataclass
+class RunsBudgetConfig(NodeConfig):
+    """Training runs of `coil-reproduce`: number of seeds, and overrides of all runs and of single experiments."""
+
+    seeds: Annotated[int, Field(ge=1)] = MISSING
+    note: str | None = None
+    every: list[str] = field(default_factory=list)
+    only: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass
+class ReproduceConfig(ProgramConfig):
     """Configuration of `coil-reproduce`."""
 
-    defaults: list[Any] = field(default_factory=lambda: [{"override /hydra/callbacks": "refusal"}, "_self_"])
     table: Any = None
     figure: Any = None
     claim: Any = None
     all: bool = False
     budget: str = MISSING
-    budgets: dict[str, RunsBudget] = MISSING
+    budgets: dict[str, RunsBudgetConfig] = MISSING
     aliases: dict[str, str] = field(default_factory=dict)
-    threads: int = 1
+    threads: Threads = 1
     train: list[str] = field(default_factory=list)
     known_problems: list[str] = field(default_factory=list)
     not_reproduced: list[str] = field(default_factory=list)
@@ -189,12 +207,47 @@ class Reproduce:
     run_dir: str = MISSING
 
 
-REFUSAL = {"refusal": {"_target_": "coil_rl.programs.refusal.Refusal"}}
-ConfigStore.instance().store(group="hydra/callbacks", name="refusal", node=REFUSAL)
-ConfigStore.instance().store(name="schema", node=Train)
-ConfigStore.instance().store(name="evaluate_schema", node=Evaluate)
-ConfigStore.instance().store(name="report_schema", node=Report)
-ConfigStore.instance().store(name="listen_schema", node=Listen)
-ConfigStore.instance().store(name="replay_schema", node=Replay)
-ConfigStore.instance().store(name="robot_schema", node=Robot)
-ConfigStore.instance().store(name="reproduce_schema", node=Reproduce)
+def fingerprint(config: DictConfig) -> str:
+    """Return ten hexadecimal digits that identify the numbers of a training run.
+
+    Args:
+        config: of a run, also as Hydra composes it, with the node `hydra` and interpolations.
+    """
+    identity: dict[str, Any] = {
+        str(key): OmegaConf.to_container(config[key], resolve=True) if OmegaConf.is_config(config[key]) else config[key]
+        for key in sorted(map(str, config))
+        if key not in (*IGNORED_KEYS, "hydra")
+    }
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def agent_label(config: DictConfig) -> str:
+    """Return the default label of a run: the method, and the learner unless it is PPO or the method's own."""
+    name = str(config.method.name)
+    if OmegaConf.is_missing(config, "learner") or config.method.learner != "agent":
+        return name
+    learner = str(config.learner.get("_target_", "")).rpartition(".")[2].lower()
+    if learner in ("", "ppo"):
+        return name
+    return learner if name == "ppo" else f"{name}_{learner}"
+
+
+# Process id in run folders: two runs may start within a microsecond.
+OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
+# Keys of a table in a label: ${names:${degrade},intact}
+OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, table)) or none, replace=True)
+# ${label}_seed${seed}_${fingerprint:}
+OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
+OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
+
+SCHEMAS = {
+    "schema": TrainConfig,
+    "evaluate_schema": EvaluateConfig,
+    "report_schema": ReportConfig,
+    "listen_schema": ListenConfig,
+    "replay_schema": ReplayConfig,
+    "robot_schema": RobotConfig,
+    "reproduce_schema": ReproduceConfig,
+}
+for _name, _schema in SCHEMAS.items():
+    ConfigStore.instance().store(name=_name, node=_schema)

@@ -19,8 +19,7 @@ from torch import nn
 from coil_rl.files import whole_folder
 from coil_rl.train import load
 from coil_rl.train.build import build_env, build_guides, build_learner
-from coil_rl.train.config import Train
-from coil_rl.train.fingerprint import fingerprint
+from coil_rl.train.config import TrainConfig, fingerprint
 
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
@@ -45,7 +44,7 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
         "evaluation": {"env": resolved["evaluation"]["env"], "gif": False},
         "existing": "resume",
     }
-    merged: Any = OmegaConf.merge(OmegaConf.structured(Train), values)
+    merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)
     merged.run_dir = f"{proxy['folder']}/{name}_{fingerprint(merged)}"
     return merged
 

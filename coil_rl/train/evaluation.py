@@ -1,4 +1,4 @@
-"""Drives a policy until every row of an env has finished one episode, and measures how it went."""
+"""Evaluation of policies: one episode on every row of an env, its measures, and their means."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
-PER_STEP = "per_step_"  # and the name of a task
+PER_STEP = "per_step_"  # followed by the name of a task
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """What a policy did.
+    """Episodes of a policy, one per car.
 
     Attributes:
-        episodes: one row per car: `track`, `reward` (sum), `steps`, `lap_time` s (mean of the completed laps, NaN
-            without one), `laps`, `completed`, `crashed`, `smoothness` (mean |a - a_avg|) and `clearance` m (smallest).
-            An env without `info` gives `reward` and `steps` only, one that says under `info` in which `task` a step was
-            paid also `steps_TASK` and `reward_TASK`, the parts that fell to each.
-        lines: the positions of each car, [steps, 2] m.
-        smoothness: |a - a_avg| of each car at each of these, [steps].
+        episodes: `track`, `reward` (sum), `steps`, `lap_time` s (mean of the completed laps, NaN without one), `laps`,
+            `completed`, `crashed`, `smoothness` (mean |a - a_avg|) and `clearance` m (minimum). An env without `info`
+            gives `reward` and `steps` only, one with tasks (`info`, `task`) also `steps_TASK` and `reward_TASK`.
+        lines: positions of each car, [steps, 2] m.
+        smoothness: |a - a_avg| of each car, [steps].
     """
 
     episodes: list[dict[str, Any]]
@@ -39,16 +38,16 @@ class EvaluationResult:
 
     @property
     def mean_reward(self) -> float:
-        """Of an episode."""
+        """Mean of the episodes."""
         return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
 
     def split(self, parts: int) -> list[EvaluationResult]:
-        """As many drives, of equally many cars each, in their order."""
+        """Return consecutive parts of equally many cars."""
         size = len(self.episodes) // parts
         return [self[end - size : end] for end in range(size, len(self.episodes) + 1, size)]
 
     def __getitem__(self, cars: slice) -> EvaluationResult:
-        """The drive of some cars."""
+        """Return the episodes of some cars."""
         return EvaluationResult(self.episodes[cars], self.lines[cars], self.smoothness[cars])
 
 
@@ -61,106 +60,105 @@ def evaluate_policy(
     names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> EvaluationResult:
-    """One episode of every row of the env.
+    """Run one episode on every row of an env.
 
     Args:
-        env: batched env, [B]; its transforms go into evaluation mode.
+        env: batched env, [B]; its transforms are set to evaluation mode.
         policy: writes the action.
-        sampled: draw actions instead of taking the deterministic one; bool [B] for which rows.
+        sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B] for each row.
         names: of the tracks.
-        tick: called every step.
+        tick: called after every step.
     """
     history: list[dict[str, Tensor]] = []
     carrier = env.eval().reset()
     running = torch.ones_like(env.full_done_spec["done"].zero())
     while True:
         step = env.step(_act(policy, carrier, sampled))
-        history.append(_notes(step["next"]) | {"running": running})
+        history.append(_record(step["next"]) | {"running": running})
         running = running & ~step["next", "done"]
-        # To ask costs a wait for the device.
+        # The test waits for the device.
         if len(history) % 8 == 0 and not running.any():
             break
         carrier = env.step_mdp(step)
         if tick is not None:
             tick()
-    notes = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
-    return _measure(notes, names)
+    steps = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
+    return _measure(steps, names)
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor) -> TensorDictBase:
     if isinstance(sampled, Tensor):
         drawn = _act(policy, carrier, True)["action"]
-        taken = _act(policy, carrier, False)
-        return taken.set("action", torch.where(expand_as_right(sampled, drawn), drawn, taken["action"]))
+        deterministic = _act(policy, carrier, False)
+        return deterministic.set("action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"]))
     with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
         return policy(carrier)
 
 
-def _notes(after: TensorDictBase) -> dict[str, Tensor]:
-    notes = {"reward": after["reward"]}
+def _record(after: TensorDictBase) -> dict[str, Tensor]:
+    record = {"reward": after["reward"]}
     if "info" in after:
         info = after["info"]
-        notes |= {key: info[key] for key in ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")}
-        notes["finished"] = after["terminated"] & ~info["crashed"]
+        record |= {key: info[key] for key in ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")}
+        record["finished"] = after["terminated"] & ~info["crashed"]
         if "task" in info:
-            notes |= {f"steps_{name}": paid for name, paid in info["task"].items()}
-    return notes
+            record |= {f"steps_{name}": active for name, active in info["task"].items()}
+    return record
 
 
-def _measure(notes: dict[str, NDArray[np.float64]], names: Sequence[str]) -> EvaluationResult:
-    running = notes["running"].astype(bool)
+def _measure(steps: dict[str, NDArray[np.float64]], names: Sequence[str]) -> EvaluationResult:
     episodes, lines, smoothness = [], [], []
-    for car, on in enumerate(running.T):
-        row: dict[str, Any] = {"reward": notes["reward"][on, car].sum(), "steps": int(on.sum())}
-        if "track" in notes:
-            track = int(notes["track"][0, car])
-            laps = notes["lap_time"][on, car]
-            laps = laps[laps > 0]
+    for car, running in enumerate(steps["running"].astype(bool).T):
+        own = {key: values[running, car] for key, values in steps.items()}
+        row: dict[str, Any] = {"reward": own["reward"].sum(), "steps": int(running.sum())}
+        if "track" in own:
+            track = int(own["track"][0])
+            laps = own["lap_time"][own["lap_time"] > 0]
             row |= {
                 "track": names[track] if names else str(track),
                 "laps": len(laps),
                 "lap_time": float(laps.mean()) if len(laps) else float("nan"),
-                "completed": bool(notes["finished"][on, car].any()),
-                "crashed": bool(notes["crashed"][on, car].any()),
-                "smoothness": float(notes["smoothness"][on, car].mean()),
-                "clearance": float(notes["clearance"][on, car].min()),
+                "completed": bool(own["finished"].any()),
+                "crashed": bool(own["crashed"].any()),
+                "smoothness": float(own["smoothness"].mean()),
+                "clearance": float(own["clearance"].min()),
             }
-            lines.append(notes["pose"][on, car, :2])
-            smoothness.append(notes["smoothness"][on, car])
-            for key in notes:
+            lines.append(own["pose"][:, :2])
+            smoothness.append(own["smoothness"])
+            for key, active in own.items():
                 if key.startswith("steps_"):
-                    paid = notes[key][on, car]
-                    row |= {key: int(paid.sum()), f"reward_{key[6:]}": (paid * notes["reward"][on, car]).sum()}
+                    row |= {key: int(active.sum()), f"reward_{key[6:]}": (active * own["reward"]).sum()}
         episodes.append(row)
     return EvaluationResult(episodes, lines, smoothness)
 
 
 def summarise(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Means per track in the order they come, then the mean over tracks as the row `mean`.
+    """Return the means of each track in the order of the episodes, then their mean as the track `mean`.
 
-    `completed` and `crashed` become shares, `lap_time` is over the episodes that have one, and `clearance` is the
-    smallest of all. Where there are tasks, `per_step_TASK` is the reward of a step in it, over all steps of a track.
+    `completed` and `crashed` become shares, `lap_time` is the mean of the episodes that have one, and `clearance` the
+    minimum. With tasks, `per_step_TASK` is the mean reward of a step in a task, over all steps on a track.
     """
     tracks = {episode["track"]: [e for e in episodes if e["track"] == episode["track"]] for episode in episodes}
-    rows = [_mean(track, alike) | _per_step(alike) for track, alike in tracks.items()]
-    tasks = {key: _mean_of_known([row[key] for row in rows]) for key in rows[0] if key.startswith(PER_STEP)}
+    rows = [_mean(track, group) | _per_step(group) for track, group in tracks.items()]
+    tasks = {key: _nan_mean([row[key] for row in rows]) for key in rows[0] if key.startswith(PER_STEP)}
     return [*rows, _mean("mean", rows) | tasks]
 
 
 def _per_step(episodes: Sequence[dict[str, Any]]) -> dict[str, float]:
-    tasks = [key.removeprefix("steps_") for key in episodes[0] if key.startswith("steps_")]
-    steps = {task: sum(row[f"steps_{task}"] for row in episodes) for task in tasks}
-    paid = {task: sum(row[f"reward_{task}"] for row in episodes) for task in tasks}
-    return {f"{PER_STEP}{task}": paid[task] / steps[task] if steps[task] else float("nan") for task in tasks}
+    means = {}
+    for task in (key.removeprefix("steps_") for key in episodes[0] if key.startswith("steps_")):
+        steps, reward = (sum(row[f"{key}_{task}"] for row in episodes) for key in ("steps", "reward"))
+        means[f"{PER_STEP}{task}"] = reward / steps if steps else float("nan")
+    return means
 
 
-def _mean_of_known(values: Sequence[float]) -> float:
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else float("nan")
+def _nan_mean(values: Sequence[float]) -> float:
+    numbers = [value for value in values if not np.isnan(value)]
+    return float(np.mean(numbers)) if numbers else float("nan")
 
 
 def _mean(track: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     columns = {key: np.array([row[key] for row in rows], dtype=float) for key in MEASURES}
     means = {key: float(values.mean()) for key, values in columns.items()}
-    means |= {"lap_time": _mean_of_known([row["lap_time"] for row in rows])}
+    means |= {"lap_time": _nan_mean([row["lap_time"] for row in rows])}
     return {"track": track, **means, "clearance": float(columns["clearance"].min())}

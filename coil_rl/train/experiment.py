@@ -1,8 +1,10 @@
-"""The loop of a run: collect, update, log, keep the best policy, checkpoint."""
+"""The training loop: collect a batch, update, log, keep the best policy, save checkpoints."""
 
 from __future__ import annotations
 
+import csv
 import math
+import os
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -18,9 +20,8 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.errors import UserError
+from coil_rl.files import whole_file
 from coil_rl.train import checkpoint
-from coil_rl.train.finite import check_losses, check_state
-from coil_rl.train.metrics import Metrics
 from coil_rl.train.rollout import Rollout
 
 
@@ -36,53 +37,46 @@ class Learner(Protocol):
     policy: TensorDictModuleBase
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Learn from a batch [B, T]; returns what is worth logging."""
+        """Learn from a batch [B, T] and return metrics."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the next update depends on besides its batch."""
+        """Return everything that the next update depends on, except its batch."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take over a state of `state_dict`."""
+        """Restore a state of `state_dict`."""
 
 
 class Probe(Protocol):
-    """What is measured now and then, because it takes long.
+    """Expensive measurement before the first update and after the last one."""
 
-    Attributes:
-        each_phase: whether it is measured each time that the learner says `guides_changed`.
-    """
-
-    each_phase: bool
-
-    @property
-    def unknown(self) -> dict[str, float]:
-        """NaN under each name that a call gives."""
+    each_phase: bool  # also after each update with the metric `guides_changed`
+    names: list[str]  # of the numbers
 
     def __call__(self) -> dict[str, float]:
-        """Measure."""
+        """Return the numbers by name."""
 
 
 class Experiment:
     """One training run in one folder.
 
-    It leaves there `metrics.csv` (one row an update), `checkpoint.pt` (everything a later process needs to go on),
-    `checkpoint_previous.pt` (the one before it), `policy_best.pt` and `policy_last.pt`. After `resume` in a new process
-    it ends on a CPU with the same files, to the bit, wherever the process before it was killed.
+    Files: `metrics.csv` (a row per update), `checkpoint.pt` (the complete state), `checkpoint_previous.pt`,
+    `policy_best.pt` and `policy_last.pt`. A run that was killed at any moment and resumed in a new process ends with
+    the same files, to the bit on a CPU.
 
     Args:
-        learner: learns.
-        rollout: collects; its env must write `episode_reward` (TorchRL's RewardSum). Where something is added to the
-            reward for learning only, the env must write the task's as `task_reward`.
-        frames: length of the run; the last batch may go beyond it.
+        learner: see `Learner`.
+        rollout: its env must write `episode_reward` (TorchRL's RewardSum), and `task_reward` if a transform adds to
+            the reward of the task.
+        frames: length of the run; the last batch may exceed it.
         folder: exists.
-        logger: any TorchRL logger, besides the CSV.
-        watch: name to key of entries logged as means over finished episodes ("episode") or over all steps ("step").
+        logger: any TorchRL logger, in addition to the CSV file.
+        watch: name to key of further entries to log, as means over finished episodes ("episode") or over all steps
+            ("step").
         checkpoint_every: updates between two checkpoints.
-        probe: looks at what learns besides the agent before the first update, at the end and, if it asks for it, when
-            the learner says `guides_changed`.
+        probe: see `Probe`.
     """
 
-    EPISODES = 100  # the return is a mean over so many finished episodes
+    EPISODES = 100  # the return is the mean over this many finished episodes
 
     def __init__(
         self,
@@ -108,44 +102,37 @@ class Experiment:
         self.rows: list[dict[str, float]] = []
 
     def resume(self) -> None:
-        """Go on where the folder's last whole checkpoint was written, or from the beginning if there is none.
-
-        Raises:
-            UserError: if no checkpoint there can be used, or rows of `metrics.csv` are gone.
-        """
+        """Continue from the last intact checkpoint of the folder, or from the beginning if there is none yet."""
         state = checkpoint.load_newest(self.folder)
         if state is not None:
             self.load_state_dict(state)
-        self.rows = self.metrics.keep(self.updates)
+        self.rows = self.metrics.truncate(self.updates)
         where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
-        print(f"{self.folder} goes on {where}", file=sys.stderr)
+        print(f"{self.folder} continues {where}", file=sys.stderr)
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
-        """Train to the end and return the rows of `metrics.csv`.
-
-        Args:
-            guide_return: shown beside the agent's, to compare.
+        """Train to the end and return the rows of `metrics.csv`; `guide_return` is shown beside the agent's.
 
         Raises:
-            UserError: at the first number from the env, the losses or the weights that is NaN.
+            UserError: if a number of the env, the losses or the weights is NaN.
         """
         updates, frames = math.ceil(self.frames / self.rollout.frames), self.rollout.frames
         with tqdm(
             total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
         ) as bar:
             while self.updates < updates:
-                before = self._probed(self.updates == 0)
+                before = self._probe(self.updates == 0)
                 row = self.update(self.updates / updates)
                 changed = self.probe is not None and self.probe.each_phase and row["learner/guides_changed"]
-                after = self._probed(self.updates == updates or bool(changed))
+                after = self._probe(self.updates == updates or bool(changed))
                 row |= {name: before[name] if math.isnan(value) else value for name, value in after.items()}
                 self.rows.append(row)
                 self.metrics.append(row)
                 bar.update(frames)
-                shown = {"return": f"{row['train/return']:.0f}"}
+                postfix = {"return": f"{row['train/return']:.0f}"}
                 if guide_return is not None:
-                    shown["guide"] = f"{guide_return:.0f}"
-                bar.set_postfix(shown)
+                    postfix["guide"] = f"{guide_return:.0f}"
+                bar.set_postfix(postfix)
                 if self.updates % self.checkpoint_every == 0 or self.updates == updates:
                     self._save()
         policy = self.learner.policy.state_dict()
@@ -155,39 +142,40 @@ class Experiment:
         return self.rows
 
     def update(self, progress: float) -> dict[str, float]:
-        """Collect one batch and learn from it; returns the row for the log."""
-        with self._saying_how_to_go_on():
+        """Collect one batch, learn from it and return the row of the log."""
+        with self._resume_hint():
             batch = self.rollout.collect(progress)
         row = self._describe(batch)
         if len(self.returns) == self.EPISODES and row["train/return"] > self.best:
-            # The policy that collected this batch, not the one that learned from it.
+            # The policy that collected this batch, before the update.
             self.best = row["train/return"]
             checkpoint.save(self.learner.policy.state_dict(), self.folder / "policy_best.pt")
         learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
         self.updates += 1
-        with self._saying_how_to_go_on():
+        with self._resume_hint():
             check_losses(learned, self.updates)
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
-    def _probed(self, due: bool) -> dict[str, float]:
+    def _probe(self, due: bool) -> dict[str, float]:
+        """Return the numbers of the probe, or NaN if they are not due."""
         if self.probe is None:
             return {}
-        return self.probe() if due else self.probe.unknown
+        return self.probe() if due else dict.fromkeys(self.probe.names, math.nan)
 
     @contextmanager
-    def _saying_how_to_go_on(self) -> Iterator[None]:
+    def _resume_hint(self) -> Iterator[None]:
         try:
             yield
         except UserError as error:
             raise UserError(
-                f"{error}; the last good checkpoint is kept: mend the cause and go on with "
+                f"{error}; the last good checkpoint is kept: correct the cause and continue with "
                 f"coil-train resume={self.folder}, or train again with other values"
             ) from error
 
     def _save(self) -> None:
         state = self.state_dict()
-        with self._saying_how_to_go_on():
-            check_state(state["learner"], self.updates)
+        with self._resume_hint():
+            check_weights(state["learner"], self.updates)
         self.metrics.flush()
         checkpoint.save_newest(state, self.folder)
 
@@ -207,7 +195,7 @@ class Experiment:
         return row
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything the rest of the run depends on."""
+        """Return everything that the rest of the run depends on."""
         return {
             "learner": self.learner.state_dict(),
             "rollout": self.rollout.state_dict(),
@@ -219,7 +207,7 @@ class Experiment:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state of `state_dict`."""
+        """Restore a state of `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
         self.updates, self.best = state["updates"], state["best"]
@@ -230,7 +218,79 @@ class Experiment:
 
 
 def watched_keys(env: EnvBase, watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:
-    """The entries that a rollout must keep for `Experiment`, besides those of the learner."""
+    """Return the entries that `Experiment` needs in a rollout, besides those of the learner."""
     watched = (tuple(key) for group in watch.values() for key in group.values())
     task = [("task_reward",)] if "task_reward" in env.observation_spec else []
     return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)]
+
+
+def check_losses(values: Mapping[str, float], update: int) -> None:
+    """Raise a `UserError` if a metric of an update is NaN or infinite."""
+    for name, value in values.items():
+        if not math.isfinite(value):
+            raise UserError(f"{name} is {value} in update {update}")
+
+
+def check_weights(state: Any, update: int, name: str = "learner") -> None:
+    """Raise a `UserError` if a tensor of a nested state holds NaN; bounds may be infinite."""
+    if isinstance(state, Mapping):
+        for key, value in state.items():
+            check_weights(value, update, f"{name}/{key}")
+    elif isinstance(state, torch.Tensor) and state.is_floating_point() and state.isnan().any():
+        raise UserError(f"{name} is nan after update {update}")
+
+
+class Metrics:
+    """Log of a run: rows in a CSV file and in any TorchRL logger.
+
+    After a resume the rows since the checkpoint are written again. They are removed from the CSV file and from
+    TensorBoard first; other loggers may show a point twice, with the same value.
+    """
+
+    def __init__(self, path: Path, logger: Any | None = None) -> None:
+        self.path, self.logger = path, logger
+        writer = getattr(logger, "experiment", None)
+        self.tensorboard: Any | None = writer if hasattr(writer, "purge_step") else None
+
+    def append(self, row: dict[str, float]) -> None:
+        """Log a row; `frames` is the step of the logger."""
+        first = not self.path.exists()
+        with self.path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if first:
+                writer.writeheader()
+            writer.writerow(row)
+        if self.logger is not None:
+            for name, value in row.items():
+                self.logger.log_scalar(name, value, step=int(row["frames"]))
+
+    def flush(self) -> None:
+        """Wait until all rows are on the disk."""
+        if self.path.exists():
+            with self.path.open("a") as file:
+                os.fsync(file.fileno())
+        if self.tensorboard is not None:
+            self.tensorboard.flush()
+
+    def truncate(self, count: int) -> list[dict[str, float]]:
+        """Remove all rows except the first ones and return these; raise a `UserError` if there are fewer."""
+        lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
+        if len(lines) <= count and count:
+            raise UserError(
+                f"{self.path} has {max(len(lines) - 1, 0)} of the {count} rows that belong to the checkpoint; "
+                "put the whole file back, or train again in another folder"
+            )
+        rows: list[dict[str, float]] = []
+        if count:
+            with whole_file(self.path) as unfinished:
+                unfinished.write_bytes(b"".join(lines[: count + 1]))
+            with self.path.open(newline="") as file:
+                rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        else:
+            self.path.unlink(missing_ok=True)
+        if self.logger is not None and self.tensorboard is not None:
+            self.tensorboard.close()
+            frames = int(rows[-1]["frames"]) if rows else 0
+            self.tensorboard = type(self.tensorboard)(self.tensorboard.log_dir, purge_step=frames + 1)
+            self.logger.experiment = self.tensorboard
+        return rows

@@ -1,4 +1,4 @@
-"""Collects experience: steps an env with a policy and remembers where it stopped."""
+"""Collection of experience: batches of consecutive steps of an env and a policy."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.train.finite import check_batch
+from coil_rl.errors import UserError
 from coil_rl.transforms.guide_transform import GuideTransform
 
 
 class Rollout:
-    """Batches of consecutive steps of every row of an env, resetting each row that is done.
+    """Batches of consecutive steps of all rows of an env. A row that is done is reset.
 
     Args:
-        env: batched env; its transforms go into training mode.
-        policy: writes the action; it samples.
+        env: batched env; its transforms are set to training mode.
+        policy: writes the action; actions are sampled.
         steps: T, length of a batch.
-        keys: entries to keep, of those after a step as `("next", ...)`; all of them by default.
+        keys: entries to keep, those after a step as `("next", ...)`; all by default.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -44,18 +44,18 @@ class Rollout:
 
     @property
     def frames(self) -> int:
-        """Frames in a batch, B * T."""
+        """Number of frames in a batch, B * T."""
         return self.env.batch_size.numel() * self.steps
 
     @torch.no_grad()
     def collect(self, progress: float = 0.0) -> TensorDictBase:
-        """The next batch, [B, T].
+        """Return the next batch, [B, T].
 
         Args:
-            progress: share of the run that is over, for the schedules of transforms.
+            progress: finished share of the run in [0, 1], for the schedules of transforms.
 
         Raises:
-            UserError: if a number in it is NaN or infinite, naming the entry, the step and the row.
+            UserError: if a number is NaN or infinite, with its entry, step and row.
         """
         for transform in self.guided:
             transform.progress = progress
@@ -68,7 +68,7 @@ class Rollout:
                     for key in self.keys or step.keys(True, True):
                         columns.setdefault(key, []).append(step[key])
         except Exception:
-            # An env may break over the NaN that it wrote a step ago, and that NaN is what a person must hear of.
+            # NaN of an earlier step may be the cause.
             check_batch(self._stacked(columns), self.taken)
             check_batch(carrier.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0))
             raise
@@ -87,7 +87,7 @@ class Rollout:
         return batch
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the env and the collection stand."""
+        """Return the state of the env and of the collection."""
         env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         return {
             "env": env.state_dict(),
@@ -97,7 +97,7 @@ class Rollout:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a state of `state_dict`."""
+        """Restore a state of `state_dict`."""
         env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         env.load_state_dict(state["env"])
         if env is not self.env:
@@ -106,3 +106,31 @@ class Rollout:
         if carrier is not None:
             carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
         self.carrier, self.taken = carrier, state["taken"]
+
+
+def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
+    """Raise an error if a number of a batch is NaN or infinite. The check waits for the device once.
+
+    Args:
+        batch: [*B, T] consecutive steps of B cars.
+        steps: of each car before this batch.
+
+    Raises:
+        UserError: for the earliest such number, with its entry, step (from 1) and car (from 0).
+    """
+    floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
+    if not floats or torch.stack([value.isfinite().all() for value in floats.values()]).all():
+        return
+    errors = []
+    for order, (key, value) in enumerate(floats.items()):
+        if value.isfinite().all():
+            continue
+        rows = value.reshape(batch.shape[:-1].numel(), batch.shape[-1], -1)
+        t, car = (~rows.isfinite()).any(-1).T.nonzero()[0].tolist()
+        numbers = rows[car, t]
+        path = (key,) if isinstance(key, str) else key
+        # Entries before a step precede those after it.
+        place = (t, path[0] == "next", order)
+        errors.append((place, car, float(numbers[~numbers.isfinite()][0]), "/".join(path)))
+    (t, _, _), car, number, name = min(errors)
+    raise UserError(f"{name} is {number} at step {steps + t + 1} of car {car}")

@@ -1,33 +1,38 @@
-"""The folder of a run: who may write there, and the configuration that it keeps."""
+"""The folder of a run: its lock, configuration and software versions."""
 
 from __future__ import annotations
 
 import json
+import os
+import platform
+import subprocess
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+import yaml
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, sentence
 from coil_rl.files import remove_unfinished, whole_file, write_text
-from coil_rl.train.fingerprint import IGNORED_KEYS
-from coil_rl.train.load import read_config
-from coil_rl.train.versions import versions
+from coil_rl.train.config import IGNORED_KEYS, TrainConfig
+
+PACKAGES = (
+    "coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "stable-baselines3", "numpy", "scipy",
+    "matplotlib",
+)  # fmt: skip
 
 
 @contextmanager
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
-    """Keep every other process from writing a run there until the block ends, or this process does.
-
-    Args:
-        folder: of the run; it is made.
-        wait: for a process that has locked it, instead of refusing.
+    """Make a run folder and lock it until the block or this process ends.
 
     Raises:
-        UserError: if another process has locked the folder.
+        UserError: if another process holds the lock, unless `wait` is set.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -39,46 +44,93 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 
 def begin(config: DictConfig, folder: Path) -> None:
-    """Keep the configuration and the versions of a new run; from then on the folder holds one.
-
-    Raises:
-        UserError: if it already does.
-    """
+    """Write the versions and the configuration of a new run; raise a `UserError` if there is a run already."""
     if (folder / "config.yaml").exists():
         raise UserError(
-            f"{folder} already holds a run; go on with it by coil-train resume={folder}, "
+            f"{folder} already holds a run; resume it with coil-train resume={folder}, "
             "or choose another folder with hydra.run.dir=FOLDER"
         )
     write_text(folder / "versions.json", json.dumps(versions(), indent=2))
-    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    # A logger writes into `run_dir`, wherever that is when the run goes on.
-    kept.logger = OmegaConf.to_container(config.logger) if config.logger else None
+    saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    # Loggers write into `run_dir`, which may be another folder when the run is resumed.
+    saved.logger = OmegaConf.to_container(config.logger) if config.logger else None
     with whole_file(folder / "config.yaml") as unfinished:
-        OmegaConf.save(kept, unfinished)
+        OmegaConf.save(saved, unfinished)
+
+
+def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
+    """Return the configuration of the run in a folder.
+
+    Args:
+        folder: of the run.
+        key: of the configuration that names the folder, for the message.
+        changes: new values of top-level keys.
+
+    Raises:
+        UserError: if the folder holds no run, or its configuration cannot be read.
+    """
+    path = folder / "config.yaml"
+    if not path.is_file():
+        raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
+    try:
+        saved = OmegaConf.load(path)
+        if not isinstance(saved, DictConfig):
+            raise UserError(f"{path} is not the configuration of a run, but a list")
+        for name, value in (changes or {}).items():
+            saved[name] = value
+        config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
+        OmegaConf.to_container(config, throw_on_missing=True)
+    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
+    return config
 
 
 def holds(folder: Path, config: DictConfig) -> bool:
-    """Whether the folder holds a run of just this configuration.
-
-    Raises:
-        UserError: if it holds one of another, naming the first value that is different.
-    """
+    """Return whether the folder holds a run; raise a `UserError` if that has another configuration."""
     if not (folder / "config.yaml").exists():
         return False
-    kept, wanted = (
+    saved, requested = (
         _flat(OmegaConf.to_container(each, resolve=True)) for each in (read_config(folder, "run_dir"), config)
     )
-    for key in dict.fromkeys([*kept, *wanted]):
-        if kept.get(key) != wanted.get(key) and key.split(".")[0] not in IGNORED_KEYS:
+    for key in dict.fromkeys([*saved, *requested]):
+        if saved.get(key) != requested.get(key) and key.split(".")[0] not in IGNORED_KEYS:
             raise UserError(
-                f"{folder} holds a run with {key}={kept.get(key)}, not {wanted.get(key)}; "
+                f"{folder} holds a run with {key}={saved.get(key)}, not {requested.get(key)}; "
                 "choose another folder, or remove that one"
             )
     return True
 
 
 def _flat(node: Any, name: str = "") -> dict[str, Any]:
-    """The values of a configuration by their full names."""
+    """Return the values of a configuration by their full keys."""
     if not isinstance(node, Mapping) or not node:
         return {name: node}
     return {key: value for k, v in node.items() for key, value in _flat(v, f"{name}.{k}" if name else str(k)).items()}
+
+
+def is_evaluated(folder: Path) -> bool:
+    """Return whether a run is finished: its evaluation is the last thing it writes."""
+    return (folder / "evaluation.csv").exists()
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and important packages, the commit, and the machine."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    git = ["git", "-C", str(Path(__file__).resolve().parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    found["commit"] = _output(git) or "not a git checkout"
+    found["cpus"] = str(os.cpu_count())
+    found["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    return found
+
+
+def _output(command: list[str]) -> str:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+        return ", ".join(done.stdout.strip().splitlines())
+    except (OSError, subprocess.SubprocessError):
+        return ""

@@ -26,8 +26,8 @@ from coil_rl.report import markdown_table, style
 from coil_rl.reproduce.result import lighten, picture
 from coil_rl.train import load
 from coil_rl.train.build import build, build_env
+from coil_rl.train.evaluate_run import drive_guides
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
-from coil_rl.train.guide_drives import drive_guides
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track

@@ -5,7 +5,7 @@ import pytest
 from coil_rl.files import remove_unfinished, whole_file, whole_folder, write_text
 
 
-def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
+def test_file_appears_complete(tmp_path: Path) -> None:
     path = tmp_path / "new folder" / "table.csv"
     with whole_file(path) as unfinished:
         unfinished.write_text("half")
@@ -15,7 +15,7 @@ def test_a_file_appears_when_it_is_whole(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_an_error_leaves_the_older_file_and_nothing_else(tmp_path: Path) -> None:
+def test_error_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("old")
 
@@ -31,12 +31,12 @@ def test_an_error_leaves_the_older_file_and_nothing_else(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n"])
-def test_a_text_ends_with_its_last_line(tmp_path: Path, end: str) -> None:
+def test_text_ends_with_one_line_break(tmp_path: Path, end: str) -> None:
     write_text(tmp_path / "page.md", f"één\ntwo{end}")
     assert (tmp_path / "page.md").read_bytes() == "één\ntwo\n".encode()
 
 
-def test_a_folder_appears_when_it_is_whole(tmp_path: Path) -> None:
+def test_folder_appears_complete(tmp_path: Path) -> None:
     path = tmp_path / "new folder" / "data"
     with whole_folder(path) as unfinished:
         (unfinished / "inner").mkdir()
@@ -46,7 +46,7 @@ def test_a_folder_appears_when_it_is_whole(tmp_path: Path) -> None:
     assert list(path.parent.iterdir()) == [path]
 
 
-def test_an_error_leaves_no_folder(tmp_path: Path) -> None:
+def test_error_leaves_no_folder(tmp_path: Path) -> None:
     def write() -> None:
         with whole_folder(tmp_path / "data") as unfinished:
             (unfinished / "half").write_text("1")
@@ -57,7 +57,7 @@ def test_an_error_leaves_no_folder(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_folder_with_something_in_it_is_not_replaced(tmp_path: Path) -> None:
+def test_folder_with_contents_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "mine").write_text("1")
     with pytest.raises(OSError, match="data"), whole_folder(tmp_path / "data"):
@@ -65,7 +65,7 @@ def test_a_folder_with_something_in_it_is_not_replaced(tmp_path: Path) -> None:
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["mine"]
 
 
-def test_what_a_killed_process_began_is_removed(tmp_path: Path) -> None:
+def test_unfinished_files_of_killed_processes_are_removed(tmp_path: Path) -> None:
     (tmp_path / ".data.123" / "inner").mkdir(parents=True)
     (tmp_path / ".table.123.csv").write_text("half")
     (tmp_path / "table.csv").write_text("whole")

@@ -1,4 +1,4 @@
-"""Every experiment file is a sweep that can be run, and one that goes on where it was stopped."""
+"""Every experiment file is a sweep that can be run and resumed."""
 
 from pathlib import Path
 
@@ -18,8 +18,8 @@ TINY = ["track=generated", "track.train.count=2", "track.test.count=2", "env.lap
 
 
 def first(experiment, run_dir):
-    """The configuration of the first run of the sweep, as small as can be."""
-    # One that sweeps as the file that it begins with has none of its own; what is set without it will do.
+    """Return a very small configuration of the first run of the sweep."""
+    # A file that inherits its sweep has no params of its own.
     params = OmegaConf.select(OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml"), "hydra.sweeper.params") or {}
     values = {key: str(value).split(",") for key, value in params.items()}
     chosen = [f"{key}={value[0].strip()}" for key, value in values.items() if not key.startswith("budget.")]
@@ -28,14 +28,14 @@ def first(experiment, run_dir):
 
 
 @pytest.mark.parametrize("experiment", sorted({*EXPERIMENTS} - {*NEEDS_RUNS}))
-def test_an_experiment_can_be_run_and_goes_on_where_it_was_stopped(experiment, tmp_path):
+def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
     config = first(experiment, tmp_path / "run")
     check(config)
     assert config.existing == "resume"
 
 
 @pytest.mark.slow
-def test_every_experiment_trains_and_judges(tmp_path, monkeypatch):
+def test_every_experiment_trains_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for experiment in [*(name for name in EXPERIMENTS if name not in NEEDS_RUNS), *NEEDS_RUNS]:
         for task in ("centred", "left", "right") if experiment == "driving_guides" else ("",):

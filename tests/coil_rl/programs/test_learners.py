@@ -1,4 +1,4 @@
-"""Which learner goes with which method, and how those that do not are refused."""
+"""Every combination of a method and a learner trains or is refused."""
 
 from pathlib import Path
 
@@ -30,7 +30,7 @@ def composed(folder, *overrides):
         return compose("train", [*TINY, *overrides, f"run_dir={folder}"])
 
 
-def words(method, learner):
+def refusal(method, learner):
     return REFUSED.get(method) or (None if learner == "ppo" else WITHOUT_REPLAY.get(method))
 
 
@@ -42,11 +42,11 @@ SLOW = [name for name in DYNAMIC if name != "dynamic_coil_sequential"]  # refuse
 
 @pytest.mark.parametrize(
     ("method", "learner"),
-    [pytest.param(*pair, marks=pytest.mark.slow if pair[0] in SLOW else []) for pair in PAIRS if words(*pair)],
+    [pytest.param(*pair, marks=pytest.mark.slow if pair[0] in SLOW else []) for pair in PAIRS if refusal(*pair)],
 )
-def test_what_makes_no_sense_is_refused_in_one_sentence(method, learner, tmp_path):
+def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
-    with pytest.raises(UserError, match=words(method, learner)):
+    with pytest.raises(UserError, match=refusal(method, learner)):
         check(config)
 
 
@@ -56,9 +56,9 @@ FAST = [("coil_rfc", "dqn"), ("residual_coil", "dqn"), ("jump_start", "dqn"), ("
 
 @pytest.mark.parametrize(
     ("method", "learner"),
-    [pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow) for pair in PAIRS if not words(*pair)],
+    [pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow) for pair in PAIRS if not refusal(*pair)],
 )
-def test_what_makes_sense_learns(method, learner, tmp_path):
+def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
     check(config)
     env = build_env(config)
@@ -70,7 +70,7 @@ def test_what_makes_sense_learns(method, learner, tmp_path):
     assert method == "jump_start" or metrics.get("minibatches", 4) == 4
 
 
-def test_a_mixture_that_stays_the_same_may_be_replayed(tmp_path):
+def test_constant_mixture_may_be_replayed(tmp_path):
     check(composed(tmp_path, "method=mixing", "learner=sac", "method.transforms.mixing.weight=0.5"))
 
 
@@ -88,12 +88,12 @@ def test_a_mixture_that_stays_the_same_may_be_replayed(tmp_path):
         ("learner=dqn learner.capacity=10", "learner: capacity=10 must be at least 1 and at least starts=5000"),
     ],
 )
-def test_other_mistakes_are_one_sentence(overrides, sentence, tmp_path):
+def test_other_incompatible_choices_are_refused(overrides, sentence, tmp_path):
     with pytest.raises(UserError, match=sentence):
         check(composed(tmp_path, *overrides.split()))
 
 
-def test_off_policy_learners_choose_their_action_and_their_batches(tmp_path):
+def test_off_policy_learners_set_their_action_and_batch(tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
     assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})

@@ -101,7 +101,7 @@ def test_all_numbers_come_out_again(runs, here):
     ("arguments", "words"),
     [
         ("", "run must be given: write run=VALUE"),
-        ("run=null", "run=null must be text"),
+        ("run=null", "run=null: field 'run' is not Optional"),
         ("run=nowhere", "run=nowhere is not the folder of a run: it has no config.yaml"),
         ("run={runs}/ppo", "has nobody to listen to: the policy does not read guide_action; it reads observation"),
         ("run={runs}/guide", "has no agent: its guide drives alone; give a run that sees advice"),

@@ -1,4 +1,4 @@
-"""Every method is trained, judged, stopped, resumed and judged again by the same programs."""
+"""Every method trains, evaluates and resumes with the same programs."""
 
 import csv
 import json
@@ -13,13 +13,14 @@ from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 from coil_rl.train import checkpoint
+from coil_rl.train.build import build_env
 from coil_rl.train.check import check
 from coil_rl.train.evaluation import evaluate_policy
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
-# What these are made of is also in another: one learner and one more option, one transform in place of another.
-ALIKE = ["coil_rfc", "kickstart", "mixing", "residual", "rfc"]
-ALIKE += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint"]
+# Their parts are also tested with another method.
+SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "rfc"]
+SLOW += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint"]
 TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
 TINY = [*TRACKS, "env.laps=1", "env.time_limit=1", "env.rate=12", "evaluation.repeats=1", "evaluation.gif=false",
         "logger=none", "checkpoint_every=1", "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
@@ -46,9 +47,9 @@ def proxies(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "method", [pytest.param(name, marks=pytest.mark.slow) if name in ALIKE else name for name in METHODS]
+    "method", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in METHODS]
 )
-def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies, tmp_path, capsys):
+def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies)
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
@@ -59,7 +60,7 @@ def test_a_method_ends_with_the_same_files_after_it_was_stopped(method, proxies,
         assert (run / name).exists() == (stopped / name).exists() == (method != "guide" or name[0] == "e")
         if (run / name).exists() and not (name == "policy_last.pt" and method in SKLEARN):
             assert (run / name).read_bytes() == (stopped / name).read_bytes()
-    assert method == "guide" or "goes on after update 1" in capsys.readouterr().err
+    assert method == "guide" or "continues after update 1" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")
@@ -77,11 +78,11 @@ def rows(folder, **where):
         return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in where.items())]
 
 
-def test_a_run_goes_by_its_label(residual):
+def test_driver_is_the_label_of_the_run(residual):
     assert {row["driver"] for row in rows(residual)} == {"guide", "mine"}
 
 
-def test_a_run_that_is_there_is_not_trained_again_where_that_is_asked_for(residual, capsys):
+def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
     before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
     trained(residual, "residual", "label=mine", "existing=resume")
     assert {file: file.stat().st_mtime_ns for file in before} == before
@@ -90,7 +91,7 @@ def test_a_run_that_is_there_is_not_trained_again_where_that_is_asked_for(residu
         trained(residual, "residual", "label=mine", "existing=resume", "learner.gamma=0.9")
 
 
-def test_a_trained_agent_is_judged_with_other_advice_too(residual, tmp_path):
+def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("evaluate", [*TRACKS, f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
                                       "degrade=[zeroed,adversarial]"])  # fmt: skip
@@ -103,14 +104,14 @@ def test_a_trained_agent_is_judged_with_other_advice_too(residual, tmp_path):
     assert len({row["reward"] for row in (normal[-1], zeroed[-1], adversarial[-1])}) == 3
 
 
-def test_a_degraded_guide_is_judged_as_it_advises(tmp_path):
+def test_guide_is_evaluated_with_degraded_advice(tmp_path):
     run = trained(tmp_path / "run", "guide", "degrade=[adversarial]")
     alone = trained(tmp_path / "alone", "guide")
     assert rows(run)[0]["reward"] != rows(alone)[0]["reward"]
 
 
-def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path, plain):
-    """Its numbers before the first update are plain PPO's, whatever the coupling costs."""
+def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
+    # Before the first update its numbers are those of plain PPO.
     coupled = trained(tmp_path / "rfc", "rfc", "method.transforms.coupling.beta=1000")
     first, other = (next(csv.DictReader((run / "metrics.csv").open(newline=""))) for run in (coupled, plain))
     same = [key for key in other if key.startswith("train/")]
@@ -119,21 +120,21 @@ def test_rfc_logs_and_judges_the_tasks_reward_alone(tmp_path, plain):
     assert first["learner/loss_critic"] != other["learner/loss_critic"]
 
 
-def test_jump_start_of_no_steps_is_ppo_to_the_bit(tmp_path, plain):
+def test_jump_start_without_steps_is_ppo_to_the_bit(tmp_path, plain):
     jumped = trained(tmp_path / "jump", "jump_start", "method.transforms.jump_start.horizon=0")
     first, other = (torch.load(run / "policy_last.pt", weights_only=True) for run in (jumped, plain))
     assert all(torch.equal(first[key], other[key]) for key in other)
 
 
-def test_residual_of_scale_zero_is_the_guide_exactly(tmp_path):
+def test_residual_of_scale_zero_is_the_guide(tmp_path):
     run = trained(tmp_path / "run", "residual", "method.transforms.residual.scale=0")
     guide, agent = rows(run, driver="guide"), rows(run, driver="residual", actions="deterministic")
     assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
 
 
-def test_driving_leaves_what_is_only_for_learning_out(residual):
+def test_evaluation_sets_transforms_to_evaluation_mode(residual):
     config, agent = evaluate.restore(residual, compose_evaluate(residual))
-    env = evaluate.build_env(config, {"num_cars": 2})
+    env = build_env(config, {"num_cars": 2})
     evaluate_policy(env, agent)
     assert not env.transform.training
 
@@ -143,7 +144,7 @@ def compose_evaluate(run):
         return compose("evaluate", [*TRACKS, f"run={run}", "run_dir=unused"])
 
 
-def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
+def test_first_round_of_dagger_collects_the_data_of_oil(tmp_path):
     given = ["learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
     oil = trained(tmp_path / "oil", "oil", *given)
     dagger = trained(tmp_path / "dagger", "dagger", *given)
@@ -152,7 +153,7 @@ def test_the_first_round_of_dagger_gathers_what_oil_does(tmp_path):
     assert all(torch.equal(gathered[key], other[key]) for key in ("observation", "action"))
 
 
-def test_every_guide_of_several_is_driven_and_remembered(tmp_path):
+def test_every_one_of_several_guides_is_evaluated(tmp_path):
     run = trained(tmp_path / "run", "coil_multi", "guide=[zero,spline]")
     assert [row["driver"] for row in rows(run)][::3] == ["guide zero", "guide spline", "coil_multi", "coil_multi"]
     assert list(json.loads((run / "guide_return.json").read_text())) == ["guide zero", "guide spline"]

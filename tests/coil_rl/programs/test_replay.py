@@ -187,7 +187,7 @@ def test_of_a_recording_cut_at_60_percent_what_is_readable_is_replayed_and_count
         ("", "recording must be given: write recording=VALUE"),
         ("recording=null", "recording must be an MCAP file or a rosbag2 directory"),
         ("recording=[]", "env: recordings is empty; give at least one"),
-        ("recording=5", "env: recordings=5 must be"),
+        ("recording=5", "env.recordings=5 must be"),
         ("recording=missing.mcap", "missing.mcap cannot be read (No such file or directory)"),
         ("recording=[drive.mcap,drive.mcap]", "drive.mcap twice; leave one out"),
         ("recording=text.mcap", "text.mcap is not an MCAP file"),
@@ -200,7 +200,7 @@ def test_of_a_recording_cut_at_60_percent_what_is_readable_is_replayed_and_count
         ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
         ("recording=drive.mcap runs=[coil_0,./coil_0]", "coil_0 twice; leave one out"),
         ("recording=drive.mcap runs=[coil_0] policy=best", "there is no file coil_0/policy_best.pt"),
-        ("recording=drive.mcap runs=[coil_0] policy=worst", "policy=worst must be one of last, best"),
+        ("recording=drive.mcap runs=[coil_0] policy=worst", "policy='worst' must be 'last' or 'best'"),
         (
             "recording=drive.mcap runs=[coil_0] guide=zero +guide.coil=${guide.zero}",
             "two policies would be called coil; leave one out, or give the guide another name",

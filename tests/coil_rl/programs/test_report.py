@@ -128,11 +128,11 @@ def test_guides_alone_have_no_curves(sweep):
         ),
         (
             "folder=sweep actions=sample",
-            "actions=sample must be one of deterministic, sampled, both; did you mean sampled?",
+            "actions='sample' must be 'deterministic', 'sampled' or 'both'",
         ),
-        ("folder=sweep resamples=0", "resamples=0 must be between 1 and 1000000"),
-        ("folder=sweep resamples=many", "resamples='many' must be a whole number"),
-        ("folder=sweep seed=-1", "seed=-1 must be between 0 and"),
+        ("folder=sweep resamples=0", "resamples=0 must be greater than or equal to 1"),
+        ("folder=sweep resamples=many", "resamples=many: Value 'many' of type 'str' could not be converted to Integer"),
+        ("folder=sweep seed=-1", "seed=-1 must be greater than or equal to 0"),
         ("foldr=sweep", "no key foldr; the configuration has folder, actions, against, resamples, seed"),
         (
             "folder=sweep +sed=1",

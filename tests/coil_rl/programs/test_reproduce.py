@@ -111,9 +111,9 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     (sweep.all_folders[1] / "evaluation.csv").unlink()
     code, _, error = outcome(*arguments, "hydra/launcher=basic")
     assert code == 2
-    assert "a sweep of paper ended with code 3" in error
+    assert "the sweep of paper ended with exit code 3" in error
     (command,) = started
-    assert command == ["-m", "+experiment=paper", "method=ppo", "seed=0", "hydra/launcher=basic"]
+    assert command == ["-m", "+experiment=paper", "seed=0", "hydra/launcher=basic"]
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("table=1 +results.table_1.x=0", "results.table_1: Table1 takes no x; it takes tolerance"),
         ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "but Result is wanted"),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
-        ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be at least 1"),
+        ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be greater than or equal to 1"),
         ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
     ],
 )

@@ -91,7 +91,7 @@ def test_what_a_transform_made_of_the_action_is_what_the_robot_was_told(runs):
         ("steps=[table] recordings=[none.mcap]", "none.mcap cannot be read (No such file or directory)"),
         ("steps=[train] figure_25.left=[none.mcap]", "figure_25: left=['none.mcap'] and right=[] must both be given"),
         ("runs=[nowhere]", "runs=nowhere is not the folder of a run: it has no config.yaml"),
-        ("runs=[{runs}/guide]", "guide has no agent: its guide drives alone; name that guide instead"),
+        ("runs=[{runs}/guide]", "guide has no agent: its guide drives alone; give that guide instead"),
         ("runs=[{runs}/tasks]", "tasks: learner: the env has no entry task to observe; it has observation"),
         ("env=cone_track", "guide drives a ConeTrackEnv; give env=simulated_robot"),
         ("step=[table]", "there is no key step"),

@@ -11,7 +11,7 @@ from coil_rl.files import remove_unfinished
 from coil_rl.train import checkpoint
 
 
-def test_state_comes_back_as_it_was(tmp_path):
+def test_saved_state_is_loaded_unchanged(tmp_path):
     state = {"weights": torch.arange(3.0), "updates": 7, "returns": [1.5, 2.5], "none": None}
     checkpoint.save(state, tmp_path / "state.pt")
     again = checkpoint.load(tmp_path / "state.pt")
@@ -20,7 +20,7 @@ def test_state_comes_back_as_it_was(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
 
 
-def test_failed_save_leaves_the_file_before_it(tmp_path):
+def test_failed_save_keeps_the_old_file(tmp_path):
     checkpoint.save(1, tmp_path / "state.pt")
     with pytest.raises(Exception, match="pickle"):
         checkpoint.save(lambda: None, tmp_path / "state.pt")
@@ -28,37 +28,37 @@ def test_failed_save_leaves_the_file_before_it(tmp_path):
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_missing_and_broken_files_are_named(tmp_path):
+def test_missing_and_damaged_files_are_refused(tmp_path):
     with pytest.raises(UserError, match=r"there is no file .*state\.pt"):
         checkpoint.load(tmp_path / "state.pt")
     checkpoint.save(torch.zeros(1000), tmp_path / "state.pt")
     whole = (tmp_path / "state.pt").read_bytes()
     (tmp_path / "state.pt").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(UserError, match=r"state\.pt is not a whole checkpoint"):
+    with pytest.raises(UserError, match=r"state\.pt is damaged"):
         checkpoint.load(tmp_path / "state.pt")
 
 
-def test_a_checkpoint_runs_no_code(tmp_path):
+def test_loading_runs_no_code(tmp_path):
     class Payload:
         def __reduce__(self):
             return (print, ("code ran",))
 
     torch.save(Payload(), tmp_path / "evil.pt")
-    with pytest.raises(UserError, match="checksum does not fit"):
+    with pytest.raises(UserError, match="checksum is wrong"):
         checkpoint.load(tmp_path / "evil.pt")
     checkpoint.save(Payload(), tmp_path / "evil.pt")
-    with pytest.raises(UserError, match="not a whole checkpoint"):
+    with pytest.raises(UserError, match="is damaged"):
         checkpoint.load(tmp_path / "evil.pt")
 
 
-def test_torch_reads_what_is_saved(tmp_path):
+def test_torch_reads_a_saved_state(tmp_path):
     checkpoint.save({"weights": torch.arange(3.0)}, tmp_path / "state.pt")
     assert torch.load(tmp_path / "state.pt", weights_only=True)["weights"].tolist() == [0, 1, 2]
 
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory):
-    """A folder with a checkpoint 2 and, before it, a checkpoint 1; and the bytes of 2."""
+    """A folder with checkpoint 2 and, as the previous one, checkpoint 1; and the bytes of 2."""
     folder = tmp_path_factory.mktemp("run")
     for number in (1, 2):
         checkpoint.save_newest({"updates": number, "weights": torch.zeros(50)}, folder)
@@ -66,7 +66,7 @@ def two(tmp_path_factory):
 
 
 @given(st.data())
-def test_an_altered_or_cut_checkpoint_is_refused_and_the_one_before_it_used(two, data):
+def test_previous_checkpoint_replaces_an_altered_or_truncated_one(two, data):
     folder, whole = two
     at = data.draw(st.integers(0, len(whole) - 1))
     if data.draw(st.booleans()):
@@ -80,26 +80,23 @@ def test_an_altered_or_cut_checkpoint_is_refused_and_the_one_before_it_used(two,
     (folder / "checkpoint_previous.pt").write_bytes(before)
 
 
-def test_going_back_is_said_in_one_line(two, capsys):
+def test_use_of_the_previous_checkpoint_is_reported(two, capsys):
     folder, whole = two
     (folder / "checkpoint.pt").write_bytes(whole[:-1])
     checkpoint.load_newest(folder)
     (line,) = capsys.readouterr().err.splitlines()
-    assert line == (
-        f"{folder / 'checkpoint.pt'} is not a whole checkpoint: its checksum does not fit; "
-        "going back to checkpoint_previous.pt"
-    )
+    assert line == (f"{folder / 'checkpoint.pt'} is damaged: its checksum is wrong; using checkpoint_previous.pt")
 
 
-def test_two_broken_checkpoints_are_both_named(tmp_path):
+def test_two_damaged_checkpoints_are_refused(tmp_path):
     assert checkpoint.load_newest(tmp_path) is None
     for name in ("checkpoint.pt", "checkpoint_previous.pt"):
         (tmp_path / name).write_bytes(b"")
-    with pytest.raises(UserError, match=r"neither .*checkpoint\.pt nor .*checkpoint_previous\.pt is a whole .* copy"):
+    with pytest.raises(UserError, match=r"both .*checkpoint\.pt and .*checkpoint_previous\.pt are damaged.* copy"):
         checkpoint.load_newest(tmp_path)
 
 
-def test_a_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
+def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
     class Killed(BaseException):
         pass
 
@@ -118,7 +115,7 @@ def test_a_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch)
             return call
 
         with monkeypatch.context() as patch:
-            # All that touches the disk; a killed process tidies nothing up either.
+            # All writes to the disk; a killed process does not clean up either.
             for owner, name in [(Path, "write_bytes"), (os, "fsync"), (Path, "replace"), (Path, "unlink")]:
                 patch.setattr(owner, name, dying(getattr(owner, name)))
             try:

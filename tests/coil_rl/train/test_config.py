@@ -1,5 +1,13 @@
 import pytest
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl.train.config import fingerprint
+
+
+def composed(*overrides, **options):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", list(overrides), **options)
 
 
 @pytest.mark.parametrize(
@@ -9,13 +17,29 @@ from hydra import compose, initialize_config_module
         ("method=ppo", "ppo"),
         ("method=ppo learner=a2c", "a2c"),
         ("method=coil learner=trpo", "coil_trpo"),
-        ("method=rfc learner=reinforce", "rfc_reinforce"),
         ("learner._target_=others.Q", "coil_q"),
         ("method=oil learner=linear", "oil"),
         ("method=dynamic_coil_stochastic", "dynamic_coil_stochastic"),
         ("method=ppo learner=a2c label=mine", "mine"),
     ],
 )
-def test_an_agent_is_called_by_its_method_and_by_a_learner_that_is_not_the_usual_one(overrides, label):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        assert compose("train", [*overrides.split(), "run_dir=unused"]).label == label
+def test_label_is_the_method_and_an_unusual_learner(overrides, label):
+    assert composed(*overrides.split(), "run_dir=unused").label == label
+
+
+def test_fingerprint_depends_on_everything_that_changes_the_numbers():
+    one = fingerprint(composed())
+    assert one == fingerprint(composed("run_dir=elsewhere", "logger=none", "existing=resume"))
+    others = [("seed=1",), ("learner.gamma=0.98",), ("method=ppo",), ("track.train.split=test",), ("label=mine",)]
+    assert len({one, *(fingerprint(composed(*other)) for other in others)}) == 1 + len(others)
+
+
+def test_saved_configuration_has_the_same_fingerprint():
+    config = composed("run_dir=here")
+    assert fingerprint(OmegaConf.create(OmegaConf.to_container(config, resolve=True))) == fingerprint(config)
+
+
+def test_fingerprint_in_the_name_of_a_sweep_folder():
+    subdir = "hydra.sweep.subdir=${label}_seed${seed}_${fingerprint:}"
+    config = composed("seed=3", subdir, return_hydra_config=True)
+    assert config.hydra.sweep.subdir == f"coil_seed3_{fingerprint(composed('seed=3'))}"

@@ -54,7 +54,7 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
     distill(composed("guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"))
     output = capsys.readouterr().out
     assert str(folder) in output
-    assert "distill: 1 made; the worst drives for" in output
+    assert "distill: made 1; the lowest mean reward is" in output
 
 
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):

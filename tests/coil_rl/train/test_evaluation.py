@@ -11,27 +11,27 @@ from coil_rl.train.evaluation import evaluate_policy, summarise
 TRACKS = random_tracks(2, seed=5)
 
 
-def test_guide_completes_its_laps_and_the_measures_agree_with_one_another(ring):
+def test_measures_of_a_guide_that_completes_its_laps(ring):
     tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
     env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=8)
-    driven = evaluate_policy(env, SplineGuide(), names=[track.name for track in tracks])
-    for track, row, line in zip(tracks, driven.episodes, driven.lines, strict=True):
+    result = evaluate_policy(env, SplineGuide(), names=[track.name for track in tracks])
+    for track, row, line in zip(tracks, result.episodes, result.lines, strict=True):
         assert row["track"] == track.name
         assert row["completed"]
         assert not row["crashed"]
         assert row["laps"] == 1
         assert row["clearance"] > 0
-        # The middle line at 2 m/s, less what is cut at corners.
+        # The middle line at 2 m/s; the guide cuts corners.
         assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
         assert len(line) == row["steps"] >= row["lap_time"] * 8
     again = evaluate_policy(env, SplineGuide(), names=[track.name for track in tracks])
-    assert again.episodes == driven.episodes
+    assert again.episodes == result.episodes
 
 
-def test_crash_ends_the_measuring():
+def test_measures_of_a_crash():
     env = ConeTrackEnv(TRACKS, 4, assignment="cyclic")
-    driven = evaluate_policy(env, ConstantGuide(1.0))
-    for row in driven.episodes:
+    result = evaluate_policy(env, ConstantGuide(1.0))
+    for row in result.episodes:
         assert row["crashed"]
         assert not row["completed"]
         assert math.isnan(row["lap_time"])
@@ -39,7 +39,7 @@ def test_crash_ends_the_measuring():
         assert -100 < row["reward"] < -80
 
 
-def test_sampled_actions_differ_from_the_deterministic_ones():
+def test_sampled_actions_are_less_smooth_than_deterministic_ones():
     env = ConeTrackEnv(TRACKS, 2, assignment="cyclic", rate=8)
     policy = actor(env, ["observation"])
     plain, drawn = (
@@ -67,17 +67,17 @@ def test_summary_is_the_mean_over_tracks_of_means_over_episodes():
     assert rows[2]["clearance"] == 0.1
 
 
-def test_reward_is_told_apart_by_the_task_that_paid_it():
+def test_reward_of_each_task_is_measured():
     tasks = {"left": {"alive": 1.0, "crash": 0.0, "cone": 0.0}, "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0}}
     env = DrivingTasksEnv(TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0})
-    driven = evaluate_policy(env, ConstantGuide(1.0))
-    for row in driven.episodes:
+    result = evaluate_policy(env, ConstantGuide(1.0))
+    for row in result.episodes:
         assert row["steps_left"] + row["steps_right"] == row["steps"]
         assert row["reward_left"] + row["reward_right"] == pytest.approx(row["reward"])
-    assert sum(row["steps_left"] for row in driven.episodes) > 6
-    *rows, mean = summarise(driven.episodes)
+    assert sum(row["steps_left"] for row in result.episodes) > 6
+    *rows, mean = summarise(result.episodes)
     for row in rows:
-        alike = [episode for episode in driven.episodes if episode["track"] == row["track"]]
+        alike = [episode for episode in result.episodes if episode["track"] == row["track"]]
         steps, paid = (sum(episode[f"{what}_left"] for episode in alike) for what in ("steps", "reward"))
         assert row["per_step_left"] == pytest.approx(paid / steps)
         # Every step but that of the crash.
@@ -85,7 +85,7 @@ def test_reward_is_told_apart_by_the_task_that_paid_it():
     assert mean["per_step_left"] == pytest.approx(sum(row["per_step_left"] for row in rows) / 2)
 
 
-def test_task_that_never_came_up_has_no_reward():
+def test_task_without_steps_has_no_reward():
     env = DrivingTasksEnv(TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left")
     rows = summarise(evaluate_policy(env, ConstantGuide(1.0)).episodes)
     assert all(math.isnan(row["per_step_right"]) for row in rows)

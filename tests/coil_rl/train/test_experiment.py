@@ -3,14 +3,16 @@ import re
 
 import pytest
 import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
+from torchrl.record.loggers import TensorboardLogger
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.train import checkpoint
-from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.experiment import Experiment, Metrics, check_losses, check_weights, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -27,9 +29,17 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
     return Experiment(learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2)
 
 
-def test_a_run_leaves_its_files_and_a_row_an_update(tmp_path):
+def contents(folder):
+    return {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+def as_written(rows):
+    return str([{**row, "frames": int(row["frames"])} for row in rows])
+
+
+def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
-    names = sorted(file.name for file in (tmp_path / "run").iterdir())
+    names = sorted(contents(tmp_path / "run"))
     assert names == ["checkpoint.pt", "checkpoint_previous.pt", "metrics.csv", "policy_best.pt", "policy_last.pt"]
     with (tmp_path / "run" / "metrics.csv").open() as file:
         written = list(csv.DictReader(file))
@@ -49,17 +59,16 @@ class Killed(BaseException):
 
 
 @pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 4), (RandomGuide, 5), (SplineGuide, 4)])
-def test_run_that_was_stopped_ends_with_the_files_of_one_that_never_was(tmp_path, guide, last, capsys):
+def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
-    whole = experiment(tmp_path / "whole", frames=frames, guide=guide())
-    rows = whole.run()
+    rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
 
     stopped = experiment(tmp_path / "stopped", frames=frames, guide=guide())
-    update, seen = stopped.learner.update, []
+    update, calls = stopped.learner.update, []
 
     def dying(batch, progress):
-        seen.append(progress)
-        if len(seen) == last:
+        calls.append(progress)
+        if len(calls) == last:
             raise Killed
         return update(batch, progress)
 
@@ -67,29 +76,29 @@ def test_run_that_was_stopped_ends_with_the_files_of_one_that_never_was(tmp_path
     with pytest.raises(Killed):
         stopped.run()
 
-    # Another seed: nothing may depend on how the second process begins, once there is a checkpoint.
+    # Once there is a checkpoint, nothing may depend on the seed of the second process.
     again = experiment(tmp_path / "stopped", seed=9 if last > 2 else 0, frames=frames, guide=guide())
     again.resume()
-    assert str([{**row, "frames": int(row["frames"])} for row in again.run()]) == str(rows)
+    assert as_written(again.run()) == str(rows)
     place = f"after update {(last - 1) // 2 * 2}" if last > 2 else "from the beginning: there is no checkpoint yet"
-    assert f"{tmp_path / 'stopped'} goes on {place}\n" in capsys.readouterr().err
-    files = [{file.name: file.read_bytes() for file in (tmp_path / name).iterdir()} for name in ("whole", "stopped")]
-    assert files[0].keys() == files[1].keys()
+    assert f"{tmp_path / 'stopped'} continues {place}\n" in capsys.readouterr().err
+    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
+    assert whole.keys() == resumed.keys()
     for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
-        assert files[0][name] == files[1][name], name
+        assert whole[name] == resumed[name], name
 
 
 def test_resume_of_a_finished_run_changes_nothing(tmp_path):
     rows = experiment(tmp_path / "run").run()
-    before = {file.name: file.read_bytes() for file in (tmp_path / "run").iterdir()}
+    before = contents(tmp_path / "run")
     again = experiment(tmp_path / "run", seed=9)
     again.resume()
-    assert str([{**row, "frames": int(row["frames"])} for row in again.run()]) == str(rows)
-    assert {file.name: file.read_bytes() for file in (tmp_path / "run").iterdir()} == before
+    assert as_written(again.run()) == str(rows)
+    assert contents(tmp_path / "run") == before
 
 
-class Spoiled(Transform):
-    """Writes NaN into an entry of one car at one step of the run."""
+class WriteNaN(Transform):
+    """Write NaN into an entry of one car at one step of the run."""
 
     def __init__(self, key, step, car):
         super().__init__(in_keys=[key], out_keys=[key])
@@ -107,52 +116,101 @@ class Spoiled(Transform):
         return tensordict_reset
 
 
+# At step 20 the env itself raises an error, because of the NaN; step 24 is the last of a batch.
 @pytest.mark.parametrize("step", [20, 24])
 @pytest.mark.parametrize("key", ["observation", "reward"])
-def test_nan_from_an_env_stops_the_run_and_keeps_the_last_checkpoint(tmp_path, key, step):
+def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, step):
     good = experiment(tmp_path / "good", frames=16 * 8 * 2)
     good.run()
-    run = experiment(tmp_path / "run", extra=[Spoiled(key, step, 5)])
-    # At step 20 the env itself breaks over what follows from the NaN; step 24 is the last of a batch.
-    words = (
-        f"next/{key} is nan at step {step} of car 5; the last good checkpoint is kept: mend the cause and go on with"
-    )
-    with pytest.raises(UserError, match=re.escape(f"{words} coil-train resume={tmp_path / 'run'}, or train again")):
+    run = experiment(tmp_path / "run", extra=[WriteNaN(key, step, 5)])
+    message = f"next/{key} is nan at step {step} of car 5; the last good checkpoint is kept"
+    with pytest.raises(UserError, match=f"{message}.*{re.escape(f'coil-train resume={tmp_path}/run')}"):
         run.run()
     ours, theirs = (checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("run", "good"))
     assert ours["updates"] == theirs["updates"] == 2
     assert torch.equal(ours["rollout"]["env"]["pose"], theirs["rollout"]["env"]["pose"])
-    mended = experiment(tmp_path / "run", seed=9)
-    mended.resume()
-    mended.run()
+    corrected = experiment(tmp_path / "run", seed=9)
+    corrected.resume()
+    corrected.run()
 
 
-def test_nan_of_a_loss_or_a_weight_stops_the_run_and_keeps_the_last_checkpoint(tmp_path):
-    for name in ("loss", "weight"):
-        run = experiment(tmp_path / name)
-        update = run.learner.update
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [("loss", "learner/loss_critic is nan in update 4"), ("weight", "learner/critic/.* is nan after update 4")],
+)
+def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_path, place, message):
+    run = experiment(tmp_path / "run")
+    update = run.learner.update
 
-        def spoiling(batch, progress, run=run, update=update, name=name):
-            learned = update(batch, progress)
-            if run.updates == 3:
-                if name == "loss":
-                    return learned | {"loss_critic": float("nan")}
-                with torch.no_grad():
-                    next(iter(run.learner.critic.parameters())).fill_(torch.nan)
-            return learned
+    def write_nan(batch, progress):
+        metrics = update(batch, progress)
+        if run.updates == 3 and place == "loss":
+            return metrics | {"loss_critic": float("nan")}
+        if run.updates == 3:
+            with torch.no_grad():
+                next(iter(run.learner.critic.parameters())).fill_(torch.nan)
+        return metrics
 
-        run.learner.update = spoiling
-        words = (
-            "learner/loss_critic is nan in update 4" if name == "loss" else "learner/critic/.* is nan after update 4"
-        )
-        with pytest.raises(UserError, match=f"{words}; the last good checkpoint is kept"):
-            run.run()
-        assert checkpoint.load(tmp_path / name / "checkpoint.pt")["updates"] == 2
-        assert not (tmp_path / name / "policy_last.pt").exists()
+    run.learner.update = write_nan
+    with pytest.raises(UserError, match=f"{message}; the last good checkpoint is kept"):
+        run.run()
+    assert checkpoint.load(tmp_path / "run" / "checkpoint.pt")["updates"] == 2
+    assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
-def test_log_terms_add_up_to_the_reward(tmp_path):
+def test_finite_losses_and_infinite_bounds_pass():
+    check_losses({"learner/loss": 1.0}, 7)
+    check_weights({"bound": torch.tensor(-torch.inf), "order": [1]}, 7)
+
+
+def test_logged_reward_terms_add_up_to_the_reward(tmp_path):
     run = experiment(tmp_path / "run")
     batch = Rollout(run.rollout.env, run.learner.policy, 40).collect()
     terms = sum(batch["next", "info", "reward", term] for term in ("finish", "crash", "cone", "smooth", "alive"))
     torch.testing.assert_close(terms, batch["next", "reward"])
+
+
+ROWS = [{"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)]
+
+
+def write_metrics(path, rows, logger=None):
+    metrics = Metrics(path, logger)
+    for row in rows:
+        metrics.append(row)
+    return metrics
+
+
+@pytest.mark.parametrize("torn", [b"", b"60,0.1", b"60,0.1,nan\r\n70"])
+@pytest.mark.parametrize("count", [0, 1, 3, 5])
+def test_truncated_metrics_continue_as_if_never_stopped(tmp_path, count, torn):
+    whole, stopped = tmp_path / "whole.csv", tmp_path / "stopped.csv"
+    write_metrics(whole, ROWS)
+    write_metrics(stopped, ROWS)
+    with stopped.open("ab") as file:
+        file.write(torn)
+    again = Metrics(stopped)
+    assert str(again.truncate(count)) == str([{k: float(v) for k, v in row.items()} for row in ROWS[:count]])
+    for row in ROWS[count:]:
+        again.append(row)
+    assert stopped.read_bytes() == whole.read_bytes()
+
+
+def test_missing_rows_are_refused(tmp_path):
+    write_metrics(tmp_path / "metrics.csv", ROWS[:2])
+    with pytest.raises(UserError, match="has 2 of the 3 rows that belong to the checkpoint"):
+        Metrics(tmp_path / "metrics.csv").truncate(3)
+    with pytest.raises(UserError, match="has 0 of the 1 rows"):
+        Metrics(tmp_path / "other.csv").truncate(1)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_tensorboard_shows_no_point_twice(tmp_path, count):
+    path = tmp_path / "metrics.csv"
+    write_metrics(path, ROWS, TensorboardLogger("board", str(tmp_path))).flush()
+    again = Metrics(path, TensorboardLogger("board", str(tmp_path)))
+    again.truncate(count)
+    for row in ROWS[count:]:
+        again.append(row)
+    again.flush()
+    points = EventAccumulator(str(tmp_path / "board")).Reload().Scalars("loss")
+    assert [point.step for point in points] == [10, 20, 30, 40, 50]

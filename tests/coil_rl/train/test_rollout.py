@@ -1,9 +1,12 @@
+import pytest
 import torch
+from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
-from coil_rl.train.rollout import Rollout
+from coil_rl.train.rollout import Rollout, check_batch
 from coil_rl.transforms import GuideActions
 
 
@@ -13,7 +16,7 @@ def rollout(seed=0, steps=6, keys=None):
     return Rollout(env, RandomGuide(-1, 0.2, seed=seed), steps, keys)
 
 
-def test_batches_follow_one_another():
+def test_batches_are_consecutive():
     long, short = rollout(steps=60), rollout(steps=20)
     parts = torch.cat([short.collect() for _ in range(3)], 1)
     whole = long.collect()
@@ -23,15 +26,15 @@ def test_batches_follow_one_another():
     assert long.frames == 300
 
 
-def test_next_of_a_step_is_the_step_after_it_unless_the_episode_ended():
+def test_next_entry_is_the_following_step_unless_the_episode_ended():
     batch = rollout(steps=60).collect()
     after, now = batch["next", "observation"][:, :-1], batch["observation"][:, 1:]
-    going_on = ~batch["next", "done"][:, :-1].squeeze(-1)
-    assert torch.equal(after[going_on], now[going_on])
-    assert not torch.equal(after[~going_on], now[~going_on])
+    running = ~batch["next", "done"][:, :-1].squeeze(-1)
+    assert torch.equal(after[running], now[running])
+    assert not torch.equal(after[~running], now[~running])
 
 
-def test_only_the_keys_asked_for_are_kept():
+def test_only_the_requested_keys_are_kept():
     keys = {"observation", ("next", "reward"), ("next", "info", "lap")}
     batch = rollout(keys=[*keys, *keys]).collect()
     assert set(batch.keys(True, True)) == keys
@@ -39,7 +42,7 @@ def test_only_the_keys_asked_for_are_kept():
     assert all(torch.equal(batch[key], whole[key]) for key in keys)
 
 
-def test_state_dict_goes_on_in_another_rollout():
+def test_restored_rollout_gives_the_same_batches():
     first, second = rollout(seed=1), rollout(seed=2)
     first.collect()
     second.load_state_dict(first.state_dict())
@@ -47,3 +50,41 @@ def test_state_dict_goes_on_in_another_rollout():
     batches = [(first.collect(), second.collect()) for _ in range(10)]
     assert all((one == other).all() for one, other in batches)
     assert any(one["next", "done"].any() for one, _ in batches)
+
+
+def zeros():
+    after = {"observation": torch.zeros(4, 6, 3), "info": {"pose": torch.zeros(4, 6, 2)}}
+    count = torch.zeros(4, 6, 1, dtype=torch.int64)
+    return TensorDict({"observation": torch.zeros(4, 6, 3), "count": count, "next": after}, [4, 6])
+
+
+def test_finite_batch_passes():
+    check_batch(zeros())
+    check_batch(TensorDict({"none": torch.zeros(4, 6, 0), "done": torch.zeros(4, 6, 1, dtype=torch.bool)}, [4, 6]))
+
+
+@pytest.mark.parametrize(
+    ("places", "message"),
+    [
+        ([("observation", 3, 2, 1)], "observation is nan at step 103 of car 3"),
+        (
+            [("observation", 1, 3, 1), (("next", "observation"), 1, 2, 1)],
+            "next/observation is nan at step 103 of car 1",
+        ),
+        ([(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)], "observation is nan at step 106 of car 2"),
+        ([(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)], "next/info/pose is nan at step 102 of car 0"),
+    ],
+)
+def test_first_nan_is_reported_with_its_entry_step_and_car(places, message):
+    batch = zeros()
+    for key, car, t, number in places:
+        batch[key][car, t, number] = torch.nan
+    with pytest.raises(UserError, match=f"^{message}$"):
+        check_batch(batch, steps=100)
+
+
+def test_infinity_is_reported_also_without_a_batch_dimension():
+    batch = zeros()[0]
+    batch["next", "observation"][4, 0] = -torch.inf
+    with pytest.raises(UserError, match="next/observation is -inf at step 5 of car 0"):
+        check_batch(batch)

@@ -1,0 +1,139 @@
+"""Validation of YAML nodes against the signatures of the classes and functions that they call."""
+
+from __future__ import annotations
+
+import inspect
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic.errors import PydanticUserError
+from pydantic_core import SchemaError
+
+from coil_rl.errors import UserError, did_you_mean
+
+STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
+
+
+def check_arguments(
+    target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
+) -> None:
+    """Raise a `UserError` for an unknown or missing argument, or one that does not fit its annotation.
+
+    Args:
+        target: class or function.
+        node: arguments; `_target_` and `_partial_` are ignored.
+        name: key of the node, for the message.
+        program: names of the arguments that the program adds.
+    """
+    title = getattr(target, "__name__", str(target))
+    given = {key: value for key, value in node.items() if key not in ("_target_", "_partial_")}
+    for key in sorted(given.keys() & set(program)):
+        raise UserError(f"{name}: {key} of {title} is set by the program; leave it out")
+    parameters = _parameters(target)
+    if parameters is None:
+        return
+    known = {p.name: p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)}
+    accepts_any = any(p.kind is p.VAR_KEYWORD for p in parameters)
+    for key in sorted(given.keys() - known):
+        if not accepts_any or key.startswith("_"):
+            takes = ", ".join(known) or "nothing"
+            raise UserError(f"{name}: {title} takes no {key}; it takes {takes}{did_you_mean(key, known)}")
+    missing = [key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}]
+    if missing and "_partial_" not in node:
+        raise UserError(f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE")
+    for key in given.keys() & known:
+        _check_type(given[key], known[key].annotation, f"{name}.{key}")
+
+
+def _check_type(value: Any, annotation: Any, name: str) -> None:
+    if annotation is inspect.Parameter.empty or isinstance(annotation, str):
+        return
+    try:
+        adapter: TypeAdapter[Any] = TypeAdapter(annotation, config=STRICT)
+    except (PydanticUserError, SchemaError):  # an annotation that cannot be checked
+        return
+    if (known := _known(value, list)) is _TARGET:
+        return
+    try:
+        adapter.validate_python(known)
+    except ValidationError as error:
+        try:  # strict pydantic accepts no list for a tuple, and YAML has no tuples
+            adapter.validate_python(_known(value, tuple))
+        except ValidationError:
+            raise UserError(validation_message(error, known, name)) from None
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        raise UserError(f"{name}={value} must be an integer of 64 bits")
+
+
+_TARGET = object()
+
+
+def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any:
+    """Return a value without nodes inside it that have a `_target_`, whose results are not known yet."""
+    if isinstance(value, Mapping):
+        entries = {key: _known(entry, sequence) for key, entry in value.items()}
+        return _TARGET if "_target_" in value else {k: entry for k, entry in entries.items() if entry is not _TARGET}
+    if isinstance(value, list):
+        return sequence(entry for entry in (_known(entry, sequence) for entry in value) if entry is not _TARGET)
+    return value
+
+
+def validation_message(error: ValidationError, value: Any, name: str = "") -> str:
+    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value; `name` is the key of the value."""
+    details = [(_path(detail["loc"], value), detail) for detail in error.errors(include_url=False)]
+    path = max((path for path, _ in details), key=len)
+    expected = []
+    for other, detail in details:
+        is_list = detail["type"] == "sequence_str" or detail.get("ctx", {}).get("class") == "Sequence"
+        if other == path:
+            expected.append("a list" if is_list else detail["msg"].removeprefix("Input should be "))
+    for part in path:
+        name = f"{name}[{part}]" if isinstance(part, int) else f"{name}.{part}".lstrip(".")
+        value = value[part]
+    return f"{name}={yaml_text(value)} must be {' or '.join(dict.fromkeys(expected))}"
+
+
+def yaml_text(value: Any) -> str:
+    """Return a short text of a value as in YAML."""
+    if value is None or isinstance(value, bool):
+        return "null" if value is None else str(value).lower()
+    return textwrap.shorten(repr(value), 100, placeholder=" ...")
+
+
+def _path(location: Iterable[int | str], value: Any) -> tuple[int | str, ...]:
+    """Drop pydantic's tags of union members from the location of an error."""
+    path: list[int | str] = []
+    for part in location:
+        is_index = isinstance(value, (list, tuple)) and isinstance(part, int) and part < len(value)
+        if is_index or (isinstance(value, Mapping) and part in value):
+            path.append(part)
+            value = value[part]
+    return tuple(path)
+
+
+def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
+    """Return the parameters of a target, including those that a class of this project passes on to its base class."""
+    try:
+        if not inspect.isclass(target) or target.__init__ is object.__init__:
+            return list(_signature(target).parameters.values())
+        # The signature of a class with a metaclass, such as an env of TorchRL, is that of the metaclass.
+        own = list(_signature(target.__init__).parameters.values())[1:]
+    except ValueError:  # builtins without a signature
+        return None
+    passes_on = "__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own)
+    if not passes_on or not target.__module__.startswith("coil_rl."):
+        return own
+    base = _parameters(target.__bases__[0])
+    if base is None:
+        return own
+    names = {parameter.name for parameter in own}
+    return [p for p in own if p.kind is not p.VAR_KEYWORD] + [p for p in base if p.name not in names]
+
+
+def _signature(function: Callable[..., Any]) -> inspect.Signature:
+    try:
+        return inspect.signature(function, eval_str=True)
+    except (NameError, TypeError):  # annotations that only a type checker can resolve
+        return inspect.signature(function)
