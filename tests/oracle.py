@@ -1,7 +1,6 @@
-"""A second opinion on the cone world: one car, plain NumPy and SciPy, loops and all.
+"""Independent implementation of the cone world for one car, in plain NumPy and SciPy, without code of `coil_rl`.
 
-Written from the description of the simulation, sharing no code with `coil_rl.envs`, so that the batched env and this
-file can only agree by both being right. It is slow on purpose: every step looks at every cone of the track.
+Every step tests every cone of the track.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ RECENT = np.exp(-0.1 * np.arange(20)) / np.exp(-0.1 * np.arange(20)).sum()
 
 
 def merge(points: Array) -> tuple[Array, Array]:
-    """Consecutive points less than a micrometre apart become one point that weighs as much as they did."""
+    """Merge consecutive points less than a micrometre apart to one point of their total weight."""
     first = np.concatenate([[True], np.linalg.norm(np.diff(points, axis=0), axis=1) >= 1e-6])
     return points[first], np.bincount(np.cumsum(first) - 1).astype(float)
 
@@ -43,10 +42,10 @@ def chord_length(points: Array) -> Array:
 
 
 def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
-    """The natural cubic smoothing spline by chord length: its parameters at the points and a function of it.
+    """Fit the natural cubic smoothing spline by chord length; return the parameters of the points and the curve.
 
-    Solved as what it is, the least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second
-    derivatives R^-1 Q' f at the inner points the integral is |L^-1 Q' f|^2, where R = L L'.
+    Least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second derivatives R^-1 Q' f at the
+    inner points, the integral is |L^-1 Q' f|^2, where R = L L'.
     """
     points, weights = merge(points)
     u = chord_length(points)
@@ -60,19 +59,19 @@ def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
     gram = np.diag((h[:-1] + h[1:]) / 3) + np.diag(h[1:-1] / 6, 1) + np.diag(h[1:-1] / 6, -1)
     rough = np.sqrt(smoothing) * solve_triangular(cholesky(gram, lower=True), second, lower=True)
     root = np.sqrt(weights)[:, None]
-    wanted = np.vstack([root * points, np.zeros((n - 2, 2))])
-    values = np.linalg.lstsq(np.vstack([np.diag(root[:, 0]), rough]), wanted)[0]
+    target = np.vstack([root * points, np.zeros((n - 2, 2))])
+    values = np.linalg.lstsq(np.vstack([np.diag(root[:, 0]), rough]), target)[0]
     return u, CubicSpline(u, values, bc_type="natural")
 
 
 def fit_quadratic(points: Array) -> tuple[Array, Curve]:
-    """The interpolating quadratic spline by chord length, a line for two points."""
+    """Fit the interpolating quadratic spline by chord length, a line for two points."""
     u = chord_length(points)
     return u, make_interp_spline(u, points, k=1 if len(points) == 2 else 2)
 
 
 def fit_parabola(points: Array) -> tuple[Array, Curve]:
-    """The least-squares parabola by chord length, a line for two points."""
+    """Fit the least-squares parabola by chord length, a line for two points."""
     u = chord_length(points)
     degree = 1 if len(points) == 2 else 2
     fits = [np.polynomial.Polynomial.fit(u, points[:, axis], degree) for axis in range(2)]
@@ -86,7 +85,7 @@ def to_car(pose: Array, points: Array) -> Array:
 
 
 def midpoints(left: Array, right: Array) -> Array:
-    """Midpoints of close left-right pairs, nearest first."""
+    """Return the midpoints of close left-right pairs, nearest first."""
     middle = (left[:, None] + right) / 2
     middle = middle[np.linalg.norm(left[:, None] - right, axis=-1) < PAIR_DISTANCE]
     return middle[np.argsort(np.linalg.norm(middle, axis=1), kind="stable")]
@@ -95,7 +94,7 @@ def midpoints(left: Array, right: Array) -> Array:
 def guide_action(
     left: Array, right: Array, steering: float, *, spline: str = "cubic", smoothing: float = 1.0, gain: float = 1.0
 ) -> float:
-    """Appendix A.1 on the visible cones (car frame, nearest first): the advice as a fraction of 80 degrees."""
+    """Return the advice of appendix A.1 for the visible cones (car frame, nearest first), a fraction of 80 degrees."""
     points = midpoints(left, right)
     if len(points) < 2:
         return steering
@@ -104,16 +103,16 @@ def guide_action(
     targets = curve(np.linspace(0, u[-1], 1 + max(1, round(length))))
     distance = np.linalg.norm(targets, axis=1)
     angle = np.arctan2(targets[:, 1], targets[:, 0])
-    wanted = (distance > TARGET_REACHED) & (np.abs(angle) <= HALF_FIELD_OF_VIEW)
-    if not wanted.any():
+    valid = (distance > TARGET_REACHED) & (np.abs(angle) <= HALF_FIELD_OF_VIEW)
+    if not valid.any():
         return steering
-    best = np.flatnonzero(wanted)[np.argmin(distance[wanted])]
+    best = np.flatnonzero(valid)[np.argmin(distance[valid])]
     degrees = 160 / np.pi * np.arctan(np.rad2deg(angle[best]) / distance[best] ** 1.8)
     return gain * float(np.clip(degrees, -80, 80)) / 80
 
 
 class Outcome(NamedTuple):
-    """What a step led to."""
+    """Result of a step."""
 
     observation: Array
     terms: dict[str, float]
@@ -155,7 +154,6 @@ class OneCar:
         for ring in self.rings:
             closed = np.vstack([ring, ring[:1]])
             u = chord_length(closed)
-            # At a quarter of a metre, points 2 mm apart are a curve to within 2 micrometres.
             curves.append(CubicSpline(u, closed, bc_type="periodic")(np.arange(0, u[-1], 0.002)))
         self.boundary = cKDTree(np.vstack(curves))
         self.reset()
@@ -165,26 +163,26 @@ class OneCar:
         self.history = []
         self.steps = 0
         self.lap = 0
-        self.clock: int | None = None
-        self.on_line = False
-        self.paid: list[set[int]] = [set(), set()]
+        self.lap_start: int | None = None
+        self.in_finish = False
+        self.rewarded: list[set[int]] = [set(), set()]
         self.before: list[set[int]] = [set(), set()]
         self.samples: list[Array | None] = [None, None]
-        self.look()
+        self.find_visible()
         return self.observe()
 
-    def look(self) -> None:
-        """Which cones of each side are in sight, nearest first."""
-        self.seen: list[list[int]] = []
+    def find_visible(self) -> None:
+        """Find the visible cones of each side, nearest first."""
+        self.visible: list[list[int]] = []
         for ring in self.rings:
             local = to_car(self.pose, ring)
             distance = np.linalg.norm(local, axis=1)
             angle = np.arctan2(local[:, 1], local[:, 0])
-            visible = np.flatnonzero((distance <= SIGHT) & (np.abs(angle) <= HALF_FIELD_OF_VIEW))
-            self.seen.append([int(i) for i in visible[np.argsort(distance[visible])][:KEPT_CONES]])
+            rows = np.flatnonzero((distance <= SIGHT) & (np.abs(angle) <= HALF_FIELD_OF_VIEW))
+            self.visible.append([int(i) for i in rows[np.argsort(distance[rows])][:KEPT_CONES]])
 
     def cones(self) -> tuple[Array, Array]:
-        left, right = (to_car(self.pose, ring[seen]) for ring, seen in zip(self.rings, self.seen, strict=True))
+        left, right = (to_car(self.pose, ring[indices]) for ring, indices in zip(self.rings, self.visible, strict=True))
         return left, right
 
     @property
@@ -193,9 +191,11 @@ class OneCar:
 
     def observe(self) -> Array:
         parts = []
-        for side, (ring, seen) in enumerate(zip(self.rings, self.seen, strict=True)):
-            if len(seen) >= 2:
-                fit = fit_cubic(ring[seen], self.smoothing) if self.spline == "cubic" else fit_quadratic(ring[seen])
+        for side, (ring, indices) in enumerate(zip(self.rings, self.visible, strict=True)):
+            if len(indices) >= 2:
+                fit = (
+                    fit_cubic(ring[indices], self.smoothing) if self.spline == "cubic" else fit_quadratic(ring[indices])
+                )
                 u, curve = fit
                 self.samples[side] = curve(np.linspace(0, u[-1], SAMPLES))
             samples = self.samples[side]
@@ -226,24 +226,24 @@ class OneCar:
         self.steps += 1
 
         inside = bool(np.linalg.norm(self.pose[:2] - self.finish) < FINISH_RADIUS)
-        entered = inside and not self.on_line
-        self.on_line = inside
+        entered = inside and not self.in_finish
+        self.in_finish = inside
         lap_time = 0.0
         if entered:
-            if self.clock is not None:
-                lap_time = (self.steps - self.clock) * dt
+            if self.lap_start is not None:
+                lap_time = (self.steps - self.lap_start) * dt
                 self.lap += 1
-            self.clock = self.steps
+            self.lap_start = self.steps
 
-        self.look()
+        self.find_visible()
         cone_sides = 0
         for side in range(2):
-            now = set(self.seen[side])
+            now = set(self.visible[side])
             if lap_time:
-                self.paid[side] = set()
-            known = self.paid[side] if self.cone_bonus == "first_sighting" else self.before[side]
+                self.rewarded[side] = set()
+            known = self.rewarded[side] if self.cone_bonus == "first_sighting" else self.before[side]
             cone_sides += bool(now - known)
-            self.paid[side] |= now
+            self.rewarded[side] |= now
             self.before[side] = now
 
         to_cone = np.linalg.norm(np.vstack(self.rings) - self.pose[:2], axis=1).min()

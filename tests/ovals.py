@@ -1,4 +1,4 @@
-"""Tracks of two straights and two half turns, on which every place is known."""
+"""Oval tracks of two straights and two half turns with known geometry."""
 
 import numpy as np
 
@@ -6,17 +6,17 @@ from coil_rl.envs import Track
 
 
 def oval_line(length=40.0, radius=6.0, spacing=0.1):
-    """Straight ahead in +x, a half turn to the left, straight back and another half turn, around the origin: [P, 2]."""
+    """Return an oval around the origin, anticlockwise, the first straight along +x: [P, 2]."""
     straight = np.arange(0, length, spacing)
     turn = np.arange(0, np.pi, spacing / radius)
-    ahead = np.stack([straight - length / 2, np.full_like(straight, -radius)], axis=1)
+    forward = np.stack([straight - length / 2, np.full_like(straight, -radius)], axis=1)
     around = np.stack([length / 2 + radius * np.sin(turn), -radius * np.cos(turn)], axis=1)
-    half = np.vstack([ahead, around])
+    half = np.vstack([forward, around])
     return np.vstack([half, -half])
 
 
 def oval_track(name, clockwise=False, length=10.0, radius=6.0):
-    """A track 3 m wide along an oval; clockwise all turns are to the right."""
-    inner, outer = (oval_line(length, of_side, spacing=1.5) for of_side in (radius - 1.5, radius + 1.5))
+    """Return a track 3 m wide along an oval."""
+    inner, outer = (oval_line(length, r, spacing=1.5) for r in (radius - 1.5, radius + 1.5))
     mirrored = np.array([1, -1])
     return Track(name, left=outer * mirrored, right=inner * mirrored) if clockwise else Track(name, inner, outer)

@@ -51,8 +51,22 @@ def advance(env: ConeTrackEnv, state: TensorDictBase, action: Tensor) -> tuple[T
     return emitted["next"], state
 
 
+def drive(env: ConeTrackEnv, actions: Tensor) -> list[TensorDictBase]:
+    """Return the outputs of all steps, with resets."""
+    state, outputs = env.reset(), []
+    for action in actions:
+        emitted, state = advance(env, state, action.to(env.device))
+        outputs.append(emitted)
+    return outputs
+
+
 def leaves(data: TensorDictBase) -> dict[Any, Tensor]:
     return dict(data.items(include_nested=True, leaves_only=True))
+
+
+def assert_finite(data: TensorDictBase) -> None:
+    for key, value in leaves(data).items():
+        assert value.isfinite().all(), key
 
 
 def same(a: TensorDictBase, b: TensorDictBase) -> bool:
@@ -71,14 +85,14 @@ def test_specs_match_the_data(rings: list[Track], preset: dict, assignment: str,
     check_env_specs(ConeTrackEnv(rings, 3, assignment=assignment, dtype=dtype, **preset))
 
 
-def test_outputs_are_within_their_specs(rings: list[Track]) -> None:
-    env = ConeTrackEnv(rings, 64)
-    state = env.reset()
-    assert env.observation_spec.is_in(state.select(*env.observation_spec.keys()))
-    for action in steering(120, 64, seed=2):
-        emitted, state = advance(env, state, action)
+@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
+def test_outputs_are_finite_and_within_their_specs(preset: dict) -> None:
+    env = ConeTrackEnv(shipped_tracks("train"), 256, **preset)
+    assert env.observation_spec.is_in(env.reset().select(*env.observation_spec.keys()))
+    for emitted in drive(env, steering(120, 256, seed=2)):
         assert env.observation_spec.is_in(emitted.select(*env.observation_spec.keys()))
         assert emitted["cones"].square().sum(-1).max() <= 49 + 1e-4
+        assert_finite(emitted)
 
 
 def test_env_is_batch_invariant(tracks: list[Track]) -> None:
@@ -111,18 +125,14 @@ def test_env_is_batch_invariant(tracks: list[Track]) -> None:
 
 
 def test_info_does_not_change_the_other_outputs(tracks: list[Track]) -> None:
-    full, bare = ConeTrackEnv(tracks, 8), ConeTrackEnv(tracks, 8, info=False)
+    full, bare = (ConeTrackEnv(tracks, 8, info=info, seed=3) for info in (True, False))
     check_env_specs(bare)
-    full.set_seed(3)
-    bare.set_seed(3)
-    states = [full.reset(), bare.reset()]
-    for action in steering(60, 8, seed=3):
-        emitted = []
-        for i, env in enumerate((full, bare)):
-            after, states[i] = advance(env, states[i], action)
-            emitted.append(after)
-        assert "info" not in emitted[1]
-        assert (emitted[0].exclude("info") == emitted[1]).all()
+    for env in (full, bare):
+        env.set_seed(3)
+    actions = steering(60, 8, seed=3)
+    for with_info, without in zip(drive(full, actions), drive(bare, actions), strict=True):
+        assert "info" not in without
+        assert same(with_info.exclude("info"), without)
 
 
 @pytest.mark.parametrize("assignment", ["random", "cyclic"])
@@ -214,17 +224,12 @@ def test_time_limit_truncates(rings: list[Track]) -> None:
 
 
 def test_crash_replaces_all_other_reward_terms(tracks: list[Track]) -> None:
-    env = ConeTrackEnv(tracks, 32)
-    state = env.reset()
     crashes = 0
-    for action in steering(150, 32, seed=7):
-        emitted, state = advance(env, state, action)
-        crashed = emitted["info", "crashed"]
+    for emitted in drive(ConeTrackEnv(tracks, 32), steering(150, 32, seed=7)):
+        crashed, terms = emitted["info", "crashed"], emitted["info", "reward"]
         crashes += int(crashed.sum())
-        terms = emitted["info", "reward"]
         assert emitted["reward"][crashed].eq(-100).all()
-        assert terms["crash"][crashed].eq(-100).all()
-        assert terms["crash"][~crashed].eq(0).all()
+        assert torch.equal(terms["crash"], -100.0 * crashed)
         assert all(terms[term][crashed].eq(0).all() for term in REWARD_TERMS if term != "crash")
         assert all(terms[term][~crashed].ne(0).any() for term in ("alive", "smooth"))
         assert torch.equal(crashed, emitted["info", "clearance"] <= 0)
@@ -318,27 +323,6 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
     assert all(same(data.select(*copied.keys()), copied) for data, copied in kept)
 
 
-def assert_finite(data: TensorDictBase) -> None:
-    for key, value in leaves(data).items():
-        assert value.isfinite().all(), key
-
-
-@pytest.mark.parametrize(
-    ("steps", "preset"),
-    [
-        (150, {}),
-        pytest.param(2000, {}, marks=pytest.mark.slow, id="long-paper"),
-        pytest.param(2000, AUTHORS, marks=pytest.mark.slow, id="long-authors"),
-    ],
-)
-def test_outputs_are_finite_under_random_steering(steps: int, preset: dict) -> None:
-    env = ConeTrackEnv(shipped_tracks("train"), 256, **preset)
-    state = env.reset()
-    for action in steering(steps, 256, seed=10):
-        emitted, state = advance(env, state, action)
-        assert_finite(emitted)
-
-
 def test_outputs_are_finite_far_off_the_track(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 16)
     state = env.reset()
@@ -378,29 +362,19 @@ def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict, message
 
 
 def test_actions_are_clamped(rings: list[Track]) -> None:
-    wild, tame = (ConeTrackEnv(rings, 4, assignment="cyclic") for _ in range(2))
-    states = [wild.reset(), tame.reset()]
-    for value in ([[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]):
-        actions = [torch.tensor(value), torch.tensor(value).clamp(-1, 1)]
-        for env, state, action in zip((wild, tame), states, actions, strict=True):
-            state["action"] = action
-            env.step(state)
-        assert same(states[0]["next"], states[1]["next"])
-        states = [env.step_mdp(state) for env, state in zip((wild, tame), states, strict=True)]
+    wild = torch.tensor([[[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]])
+    outputs = [drive(ConeTrackEnv(rings, 4, assignment="cyclic"), actions) for actions in (wild, wild.clamp(-1, 1))]
+    assert all(same(*pair) for pair in zip(*outputs, strict=True))
 
 
 def test_number_of_kept_cones_changes_only_the_padding(rings: list[Track]) -> None:
     # On these tracks a car never sees sixteen cones of a side.
     few, many = (ConeTrackEnv(rings, 8, kept_cones=kept, assignment="cyclic") for kept in (16, 30))
-    states = [few.reset(), many.reset()]
-    for action in steering(60, 8, seed=12):
-        emitted = []
-        for i, env in enumerate((few, many)):
-            after, states[i] = advance(env, states[i], action)
-            emitted.append(after)
-        assert emitted[1]["cones"].shape == (8, 2, 30, 2)
-        assert torch.equal(emitted[1]["cones"][:, :, :16], emitted[0]["cones"])
-        assert same(emitted[0].exclude("cones"), emitted[1].exclude("cones"))
+    actions = steering(60, 8, seed=12)
+    for narrow, wide in zip(drive(few, actions), drive(many, actions), strict=True):
+        assert wide["cones"].shape == (8, 2, 30, 2)
+        assert torch.equal(wide["cones"][:, :, :16], narrow["cones"])
+        assert same(narrow.exclude("cones"), wide.exclude("cones"))
 
 
 @pytest.mark.slow
@@ -424,12 +398,8 @@ def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
 def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
     envs = [ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")]
     check_env_specs(envs[1])
-    states = [env.reset() for env in envs]
-    for action in steering(30, 32, seed=13):
-        emitted = []
-        for i, env in enumerate(envs):
-            after, states[i] = advance(env, states[i], action.to(env.device))
-            assert all(value.device.type == env.device.type for value in leaves(after).values())
-            emitted.append(after.cpu())
-        assert torch.allclose(emitted[0]["observation"], emitted[1]["observation"], atol=1e-2)
-        assert torch.equal(emitted[0]["info", "track"], emitted[1]["info", "track"])
+    actions = steering(30, 32, seed=13)
+    for ours, theirs in zip(*(drive(env, actions) for env in envs), strict=True):
+        assert all(value.device.type == "cuda" for value in leaves(theirs).values())
+        assert torch.allclose(ours["observation"], theirs["observation"].cpu(), atol=1e-2)
+        assert torch.equal(ours["info", "track"], theirs["info", "track"].cpu())

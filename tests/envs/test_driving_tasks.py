@@ -154,9 +154,7 @@ def sequence(env: DrivingTasksEnv) -> Tensor:
 
 
 def test_seed_determines_the_tasks(rings: list[Track]) -> None:
-    first, again, other = (
-        sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=seed)) for seed in (7, 7, 8)
-    )
+    first, again, other = (sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=k)) for k in (7, 7, 8))
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -191,19 +189,6 @@ def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     restored = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=99)
     restored.load_state_dict(saved)
     assert all(same(*pair) for pair in zip(drive(restored, 80, state.clone()), trace, strict=True))
-
-
-def test_env_is_batch_invariant(rings: list[Track]) -> None:
-    envs = [DrivingTasksEnv(rings, 6, tasks=TASKS, duration=0.5, assignment="cyclic") for _ in range(2)]
-    states = [env.reset() for env in envs]
-    for value in torch.linspace(0, 0.3, 25):
-        rows = []
-        for i, env in enumerate(envs):
-            states[i]["action"] = torch.full((6, 1), value.item())
-            states[i]["action"][1:] *= -i
-            rows.append(env.step(states[i])["next"][:1])
-            states[i] = env.step_mdp(states[i])
-        assert same(*rows)
 
 
 @pytest.mark.parametrize(
