@@ -81,7 +81,8 @@ def check_values(config: DictConfig) -> None:
             if detail["type"] == "unexpected_keyword_argument":
                 raise UserError(_unknown_key(config, *map(str, detail["loc"]))) from None
         raise UserError(validation_message(error, values)) from None
-    if "budget" in config and (frames := config.budget.cars * config.budget.steps) > LARGEST_BATCH:
+    budget = config.get("budget")
+    if isinstance(budget, DictConfig) and (frames := budget.cars * budget.steps) > LARGEST_BATCH:
         raise UserError(f"budget.cars x budget.steps={frames} must be at most {LARGEST_BATCH}")
     for name in ("device", "env.device"):
         if isinstance(device := OmegaConf.select(config, name), str):

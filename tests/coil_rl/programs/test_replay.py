@@ -206,7 +206,7 @@ def test_of_a_recording_cut_at_60_percent_what_is_readable_is_replayed_and_count
             "two policies would be called coil; leave one out, or give the guide another name",
         ),
         ("recording=drive.mcap guide=zero +guide.recorded=${guide.zero}", "two policies would be called recorded"),
-        ("recording=drive.mcap track=robot", "nothing is chosen for track yet"),
+        ("recording=drive.mcap track=robot", "Could not override 'track'. No match in the defaults list"),
         ("recording=drive.mcap record=1", "there is no key record; the configuration has recording, runs"),
     ],
 )

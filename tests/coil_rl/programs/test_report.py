@@ -139,7 +139,7 @@ def test_guides_alone_have_no_curves(sweep):
             "no key sed; the configuration has folder, actions, against, resamples, seed; did you mean seed?",
         ),
         ("-m folder=sweep,empty", "leave out -m, and give several folders as folder=[ONE,OTHER]"),
-        ("folder=sweep,empty", "folder=sweep,empty gives several values"),
+        ("folder=sweep,empty", "Ambiguous value for argument 'folder=sweep,empty'"),
     ],
 )
 def test_mistakes_are_one_sentence_exit_code_2_and_leave_nothing(arguments, words, sweep):

@@ -128,7 +128,10 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("+other=1", "there is no key other"),
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
         ("table=1 +results.table_1.x=0", "results.table_1: Table1 takes no x; it takes tolerance"),
-        ("table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1", "but Result is wanted"),
+        (
+            "table=1 results.table_1._target_=builtins.dict results.table_1.tolerance=1",
+            "builtins.dict makes dict, not Result",
+        ),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
         ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be greater than or equal to 1"),
         ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
