@@ -78,9 +78,9 @@ class OffPolicy:
         for transform in env.modules():
             if isinstance(transform, GuideTransform) and callable(getattr(transform, transform.mdp_parameter, None)):
                 raise ValueError(
-                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run, so stored steps would "
-                    "no longer show the effect of an action; make it a number, or use a learner without replay, such as "
-                    "PPO"
+                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run, so stored steps "
+                    "would no longer show the effect of an action; make it a number, or use a learner without replay, "
+                    "such as PPO"
                 )
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = "agent_acts" in env.observation_spec
