@@ -10,7 +10,7 @@ LIMIT = 500
 
 
 class CartPoles(SeededEnv):
-    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; a mean of 475 steps per episode is a solution."""
+    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; 475 steps per episode are a solution."""
 
     batch_locked = True
 
