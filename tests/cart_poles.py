@@ -10,7 +10,7 @@ LIMIT = 500
 
 
 class CartPoles(SeededEnv):
-    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; the task is solved at a mean of 475 steps."""
+    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; 475 steps per episode are a solution."""
 
     batch_locked = True
 

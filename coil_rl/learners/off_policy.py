@@ -21,7 +21,7 @@ class OffPolicy:
     """Replay buffer, optimiser, target networks and update.
 
     A step is stored with the observations before and after it, advice included, because a guide with memory or
-    randomness cannot be asked again. A step in which a guide acted is left out: its `action` is not the executed one.
+    randomness cannot be evaluated again. A step in which a guide acted is left out: its `action` was not executed.
 
     A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of (`minimised`) and
     the values to report (`reported`).
