@@ -58,7 +58,8 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of coil-train, e.g. learner.compile=true")
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=1, help="of torch")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=[name for name in PARTS if name != "compiled"])
+    parts = [name for name in PARTS if name != "compiled"]
+    parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--cars", nargs="+", type=int, help="numbers of cars for env steps")
     parser.add_argument("--compile", nargs="+", type=int, default=[], metavar="CARS", help="also under torch.compile")
     parser.add_argument("--seconds", type=float, help="of each subject, all rounds together")
