@@ -13,7 +13,7 @@ TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 # Folder -> what its files may import beside the standard library and the folder itself.
 ALLOWED = {
     "transforms": TENSOR_LIBRARIES,
-    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "mcap_ros2", "gymnasium"},
+    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "rosbags", "gymnasium"},
     "conf": set(),
 }
 

@@ -10,21 +10,21 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
-from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.cone_features import draw_cone_features
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
-from coil_rl.robot import (
+from coil_rl.robot.classifier import (
+    Scans,
     Share,
     Training,
     accuracy,
-    cone_classifier,
+    clusters_in_range,
     label_clusters,
     recall,
     save_classifier,
     train_on_drives,
 )
-from coil_rl.robot.labelling import Scans, one_sided
 
 PAPER = Share(240, 243)
 DRAWN_EVERY = 4  # scans
@@ -42,7 +42,7 @@ COLUMNS = {
 class Figure25(Result):
     """The cone classifier, learned from recordings past the cones of one side, and measured on recordings past both.
 
-    It leaves the classifier too, as `cones.skops` beside the picture. Without any recording it simulates some.
+    It leaves the classifier too, as `cones.json` beside the picture. Without any recording it simulates some.
 
     Args:
         left: recordings past thin cones alone, which stand on the left; at least two.
@@ -93,10 +93,10 @@ class Figure25(Result):
         simulated = any("simulated" in recording.notes for recording in (*self.left, *self.right, *self.both))
         where = " (simulated)" if simulated else ""
         training = train_on_drives(_scans(self.left), _scans(self.right))
-        save_classifier(training.pipeline, stem.with_name("cones.skops"))
-        classifier = cone_classifier(training.pipeline)
+        classifier = training.classifier
+        save_classifier(classifier, stem.with_name("cones.json"))
         tables = {"paper, its own robot": {"all": PAPER}}
-        tables["cross-validation"] = {"all": Share(training.right, training.total)}
+        tables["cross-validation"] = {"all": Share(training.correct, training.total)}
         if self.surveyed:
             labelled = label_clusters(self.surveyed)
             tables["accuracy"] = accuracy(classifier, labelled)
@@ -122,7 +122,7 @@ def _scans(recordings: Sequence[Recording]) -> list[Scans]:
 def _learned_from(
     left: Sequence[Recording], right: Sequence[Recording]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    thin, thick = (one_sided(_scans(side), DRAWN_EVERY).features for side in (left, right))
+    thin, thick = (clusters_in_range(_scans(side), DRAWN_EVERY)[0] for side in (left, right))
     return np.concatenate([thin, thick]), np.arange(len(thin) + len(thick)) >= len(thin)
 
 
@@ -150,5 +150,5 @@ def _page(training: Training, tables: Mapping[str, Mapping[str, Share]], where: 
 
 def _row(of: str, share: Share) -> dict[str, object]:
     low, high = share.interval
-    wrong = share.total - share.right
+    wrong = share.total - share.correct
     return {"of": of, "share": share.share, "low": low, "high": high, "wrong": wrong, "total": share.total}

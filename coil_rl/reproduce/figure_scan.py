@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from coil_rl.envs import Perception, simulated_cone_classifier, simulated_drive
 from coil_rl.envs.robot.clusters import FEATURES
-from coil_rl.envs.robot.lidar import LEAST
-from coil_rl.envs.robot.simulated_recordings import TEST_SEED
+from coil_rl.envs.robot.drives import TEST_SEED
+from coil_rl.envs.robot.lidar import RANGE_MIN
 from coil_rl.envs.track import SIDES
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.reproduce.facing_up import rows_of_places, rows_of_samples
 from coil_rl.reproduce.figure_scan_look import Look, look
 from coil_rl.reproduce.figure_scan_picture import draw
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
-from coil_rl.robot import accuracy, label_clusters
+from coil_rl.robot.classifier import accuracy, label_clusters
 
 KINDS = ("thin", "thick")
 
@@ -87,12 +87,12 @@ class FigureScan(Result):
                 "Width is the distance from the first point to the last, depth the difference of the least and the "
                 "greatest range, girth the length of the line through all points; the classifier's decision is above 0 "
                 "for thick cones. Visible is the share of the cone's beams that no nearer cone catches. Here "
-                f"{told}; in the whole drive the classifier is right about {share.right} of {share.total} clusters "
+                f"{told}; in the whole drive the classifier is right about {share.correct} of {share.total} clusters "
                 f"within 1 m ({share.share:.1%}). Boundaries, observation and guide are those of the cone world, at a "
                 f"seventh of its size: the guide steers {degrees}.",
                 "Filled circles are where the cones stood when the beam straight ahead was sent; the robot drives on "
                 "while the LiDAR turns. One without returns is as a rule hidden by a nearer one, or nearer than "
-                f"{LEAST} m, where the LiDAR measures nothing.",
+                f"{RANGE_MIN} m, where the LiDAR measures nothing.",
             ]
         )
 

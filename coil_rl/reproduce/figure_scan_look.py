@@ -10,13 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from coil_rl.envs import Perception, SimulatedDrive
-from coil_rl.envs.robot.boundary_memory import BoundaryMemory
 from coil_rl.envs.robot.clusters import Clusters, measure, points_of, single_linkage
-from coil_rl.envs.robot.lidar import MOST
+from coil_rl.envs.robot.lidar import RANGE_MAX
+from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.envs.sight import Frame
 from coil_rl.guides import SplineGuide
 from coil_rl.reproduce.facing_up import FINE, places_of, rows
-from coil_rl.robot.labelling import majority
+from coil_rl.robot.classifier import majority
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -89,7 +89,7 @@ def look(drive: SimulatedDrive, scan: int, perception: Perception) -> Look:
     cone = majority(label, hit, len(drive.radius))[clusters.label]
     place = np.full(label.max(initial=-1) + 1, -1)
     place[clusters.label] = np.arange(len(clusters.label))
-    everywhere = points_of(ranges[-1:], angles + perception.laser_yaw, perception.range_min, MOST)
+    everywhere = points_of(ranges[-1:], angles + perception.laser_yaw, perception.range_min, RANGE_MAX)
 
     memory, guide = BoundaryMemory(1, sight=perception.range_max * perception.scale), SplineGuide()
     found, number = (torch.from_numpy(x) for x in perception(ranges, angles))

@@ -19,7 +19,7 @@ from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.reproduce.table_6_measures import measure, smoothness
 from coil_rl.reproduce.table_6_page import page
 from coil_rl.reproduce.table_6_picture import draw_drives
-from coil_rl.robot.drives import Driver, agent_of, record
+from coil_rl.robot.drivers import Driver, agent_driver, record
 from coil_rl.train.build import build_guides
 from coil_rl.train.guide_drives import driver_names
 from coil_rl.train.load import read_config
@@ -122,7 +122,7 @@ class Table6(Result):
             about = {"policy": driver, "guide": json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))}
             yield Driver(driver.replace(" ", "_"), about, partial(_seated, robots, guide))
         for run in chosen:
-            yield agent_of(run.folder, read_config(run.folder, "run", {"device": "cpu"}), robots)
+            yield agent_driver(run.folder, read_config(run.folder, "run", {"device": "cpu"}), robots)
 
 
 def _seated(robots: Callable[[], EnvBase], guide: TensorDictModuleBase) -> tuple[EnvBase, TensorDictModuleBase]:

@@ -14,9 +14,8 @@ from tensordict.nn import TensorDictModule
 
 from coil_rl.envs.recordings.reading import SIMULATED, Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv
-from coil_rl.envs.robot.course import RobotCourse, middle_line
-from coil_rl.envs.robot.laps import laps
-from coil_rl.envs.robot.simulated_recordings import track_of
+from coil_rl.envs.robot.course import RobotCourse, laps, middle_line
+from coil_rl.envs.robot.drives import track_of
 from coil_rl.envs.track import Track
 
 Array = NDArray[np.float64]

@@ -6,10 +6,10 @@ import pytest
 from PIL import Image
 
 from coil_rl.envs import RecordingError, read_recording, save_drive, simulated_drive
-from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
 from coil_rl.errors import UserError
 from coil_rl.reproduce import Figure25
-from coil_rl.robot import accuracy, label_clusters, load_classifier
+from coil_rl.robot.classifier import accuracy, label_clusters, load_classifier
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def drives(tmp_path_factory):
 def test_the_page_says_what_the_written_classifier_does_on_the_recordings(drives, tmp_path):
     page = Figure25(**drives).make(tmp_path / "figure_25")
     tested = surveyed_drive(read_recording(drives["both"][0]))
-    told = accuracy(load_classifier(tmp_path / "cones.skops"), label_clusters([tested]))
+    told = accuracy(load_classifier(tmp_path / "cones.json"), label_clusters([tested]))
     assert page.startswith("## Figure 25: thin cones and thick ones (simulated)\n")
     for name, share in told.items():
         assert re.search(rf"\| {re.escape(name)} +\| +{share.share:.4f} \|.*\| +{share.total} \|", page)
@@ -37,7 +37,7 @@ def test_without_drives_past_both_sides_there_is_the_cross_validation_alone(driv
     page = Figure25(drives["left"], drives["right"]).make(tmp_path / "figure_25")
     assert "| cross-validation " in page
     assert "Recall" not in page
-    assert (tmp_path / "cones.skops").exists()
+    assert (tmp_path / "cones.json").exists()
 
 
 def test_drives_that_cannot_be_used_are_refused_before_anything_is_done(drives, tmp_path):
@@ -45,7 +45,7 @@ def test_drives_that_cannot_be_used_are_refused_before_anything_is_done(drives, 
         Figure25(left=drives["left"])
     with pytest.raises(ValueError, match="pairs=1 must be at least 2"):
         Figure25(pairs=1)
-    with pytest.raises(RecordingError, match="does not tell where its cones stood"):
+    with pytest.raises(RecordingError, match="lacks the positions of its cones"):
         Figure25(drives["left"], drives["right"], both=drives["left"])
     with pytest.raises(UserError, match="are too few to learn from"):
         Figure25(drives["left"][:1], drives["right"]).make(tmp_path / "figure_25")

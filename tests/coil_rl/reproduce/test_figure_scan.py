@@ -7,7 +7,7 @@ from PIL import Image
 from coil_rl.envs import McapReplayEnv, Perception, save_drive, simulated_cone_classifier, simulated_drive
 from coil_rl.guides import SplineGuide
 from coil_rl.reproduce import FigureScan
-from coil_rl.robot import label_clusters
+from coil_rl.robot.classifier import label_clusters
 
 SCAN = 25  # in which a cone is taken for the other kind
 

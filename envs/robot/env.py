@@ -1,8 +1,8 @@
-"""The robot of the paper (section 4.2), simulated: a small car with a LiDAR between thin and thick cones.
+"""Simulation of the paper's robot (section 4.2): a small car with a LiDAR between thin and thick cones.
 
-It drives on a physical track at 0.15 m/s, is steered once a turn of its LiDAR, and knows the world by its scans alone:
-cones hide one another, are taken for the other kind, or are not seen. What it writes has the keys and the scale of
-the cone world, so that any guide or policy of that world drives it unchanged. No real robot was measured for this.
+It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone: cones hide one
+another, are misclassified or missed. The entries have the keys and the scale of the cone world, so guides and policies
+of that world run unchanged. The figures come from data sheets, not from a real robot.
 """
 
 from __future__ import annotations
@@ -16,50 +16,39 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from coil_rl.envs.reward import HISTORY, REWARD_TERMS, Outcome, Reward, check_weights, pay, recent_mean
-from coil_rl.envs.robot.boundary_memory import BoundaryMemory
-from coil_rl.envs.robot.cone_classifier import simulated_cone_classifier
 from coil_rl.envs.robot.course import RobotCourse, robot_track
-from coil_rl.envs.robot.lidar import SimulatedLidar, driven
-from coil_rl.envs.robot.perception import Perception
+from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
+from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs, simulated_cone_classifier
 from coil_rl.envs.seeded import SeededEnv
-from coil_rl.envs.sight import SAMPLES
 from coil_rl.envs.track import Track
 
-FINISH_RADIUS = 0.15  # m, so wide that nobody between the cones drives past it
+FINISH_RADIUS = 0.15  # m, covers the width between the cones
 
 
 class SimulatedRobotEnv(SeededEnv):
-    """Simulated robots on tracks between cones, each by itself.
+    """Simulated robots on tracks between cones, independent of one another.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes what `ConeTrackEnv` does:
-    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the simulation, `cone_count` [B, 2], `steering` [B, 1],
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of `ConeTrackEnv`:
+    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
     `reward`, `done`, `terminated`, `truncated` [B, 1], and under `info` the same entries in the robot's own metres, and
-    `valid` [B, 2], whether each side was seen in this scan. The reward is that of the cone world without the term
-    for cones: the robot cannot tell a new one from one that comes back. A robot crashes where its outline
-    touches a cone or its middle comes to the line between two. All state is in buffers; `scan` [B, P] m is the last
-    scan, infinite where nothing came back.
+    `valid` [B, 2], whether each side is valid in this scan. The reward is that of the cone world without the term for
+    new cones, which the robot cannot tell from known ones. A robot crashes if its outline touches a cone or its centre
+    reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a return.
 
     Args:
-        tracks: where to drive, in the robot's own metres; None for `robot_track()`.
+        tracks: in the robot's own metres; None for `robot_track()`.
         num_cars: B.
-        assignment: "random" draws a track at each reset, "cyclic" keeps robot i on track i mod len(tracks).
-        perception: from scans to cones; None for one with the classifier that learned from simulated scans.
-        lidar: None for an RPLIDAR A1M8; its turns a second are the control steps.
-        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
-        smoothing: lambda of the cubic smoothing spline, m^3.
-        reward: weights, see `Reward`.
-        laps: completed laps that end an episode.
-        time_limit: s, then an episode is truncated.
+        assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
+        perception: None for `Perception` with the shipped classifier.
+        lidar: None for an RPLIDAR A1M8; one control step per scan.
         speed: m/s.
-        car_length: L in m; by default that of the simulated car at a seventh of its size.
-        max_steering: degrees of an action of 1.
-        seed: of the LiDAR's noise, and of the draw of tracks.
+        car_length: L in m; by default a seventh of the cone world's car.
+        seed: of the LiDAR's noise and the draw of tracks.
 
     Raises:
-        ValueError: for a value outside its range, naming it.
+        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import SimulatedRobotEnv
@@ -99,9 +88,9 @@ class SimulatedRobotEnv(SeededEnv):
             "num_cars": num_cars, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
             "max_steering": max_steering,
         }  # fmt: skip
-        for name, given in positive.items():
-            if not 0 < given < math.inf:
-                raise ValueError(f"{name}={given} must be a finite number above 0")
+        for name, number in positive.items():
+            if not 0 < number < math.inf:
+                raise ValueError(f"{name}={number} must be a finite number above 0")
         if max_steering > 90:
             raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         if assignment not in ("random", "cyclic"):
@@ -118,14 +107,12 @@ class SimulatedRobotEnv(SeededEnv):
         self.step_length, self.car_length = speed / self.lidar.rate, car_length
         self.max_steering = math.radians(max_steering)
         self.weights = {key: torch.tensor(float(x)) for key, x in Reward(**(reward or {}))._asdict().items()}
-        self.memory = BoundaryMemory(
-            num_cars, spline, smoothing, sight=self.perception.range_max * self.perception.scale
-        )
+        sight = self.perception.range_max * self.perception.scale
+        self.memory = BoundaryMemory(num_cars, spline, smoothing, sight=sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
         self.starts = torch.tensor([track.start for track in self.tracks]).t()
         self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
-        self._declare_specs()
         for name, value in {
             "track": torch.arange(num_cars) % len(self.tracks), "pose": torch.zeros(3, num_cars),
             "history": torch.zeros(HISTORY, num_cars),
@@ -134,38 +121,14 @@ class SimulatedRobotEnv(SeededEnv):
             "scan": torch.full((num_cars, self.lidar.beams), torch.inf),
         }.items():  # fmt: skip
             self.register_buffer(name, value)
+        declare_specs(self, self._reset())
         self.set_seed(seed)
 
-    def _declare_specs(self) -> None:
-        robots = self.batch_size
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded((*robots, *shape), dtype=torch.float32)
-
-        def whole(*shape: int) -> Unbounded:
-            return Unbounded((*robots, *shape), dtype=torch.int64)
-
-        def flags(count: int) -> Binary:
-            return Binary(count, shape=(*robots, count), dtype=torch.bool)
-
-        info = Composite(
-            track=whole(1), lap=whole(1), lap_time=real(1), crashed=flags(1), clearance=real(1), smoothness=real(1),
-            pose=real(3), valid=flags(2), reward=Composite({term: real(1) for term in REWARD_TERMS}, shape=robots),
-            shape=robots,
-        )  # fmt: skip
-        self.observation_spec = Composite(
-            observation=Bounded(-1, 1, (*robots, 4 * SAMPLES)), cones=real(2, self.perception.kept_cones, 2),
-            cone_count=whole(2), steering=Bounded(-1, 1, (*robots, 1)), info=info, shape=robots,
-        )  # fmt: skip
-        self.action_spec = Bounded(-1, 1, (*robots, 1))
-        self.reward_spec = real(1)
-        self.done_spec = Composite({key: flags(1) for key in ("done", "terminated", "truncated")}, shape=robots)
-
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        given = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(self.batch_size, dtype=torch.bool) if given is None else given.view(-1)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
+        # All robots draw and measure, reset or not: the order of random numbers must not depend on the data.
         if self.assignment == "random":
-            # All robots draw and measure, reset or not: which numbers come next must not depend on the data.
             drawn = torch.randint(len(self.tracks), self.batch_size, generator=self.generator)
             self.track = torch.where(mask, drawn, self.track)
         self.pose = torch.where(mask, self.starts[:, self.track], self.pose)
@@ -174,50 +137,54 @@ class SimulatedRobotEnv(SeededEnv):
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
         self.memory.reset(mask)
-        # To see the same scan twice changes nothing for the others.
-        seen = self._see()
+        # Robots that are not reset perceive their last scan again, which does not change their memory.
+        view = self._perceive()
         zero = torch.zeros(self.batch_size)
-        return self._tensordict(seen, zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero))
+        return self._tensordict(view, zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.steps = self.steps + 1
-        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
-        phase = self.lidar.phase
-        on_the_way = driven(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
-        self.pose = driven(self.pose, torch.full_like(turn, self.step_length), turn)
-        self.scan = self._measure(on_the_way)
-        seen = self._see()
+        self._drive(action)
+        view = self._perceive()
 
-        lap_time, finished = self._cross_the_line()
+        lap_time, finished = self._count_laps()
         clearance, to_boundaries = self.course.clearance(self.track, self.pose)
         crashed = clearance <= 0
-        nothing, alive = torch.zeros_like(action), (~crashed).float()
-        outcome = Outcome(action, roughness, lap_time, finished, nothing, to_boundaries, crashed, alive)
+        no_cone, alive = torch.zeros_like(action), (~crashed).float()
+        outcome = Outcome(action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive)
         terms = pay(outcome, self.weights)
         terminated = crashed | (self.lap >= self.laps)
         truncated = (self.steps >= self.max_steps) & ~terminated
-        out = self._tensordict(seen, lap_time, crashed, clearance, roughness, terms)
+        out = self._tensordict(view, lap_time, crashed, clearance, roughness, terms)
         out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
         return out
 
+    def _drive(self, action: Tensor) -> None:
+        """Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way."""
+        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
+        phase = self.lidar.phase
+        poses = move_along_arc(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
+        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
+        self.scan = self._measure(poses)
+
     def _measure(self, poses: Tensor) -> Tensor:
-        true, _ = self.lidar.cast(poses, self.course.cones[:, self.track], self.course.radius[self.track])
+        true, _ = cast_beams(poses, self.lidar.angles, self.course.cones[:, self.track], self.course.radius[self.track])
         return self.lidar.measure(true, self.generator)[0]
 
-    def _see(self) -> dict[str, Tensor]:
-        """What the last scan shows, and what is remembered from before."""
+    def _perceive(self) -> dict[str, Tensor]:
+        """Return the cones in the last scan, and the observation with the memory updated by them."""
         cones, count = (torch.from_numpy(x) for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy()))
         cones = cones.float()
         observation, valid = self.memory(cones, count)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 
-    def _cross_the_line(self) -> tuple[Tensor, Tensor]:
-        """Count laps; returns the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
+    def _count_laps(self) -> tuple[Tensor, Tensor]:
+        """Count laps; return the lap time in s [B], 0 without a completed lap, and whether one was completed [B]."""
         inside = (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
         entered = inside & ~self.on_line
         finished = entered & (self.clock >= 0)
@@ -228,7 +195,7 @@ class SimulatedRobotEnv(SeededEnv):
 
     def _tensordict(
         self,
-        seen: dict[str, Tensor],
+        view: dict[str, Tensor],
         lap_time: Tensor,
         crashed: Tensor,
         clearance: Tensor,
@@ -239,9 +206,9 @@ class SimulatedRobotEnv(SeededEnv):
             "track": self.track, "lap": self.lap, "lap_time": lap_time, "crashed": crashed,
             "clearance": clearance, "smoothness": smoothness,
         }  # fmt: skip
-        paid = {key: value.unsqueeze(-1) for key, value in terms.items()}
+        reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
         info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
-        info |= {"pose": self.pose.t(), "valid": seen["valid"], "reward": TensorDict(paid, self.batch_size)}
-        entries: dict[str, Any] = {key: seen[key] for key in ("observation", "cones", "cone_count")}
+        info |= {"pose": self.pose.t(), "valid": view["valid"], "reward": TensorDict(reward, self.batch_size)}
+        entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
         entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
         return TensorDict(entries, self.batch_size, device=self.device)
