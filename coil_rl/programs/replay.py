@@ -27,12 +27,17 @@ def replay(config: DictConfig) -> None:
     import torch
     from tqdm import tqdm
 
+    from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
     from coil_rl.replay.open_loop import open_loop
     from coil_rl.replay.report import describe, notes, outcome
+    from coil_rl.train.build import build
 
     torch.set_num_threads(config.threads)
-    env = _build_env(config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # the report mentions recordings that are cut off
+        env = build(config.env, "env", McapReplayEnv)
+    _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)
     with tqdm(total=int(env.length.max()) * len(policies), unit="scan", desc="replay", leave=False) as bar:
 
@@ -52,17 +57,6 @@ def replay(config: DictConfig) -> None:
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):
         print(f"{outcome(result)}; see {destination}")
-
-
-def _build_env(config: DictConfig) -> McapReplayEnv:
-    from coil_rl.envs import McapReplayEnv
-    from coil_rl.train.build import build
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the report mentions recordings that are cut off
-        env: McapReplayEnv = build(config.env, "env", McapReplayEnv)
-    _check_unique("recording", [recording.path for recording in env.recordings])
-    return env
 
 
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:
@@ -99,11 +93,10 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     # The folder of the results is left out, so that it does not change the bytes.
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "run_dir"])
     attachments = {"config.yaml": OmegaConf.to_yaml(settings, resolve=True).encode()}
-    about = {"config_sha256": _sha256(attachments["config.yaml"])}
+    inputs = {"config": attachments["config.yaml"]}
     for name, (run, _) in runs.items():
-        attachments[f"{name}/config.yaml"] = (run / "config.yaml").read_bytes()
-        about[f"{name}_config_sha256"] = _sha256(attachments[f"{name}/config.yaml"])
-        about[f"{name}_checkpoint_sha256"] = _sha256(weights_file(run, config.policy).read_bytes())
+        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = (run / "config.yaml").read_bytes()
+        inputs[f"{name}_checkpoint"] = weights_file(run, config.policy).read_bytes()
     annotate(
         result,
         folder / "annotated.mcap",
@@ -111,7 +104,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
         speed=robot.speed,
         scale=robot.scale,
         laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
-        about=about,
+        about={f"{name}_sha256": hashlib.sha256(content).hexdigest() for name, content in inputs.items()},
         attachments=attachments,
     )
     write_text(folder / "foxglove_layout.json", foxglove_layout(result, scan=robot.scan, command=robot.command))
@@ -145,10 +138,6 @@ def _first_repeated(names: Sequence[str]) -> str | None:
 def _check_unique(key: str, paths: Sequence[Path]) -> None:
     if (repeated := _first_repeated([str(path.resolve()) for path in paths])) is not None:
         raise UserError(f"{key} names {repeated} twice; leave one out")
-
-
-def _sha256(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()
 
 
 def check(config: DictConfig) -> None:

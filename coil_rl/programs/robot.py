@@ -22,13 +22,18 @@ STEPS = {"record": "labelling", "train": "figure_25.md", "drive": "drives", "tab
 def robot(config: DictConfig) -> None:
     """Run the chosen steps; write and print the pages."""
     import torch
+    from tqdm import tqdm
 
+    from coil_rl.envs.robot.drives import record_labelling_drives
     from coil_rl.robot.drivers import record
+    from coil_rl.train.build import build
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     if "record" in config.steps:
-        _record_labelling_drives(config, folder / STEPS["record"])
+        pairs, tests = config.figure_25.pairs, config.figure_25.tests
+        with tqdm(total=2 * pairs + tests, desc="record", unit="drive", leave=False) as bar:
+            config.figure_25.update(record_labelling_drives(folder / STEPS["record"], pairs, tests, bar.update))
     if "train" in config.steps:
         _make_page(config, "figure_25", folder)
     if "drive" in config.steps:
@@ -36,22 +41,12 @@ def robot(config: DictConfig) -> None:
             with open_dict(config):
                 loader = "coil_rl.robot.classifier.load_classifier"
                 config.env.perception.classifier = {"_target_": loader, "path": str(folder / "cones.json")}
-        robots = config.evaluation.repeats * _count_tracks(config)
+        robots = config.evaluation.repeats * len(build(config.track.test, "track.test"))
         record(_drivers(config, robots), folder / STEPS["drive"], robots)
     if "table" in config.steps:
         config.recordings = config.recordings or [str(folder / STEPS["drive"])]
         _make_page(config, "table_6", folder)
     print(f"robot: {', '.join(step for step in STEPS if step in config.steps)} done; see {folder}")
-
-
-def _record_labelling_drives(config: DictConfig, folder: Path) -> None:
-    from tqdm import tqdm
-
-    from coil_rl.envs.robot.drives import record_labelling_drives
-
-    pairs, tests = config.figure_25.pairs, config.figure_25.tests
-    with tqdm(total=2 * pairs + tests, desc="record", unit="drive", leave=False) as bar:
-        config.figure_25.update(record_labelling_drives(folder, pairs, tests, bar.update))
 
 
 def _make_page(config: DictConfig, name: str, folder: Path) -> None:
@@ -62,12 +57,6 @@ def _make_page(config: DictConfig, name: str, folder: Path) -> None:
     text = build(config[name], name, Result).make(folder / name)
     write_text(folder / f"{name}.md", text)
     print(f"{text}\n")
-
-
-def _count_tracks(config: DictConfig) -> int:
-    from coil_rl.train.build import build
-
-    return len(build(config.track.test, "track.test"))
 
 
 def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
@@ -95,6 +84,7 @@ def check(config: DictConfig) -> None:
     Raises:
         UserError: in one sentence, the problem.
     """
+    from coil_rl.envs import SimulatedRobotEnv
     from coil_rl.reproduce import Result
     from coil_rl.train.build import build
     from coil_rl.train.check import check as check_common
@@ -106,8 +96,12 @@ def check(config: DictConfig) -> None:
     for step in config.steps:
         if (folder / STEPS[step]).exists():
             raise UserError(f"{folder} already holds {STEPS[step]}; choose another folder with hydra.run.dir=FOLDER")
-    if "drive" in config.steps:
-        _check_drivers(config)
+    drivers = _drivers(config, len(build(config.track.test, "track.test"))) if "drive" in config.steps else ()
+    for driver in drivers:
+        env, _ = driver.make_env_and_policy()
+        if not isinstance(env.base_env, SimulatedRobotEnv):
+            kind = type(env.base_env).__name__
+            raise UserError(f"{driver.about['policy']} drives a {kind}; give env=simulated_robot")
     if "table" in config.steps and config.recordings:
         build(config.table_6, "table_6", Result)
     elif "table" in config.steps and "drive" not in config.steps and not (folder / STEPS["drive"]).is_dir():
@@ -115,16 +109,6 @@ def check(config: DictConfig) -> None:
     if "train" in config.steps and "record" not in config.steps:
         build(config.figure_25, "figure_25", Result)
     check_common(config)
-
-
-def _check_drivers(config: DictConfig) -> None:
-    from coil_rl.envs import SimulatedRobotEnv
-
-    for driver in _drivers(config, _count_tracks(config)):
-        env, _ = driver.make_env_and_policy()
-        if not isinstance(env.base_env, SimulatedRobotEnv):
-            kind = type(env.base_env).__name__
-            raise UserError(f"{driver.about['policy']} drives a {kind}; give env=simulated_robot")
 
 
 def main() -> None:

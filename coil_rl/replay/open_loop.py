@@ -31,12 +31,10 @@ Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering of one policy at each of N scans.
+    """Steering of one policy at each of N scans, [N] each.
 
-    Attributes:
-        action: [N] the steering that reaches the robot, as a fraction of the maximum; positive to the left.
-        omega: [N] radians/s, turn rate at that steering.
-        smoothness: [N] |a - a_avg|, as in the cone world.
+    `action` is the steering that reaches the robot, as a fraction of the maximum, positive to the left; `omega` the
+    turn rate at that steering, radians/s; `smoothness` |a - a_avg|, as in the cone world.
     """
 
     action: Floats
@@ -86,15 +84,6 @@ def open_loop(
         policies: at least one.
         seed: of PyTorch's generator, set again for each policy.
         tick: called after every scan with the policy's name.
-
-    Example:
-        >>> from coil_rl.guides import ZeroGuide
-        >>> times, ones = np.arange(5) * 10**8, np.ones(5)
-        >>> drive = Recording("drive", False, times, times, np.ones((5, 360), np.float32), ones * 360, -ones, ones / 60)
-        >>> env = McapReplayEnv(drive, lambda ranges, angles: (np.zeros((5, 2, 16, 2)), np.zeros((5, 2))))
-        >>> [result] = open_loop(env, {"straight on": (env, ZeroGuide())})
-        >>> result.steering["straight on"].omega.tolist()
-        [0.0, 0.0, 0.0, 0.0, 0.0]
     """
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}

@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binomtest
-from sklearn.base import clone
-from sklearn.model_selection import GroupKFold
+from sklearn.model_selection import GroupKFold, cross_validate
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
@@ -31,6 +30,7 @@ Integers = NDArray[np.int64]
 Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and the bearings of their beams [P] radians
 
 FOLDS = 5
+EVERY = 4  # scans, as neighbouring scans are nearly equal
 RANGE = 1.0  # m
 MARGIN = 0.15  # m, points this far beyond are clustered too
 RANGE_BINS = (RANGE_MIN, 0.25, 0.5, 0.75, 1.0)  # m
@@ -51,12 +51,9 @@ class Training:
 class LabelledClusters:
     """N clusters with their true cones.
 
-    Attributes:
-        features: [N, 3] m, width, depth, girth.
-        thick: [N] whether the cone is thick.
-        drive, scan, cone: [N] indices of the drive, of the scan in the drive, and of the cone on its track.
-        distance: [N] m, of the centroid.
-        visibility: [N] share of the cone's beams that no nearer cone blocks.
+    The features [N, 3] m are width, depth and girth; `drive`, `scan` and `cone` [N] are indices of the drive, of the
+    scan in the drive, and of the cone on its track; `distance` [N] m is that of the centroid; `visibility` [N] is the
+    share of the cone's beams that no nearer cone blocks.
     """
 
     features: Array
@@ -70,7 +67,7 @@ class LabelledClusters:
 
 @dataclass(frozen=True)
 class Share:
-    """A share with its 95 % interval (Wilson), which is too narrow for the dependent clusters of neighbouring scans."""
+    """A share, with a 95 % interval (Wilson) that assumes independent clusters."""
 
     correct: int
     total: int
@@ -89,7 +86,7 @@ class Share:
         return float(low), float(high)
 
 
-def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS, C: float = 100.0) -> Training:
+def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS) -> Training:
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Args:
@@ -97,7 +94,6 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
         thick: [N] whether the cone is thick.
         drives: [N] group of each cluster; a group is held out as a whole and should have both kinds of cone.
         folds: number of folds.
-        C: penalty of the support vector machine.
 
     Raises:
         UserError: if there are fewer groups than folds, or only one kind of cone.
@@ -107,26 +103,23 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
         raise UserError(f"{groups} drives are too few for {folds} folds; record more, or set folds to at most {groups}")
     if thick.all() or not thick.any():
         raise UserError(f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing")
-    pipeline = make_pipeline(StandardScaler(), SVC(C=C))
-    correct = []
-    for train, test in GroupKFold(folds).split(features, thick, drives):
-        if len(np.unique(thick[train])) < 2:
-            raise UserError("without one fold of drives only one kind of cone is left; number the drives in pairs")
-        predicted = clone(pipeline).fit(features[train], thick[train]).predict(features[test])
-        correct.append(predicted == thick[test])
-    accuracy = np.array([fold.mean() for fold in correct])
-    total_correct = sum(int(fold.sum()) for fold in correct)
-    return Training(cone_classifier(pipeline.fit(features, thick)), accuracy, total_correct, len(features))
+    pipeline = make_pipeline(StandardScaler(), SVC(C=100.0))
+    splits = GroupKFold(folds).split(features, thick, drives)
+    try:
+        predicted = cross_validate(pipeline, features, thick, cv=splits, return_indices=True, error_score="raise")
+    except ValueError:
+        raise UserError(
+            "without one fold of drives only one kind of cone is left; number the drives in pairs"
+        ) from None
+    accuracy = predicted["test_score"]
+    correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
+    return Training(cone_classifier(pipeline.fit(features, thick)), accuracy, correct, len(features))
 
 
-def train_on_drives(left: Sequence[Scans], right: Sequence[Scans], folds: int = FOLDS, every: int = 4) -> Training:
-    """Train on drives past the left cones alone and drives past the right cones alone.
+def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
+    """Train on the scans of drives past left cones alone and past right cones alone.
 
-    Args:
-        left: scans of the former.
-        right: scans of the latter; the k-th drives of both are held out together.
-        folds: greatest number of folds.
-        every: use one of this many scans, as neighbouring scans are nearly equal.
+    The k-th drives of both are held out together.
 
     Raises:
         UserError: as `train_classifier`.
@@ -135,10 +128,10 @@ def train_on_drives(left: Sequence[Scans], right: Sequence[Scans], folds: int = 
     if pairs < 2:
         given = f"{len(left)} drives past left cones and {len(right)} past right ones"
         raise UserError(f"{given} are too few to learn from; record two of each, better five")
-    (thin, thin_drive), (thick, thick_drive) = clusters_in_range(left, every), clusters_in_range(right, every)
+    (thin, thin_drive), (thick, thick_drive) = clusters_in_range(left, EVERY), clusters_in_range(right, EVERY)
     features = np.concatenate([thin, thick])
     is_thick = np.arange(len(features)) >= len(thin)
-    return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(folds, pairs))
+    return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs))
 
 
 def train_on_simulated_drives(seeds: Sequence[int] = range(5)) -> Training:
@@ -186,10 +179,7 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
 
 
 def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, Integers]:
-    """Return the features [N, 3] m of all clusters within 1 m, and the index of their drive [N].
-
-    Only one of `every` scans is used.
-    """
+    """Return the features [N, 3] m of all clusters within 1 m in one of `every` scans, and their drive [N]."""
     features = []
     for ranges, angles in drives:
         points = points_of(ranges[::every], angles, RANGE_MIN, RANGE + MARGIN)

@@ -25,15 +25,6 @@ class Driver:
         name: first part of the names of its recordings.
         about: notes in its recordings: its display name as `policy`, and what distinguishes it from other drivers.
         make_env_and_policy: returns the robots, with the transforms of the policy, and the policy.
-
-    Example:
-        >>> import tempfile
-        >>> from coil_rl.envs import SimulatedRobotEnv
-        >>> from coil_rl.guides import SplineGuide
-        >>> guide = Driver("guide", {"policy": "guide"}, lambda: (SimulatedRobotEnv(time_limit=1.0), SplineGuide()))
-        >>> (recording,) = record([guide], Path(tempfile.mkdtemp()), robots=1)
-        >>> recording.path.name, recording.notes["simulated"]["policy"]
-        ('guide_0.mcap', 'guide')
     """
 
     name: str

@@ -100,18 +100,8 @@ def digest(path: str | os.PathLike[str]) -> str:
 class RecordingWriter:
     """Collects messages and writes them as an MCAP file, ordered by time, at the end of a `with` block.
 
-    Nothing is written if the block raises. The file appears complete or not at all. Equal messages make equal bytes.
-
-    Args:
-        path: destination; its folder is created, an existing file is replaced.
-
-    Example:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "drive.mcap"
-        >>> with RecordingWriter(path) as writer:
-        ...     writer.add("/cmd_vel", "geometry_msgs/msg/Twist", 0, {"linear": {"x": 0.15}})
-        >>> path.exists()
-        True
+    Nothing is written if the block raises. The file appears complete or not at all, and replaces an existing one. Equal
+    messages make equal bytes. See `read_recording` for an example.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

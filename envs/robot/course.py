@@ -72,12 +72,6 @@ class RobotCourse:
 
     Args:
         tracks: in the robot's own metres.
-
-    Example:
-        >>> course = RobotCourse([robot_track()])
-        >>> clearance, _ = course.clearance(torch.tensor([0]), torch.tensor([robot_track().start]).t())
-        >>> round(clearance.item(), 2)
-        0.08
     """
 
     def __init__(self, tracks: Sequence[Track]) -> None:

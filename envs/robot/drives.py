@@ -1,9 +1,8 @@
 """Drives of simulated robots: scripted drives with the true cone of each range, and recordings of drives as MCAP.
 
-The cone classifier is trained on two kinds of drive, one past the left cones alone and one past the right ones alone,
-which needs no labelling by hand. In a recording, a scan is stamped with the time of its first beam and logged at the
-time of its last one. A command follows each scan and takes effect during the next one. The odometry has the pose at the
-start of each scan and at the end. The metadata record `track` has the cones and the start, in the odometry's frame.
+In a recording, a scan is stamped with the time of its first beam and logged at the time of its last one. A command
+follows each scan and takes effect during the next one. The odometry has the pose at the start of each scan and at the
+end. The metadata record `track` has the cones and the start, in the odometry's frame.
 """
 
 from __future__ import annotations
@@ -33,6 +32,7 @@ Path = str | os.PathLike[str]
 Sides = Literal["left", "right", "both"]
 
 SPEED = 0.15  # m/s
+SWAY = 0.04  # m, greatest distance to the centre line
 TEST_SEED = 100  # first seed of the test drives; training drives have smaller ones
 MAX_RANGE_ERROR = 0.03  # m, a range with a greater error is an outlier
 
@@ -77,7 +77,6 @@ def simulated_drive(
     track: Track | None = None,
     lidar: SimulatedLidar | None = None,
     laps: int = 1,
-    sway: float = 0.04,
 ) -> SimulatedDrive:
     """Simulate a drive along the centre line of a track.
 
@@ -87,7 +86,6 @@ def simulated_drive(
         track: None for `robot_track()`.
         lidar: None for an RPLIDAR A1M8.
         laps: number of laps.
-        sway: m, greatest distance to the centre line.
 
     Raises:
         ValueError: for unknown sides.
@@ -98,7 +96,7 @@ def simulated_drive(
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(np.tile(middle_line(track, SPEED / lidar.rate), (laps, 1)))
     waves, phase = torch.rand(2, generator=generator, dtype=torch.float64)
-    path = _swaying(line, sway, waves=3 + 5 * float(waves), phase=float(phase))
+    path = _swaying(line, waves=3 + 5 * float(waves), phase=float(phase))
     poses = _poses(path, lidar.phase)
     cones, radius = cones_of(track, left=sides != "right", right=sides != "left")
     true, hit = cast_beams(poses, lidar.angles, cones, radius)
@@ -110,9 +108,9 @@ def simulated_drive(
     return SimulatedDrive(name, track, sides, seconds, lidar.angles, ranges, hit, poses, cones, radius, visibility)
 
 
-def labelling_drives(seeds: Sequence[int], **options: Any) -> list[SimulatedDrive]:
+def labelling_drives(seeds: Sequence[int]) -> list[SimulatedDrive]:
     """Return, for each seed, a drive past the left cones alone and one past the right cones alone."""
-    return [simulated_drive(side, seed, **options) for seed in seeds for side in ("left", "right")]
+    return [simulated_drive(side, seed) for seed in seeds for side in ("left", "right")]
 
 
 def surveyed_drive(recording: Recording) -> SimulatedDrive:
@@ -172,10 +170,10 @@ def record_labelling_drives(
     Returns:
         The paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap` and so on. `tick` is called after each drive.
     """
-    seeds = {"left": range(pairs), "right": range(pairs), "both": range(TEST_SEED, TEST_SEED + both)}
+    training, test = range(pairs), range(TEST_SEED, TEST_SEED + both)
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}
     for sides in paths:
-        for seed in seeds[sides]:
+        for seed in test if sides == "both" else training:
             paths[sides].append(os.path.join(folder, f"{sides}_{seed}.mcap"))
             save_drive(simulated_drive(sides, seed), paths[sides][-1])
             if tick is not None:
@@ -191,14 +189,10 @@ def record_drives(
     about: Mapping[str, str] | None = None,
     tick: Callable[[], Any] | None = None,
 ) -> None:
-    """Run a policy on simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
+    """Run a policy on B simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
 
-    Args:
-        env: B robots, a `SimulatedRobotEnv` with or without transforms.
-        policy: writes the action, deterministically.
-        paths: B destinations.
-        about: further notes for each file, such as the name of the policy.
-        tick: called after every step.
+    The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically. The entries of
+    `about`, such as the name of the policy, are noted in each file. `tick` is called after every step.
 
     Raises:
         ValueError: if the env is of another kind, or the number of paths is not B.
@@ -251,7 +245,7 @@ def _write(
     commands: Tensor | None,
     notes: Mapping[str, Mapping[str, str]],
 ) -> None:
-    """Write scans [T, P] m, poses [T or more, 3] at the start of each and after, and commands after each [T, 2]."""
+    """Write scans [T, P] m, the poses at their starts and after [T or more, 3], and the commands after them [T, 2]."""
     times = [round(scan / rate * 1e9) for scan in range(max(len(ranges) + 1, len(poses)))]
     beams, angle_min = len(angles), float(angles[0])
     increment = 2 * math.pi / beams
@@ -280,12 +274,12 @@ def _visibility(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hi
     return hits / torch.stack(alone, -1).clamp(min=1)
 
 
-def _swaying(line: Tensor, sway: float, waves: float, phase: float) -> Tensor:
+def _swaying(line: Tensor, waves: float, phase: float) -> Tensor:
     """Displace a closed line [T, 2] sideways by a sine of `waves` periods."""
     along = line.roll(-1, 0) - line.roll(1, 0)
     across = torch.stack([-along[:, 1], along[:, 0]], 1) / along.norm(dim=1, keepdim=True)
     periods = torch.linspace(0, waves, len(line), dtype=line.dtype) + phase
-    return line + sway * (2 * torch.pi * periods).sin().unsqueeze(1) * across
+    return line + SWAY * (2 * torch.pi * periods).sin().unsqueeze(1) * across
 
 
 def _poses(path: Tensor, phase: Tensor) -> Tensor:

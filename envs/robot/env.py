@@ -140,7 +140,8 @@ class SimulatedRobotEnv(SeededEnv):
         # Robots that are not reset perceive their last scan again, which does not change their memory.
         view = self._perceive()
         zero = torch.zeros(self.batch_size)
-        return self._tensordict(view, zero, zero.bool(), zero, zero, dict.fromkeys(REWARD_TERMS, zero))
+        terms = dict.fromkeys(REWARD_TERMS, zero)
+        return self._tensordict(view, terms, lap_time=zero, crashed=zero.bool(), clearance=zero, smoothness=zero)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
@@ -158,7 +159,8 @@ class SimulatedRobotEnv(SeededEnv):
         terms = pay(outcome, self.weights)
         terminated = crashed | (self.lap >= self.laps)
         truncated = (self.steps >= self.max_steps) & ~terminated
-        out = self._tensordict(view, lap_time, crashed, clearance, roughness, terms)
+        info = {"lap_time": lap_time, "crashed": crashed, "clearance": clearance, "smoothness": roughness}
+        out = self._tensordict(view, terms, **info)
         out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
@@ -193,19 +195,8 @@ class SimulatedRobotEnv(SeededEnv):
         self.clock = torch.where(entered, self.steps, self.clock)
         return lap_time, finished
 
-    def _tensordict(
-        self,
-        view: dict[str, Tensor],
-        lap_time: Tensor,
-        crashed: Tensor,
-        clearance: Tensor,
-        smoothness: Tensor,
-        terms: dict[str, Tensor],
-    ) -> TensorDict:
-        columns = {
-            "track": self.track, "lap": self.lap, "lap_time": lap_time, "crashed": crashed,
-            "clearance": clearance, "smoothness": smoothness,
-        }  # fmt: skip
+    def _tensordict(self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor) -> TensorDict:
+        columns = {"track": self.track, "lap": self.lap, **values}
         reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
         info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
         info |= {"pose": self.pose.t(), "valid": view["valid"], "reward": TensorDict(reward, self.batch_size)}

@@ -34,13 +34,9 @@ MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of
 class ConeClassifier:
     """Support vector machine that separates thick from thin cones: a radial kernel on standardised features.
 
-    `coil_rl.robot` trains it with scikit-learn; the decision in NumPy is many times faster for a few clusters.
-
-    Args:
-        mean, scale: [F] mean and standard deviation of each feature.
-        support, weights: [S, F] standardised support vectors, and [S].
-        intercept: added to the weighted sum.
-        gamma: of the kernel exp(-gamma |a - b|^2).
+    `coil_rl.robot` trains it with scikit-learn; the decision in NumPy is many times faster for a few clusters. F
+    features are standardised by `mean` and `scale` [F] and compared with the support vectors [S, F], of weights [S], by
+    the kernel exp(-gamma |a - b|^2).
 
     Raises:
         ValueError: if shapes do not match, a value is not finite, or `scale` or `gamma` is not positive.
@@ -99,13 +95,12 @@ class Perception:
 
     Args:
         classifier: separates thick from thin cones.
-        range_min: m, smaller ranges are no return.
-        range_max: m, range of view.
+        range_min, range_max: m, smaller ranges are no return, and range of view.
         bearing_max: degrees to either side of the heading.
         scale: factor from the robot's metres to those of the cone world.
         laser_yaw: degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
         margin: m, points this far beyond `range_max` are clustered too, so that cones there are complete.
-        gap: m, points closer than this are in one cluster.
+        gap: m, points closer than this are linked.
         kept_cones: K, the nearest cones kept per side.
 
     Raises:
@@ -148,11 +143,7 @@ class Perception:
         self.scale, self.kept_cones = scale, kept_cones
 
     def __call__(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
-        """Return the cones in view.
-
-        Args:
-            ranges: [N, P] m; values that are not finite are no return.
-            angles: [P] radians in the LiDAR's frame, anticlockwise.
+        """Return the cones in view of scans [N, P] m, whose beams have the bearings [P] radians in the LiDAR's frame.
 
         Returns:
             Cones [N, 2, K, 2] m times `scale` in the car's frame (x forward, y left), left side first, nearest first,
