@@ -57,7 +57,7 @@ def notes(max_steering: float) -> str:
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:
-    """Return the mean |a - b| of each pair of policies over the scans with both known, [policies, policies]."""
+    """Return the mean |a - b| of each pair of policies, over the scans with both actions."""
     actions = pd.DataFrame({name: steering.action for name, steering in result.steering.items()})
     return pd.DataFrame({name: actions.sub(actions[name], axis=0).abs().mean() for name in actions})
 

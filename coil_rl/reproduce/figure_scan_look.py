@@ -114,7 +114,7 @@ def look(drive: SimulatedDrive, scan: int, perception: Perception) -> Look:
         radius=drive.radius.double().numpy(),
         estimate=[rows(boundary[:, : FINE if valid[0, side] else 0, side, 0]) for side in (0, 1)],
         samples=memory.samples[..., 0].permute(2, 1, 0).double().numpy() / perception.scale,
-        known=memory.known[:, 0].numpy() > 0,
+        known=memory.ever_valid[:, 0].numpy() > 0,
         observation=observation[0].double().numpy(),
         plan=places_of(guide.plan(seen, count), perception.scale),
         advice=float(steering) * guide.max_steering,

@@ -153,12 +153,14 @@ class McapReplayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
         self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
-        before = self.memory.samples, self.memory.known
+        before = self.memory.samples, self.memory.ever_valid
         self.memory.reset(mask)
         view = self._perceive()
         # Rows that are not reset have this scan in their memory already.
-        now = self.memory.samples, self.memory.known
-        self.memory.samples, self.memory.known = (torch.where(mask, x, y) for x, y in zip(now, before, strict=True))
+        now = self.memory.samples, self.memory.ever_valid
+        self.memory.samples, self.memory.ever_valid = (
+            torch.where(mask, x, y) for x, y in zip(now, before, strict=True)
+        )
         return self._tensordict(view, torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -217,10 +219,12 @@ def _from_start(poses: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([cos * x + sin * y, cos * y - sin * x, heading], axis=1)
 
 
-def _perceive(recording: Recording, perception: Perceive, kept: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _perceive(
+    recording: Recording, perception: Perceive, kept_cones: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2]."""
     scans = len(recording.ranges)
-    all_cones, all_counts = np.zeros((scans, 2, kept, 2), np.float32), np.zeros((scans, 2), np.int64)
+    all_cones, all_counts = np.zeros((scans, 2, kept_cones, 2), np.float32), np.zeros((scans, 2), np.int64)
     layouts = np.stack([recording.points, recording.angle_min, recording.angle_increment], axis=1)
     for layout in np.unique(layouts, axis=0):
         rows = np.flatnonzero((layouts == layout).all(axis=1))
@@ -232,6 +236,6 @@ def _perceive(recording: Recording, perception: Perceive, kept: int) -> tuple[ND
                 f"perception returned cones {cones.shape} and counts {count.shape} for {len(rows)} scans; it must "
                 f"return [{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
             )
-        nearest = min(kept, cones.shape[2])
+        nearest = min(kept_cones, cones.shape[2])
         all_cones[rows, :, :nearest], all_counts[rows] = cones[:, :, :nearest], np.minimum(count, nearest)
     return all_cones, all_counts

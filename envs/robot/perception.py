@@ -208,7 +208,7 @@ class BoundaryMemory(nn.Module):
     """
 
     samples: Tensor
-    known: Tensor
+    ever_valid: Tensor
 
     def __init__(
         self,
@@ -223,7 +223,7 @@ class BoundaryMemory(nn.Module):
         self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
         self.sight = sight
         self.register_buffer("samples", torch.zeros(2, SAMPLES, 2, batch))
-        self.register_buffer("known", torch.zeros(2, batch))
+        self.register_buffer("ever_valid", torch.zeros(2, batch))
 
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Update the memory with the cones in view.
@@ -247,13 +247,13 @@ class BoundaryMemory(nn.Module):
     def remember(self, samples: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
         """Update the memory with the output of `estimate`; return what `forward` does."""
         self.samples = torch.where(valid, samples, self.samples)
-        self.known = torch.where(valid, torch.ones_like(self.known), self.known)
-        return encode(self.samples, self.known, self.sight), valid.t()
+        self.ever_valid = torch.where(valid, torch.ones_like(self.ever_valid), self.ever_valid)
+        return encode(self.samples, self.ever_valid, self.sight), valid.t()
 
     def reset(self, mask: Tensor) -> None:
         """Clear the rows where mask [B] is true."""
         self.samples = self.samples.masked_fill(mask, 0)
-        self.known = self.known.masked_fill(mask, 0)
+        self.ever_valid = self.ever_valid.masked_fill(mask, 0)
 
 
 def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
