@@ -1,53 +1,58 @@
-"""Recordings of a robot that drives, made for tests."""
+"""Recordings of a robot, made for tests."""
 
 import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from coil_rl.envs.recordings.cdr import definition
-from coil_rl.envs.recordings.mcap_files import Source, Stored
-from coil_rl.envs.recordings.ros_messages import LaserScan, Odometry, Twist
-from coil_rl.envs.recordings.writer import RecordingWriter
+from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, twist
 
-TURN = 182_000_000  # ns
+PERIOD = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
-SCAN, ODOMETRY, TWIST = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
 
 
-def scan(turn, points=360, seed=0):
-    """A turn of a scanner as an RPLIDAR gives it, with random ranges of which some are missing."""
-    draw = np.random.default_rng([seed, turn])
+def scan(number, points=360, seed=0, **changed):
+    """A LaserScan of an RPLIDAR, with random ranges of which some are missing."""
+    draw = np.random.default_rng([seed, number])
     ranges = (draw.integers(600, 12_000, points) * 0.00025).astype(np.float32)
     ranges[draw.random(points) < 0.1] = np.inf
-    return LaserScan(START + turn * TURN, -3.1241, 2 * 3.1241 / (points - 1), 0.15, 12.0, ranges, TURN / 1e9)
+    increment = 2 * 3.1241 / (points - 1)
+    fields = {"angle_min": -3.1241, "angle_increment": increment, "range_min": 0.15, "range_max": 12.0}
+    return fields | {"header": header(START + number * PERIOD, "laser"), "ranges": ranges} | changed
+
+
+def odometry_fields(stamp, x, y, heading):
+    """An Odometry message."""
+    pose = {"position": {"x": x, "y": y}, "orientation": {"z": np.sin(heading / 2), "w": np.cos(heading / 2)}}
+    return {"header": header(stamp, "odom"), "pose": {"pose": pose}}
 
 
 def drive(path, scans=60, odometry=False, commands=False, seed=0):
     """A recording on a circle of radius 1 m at 0.15 m/s, anticlockwise from the origin."""
     with RecordingWriter(path) as writer:
-        for turn in range(scans):
-            time, angle = START + turn * TURN, 0.15 * turn * TURN / 1e9
-            writer.add("/scan", SCAN, time=time, data=scan(turn, seed=seed).to_bytes())
+        for number in range(scans):
+            time, angle = START + number * PERIOD, 0.15 * number * PERIOD / 1e9
+            writer.add("/scan", SCAN, time, scan(number, seed=seed))
             if odometry:
-                place = Odometry(time, np.sin(angle), 1 - np.cos(angle), angle, 0.15, 0.15)
-                writer.add("/odom", ODOMETRY, time=time, data=place.to_bytes())
+                writer.add("/odom", ODOMETRY, time, odometry_fields(time, np.sin(angle), 1 - np.cos(angle), angle))
             if commands:
-                writer.add("/cmd_vel", TWIST, time=time, data=Twist(0.15, 0.15).to_bytes())
+                writer.add("/cmd_vel", TWIST, time, twist(0.15, 0.15))
     return path
 
 
-def store(path, *messages, kind=SCAN, topic="/scan", **source):
-    """A recording of messages given as bytes, a second apart."""
-    known = definition(kind) if kind in (SCAN, ODOMETRY, TWIST) else b"float64 data\n"
+def store(path, *messages, kind=SCAN, topic="/scan", **channel):
+    """A recording of messages, given as fields or as bytes, a second apart."""
+    standard = definition(kind) if kind in (SCAN, ODOMETRY, TWIST) else b"float64 data\n"
     with RecordingWriter(path) as writer:
-        for second, data in enumerate(messages):
+        for second, message in enumerate(messages):
             time = START + second * 10**9
-            writer.copy(Stored(Source(topic, kind, **({"definition": known} | source)), time, time, data))
+            data = message if isinstance(message, bytes) else encode(kind, message)
+            writer.copy(RawMessage(Channel(topic, kind, **({"definition": standard} | channel)), time, time, data))
     return path
 
 
 def uncompressed(path):
-    """The same recording in chunks that are not compressed, as ROS 2 writes them unless told otherwise."""
+    """The same recording in chunks that are not compressed, the default of ROS 2."""
     with path.open("rb") as stream:
         messages = list(make_reader(stream).iter_messages())
     with path.open("wb") as stream:
@@ -64,7 +69,7 @@ def uncompressed(path):
 
 
 def flipped(path, chunk=0):
-    """The same recording with one bit turned in the middle of a chunk."""
+    """The same recording with one bit flipped in the middle of a chunk."""
     with path.open("rb") as stream:
         index = make_reader(stream).get_summary().chunk_indexes[chunk]
     data = bytearray(path.read_bytes())

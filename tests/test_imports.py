@@ -13,7 +13,7 @@ TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 # Folder -> allowed imports besides the standard library and the folder itself.
 ALLOWED = {
     "transforms": TENSOR_LIBRARIES,
-    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "mcap_ros2", "rosbags", "gymnasium"},
+    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "rosbags", "gymnasium"},
     "conf": set(),
 }
 

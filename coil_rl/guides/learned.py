@@ -11,7 +11,8 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.train.build import build_bare_env, build_transforms
-from coil_rl.train.load import load_policy, read_config
+from coil_rl.train.load import load_policy
+from coil_rl.train.run_folder import read_config
 
 
 class LearnedGuide(TensorDictModuleBase):

@@ -1,94 +1,155 @@
-"""The recording with what policies would have done beside it, as a file that stands alone and opens in Foxglove."""
+"""Annotated recordings: a copy with the policies' steering and the perceived cones, and a Foxglove layout for it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Iterator, Mapping
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from coil_rl.envs.recordings.mcap_files import digest
-from coil_rl.envs.recordings.replay_messages import add_sight, add_steering, copy_topics
-from coil_rl.envs.recordings.writer import RecordingWriter
+import numpy as np
+from numpy.typing import NDArray
+
+from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
+from coil_rl.envs.recordings.messages import TWIST, header, twist
+from coil_rl.envs.recordings.reading import SIMULATED
+from coil_rl.envs.robot.course import THICK, THIN
+from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
+from coil_rl.envs.track import SIDES
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import style
 
+MARKERS, FLOAT, BOOL = "visualization_msgs/msg/MarkerArray", "std_msgs/msg/Float64", "std_msgs/msg/Bool"
+CYLINDER, LINE_STRIP, DELETE_ALL = 3, 4, 3
+COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
+DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
+CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
+FADED = 0.3  # opacity of a boundary that is only remembered
+
 TRANSFORMS = ("/tf", "/tf_static")
-POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # what stands in the layout that is shipped
+POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
+
+Floats = NDArray[np.floating]
 
 
 def annotate(
-    found: OpenLoop,
+    result: OpenLoop,
     path: Path,
     *,
-    copied: Sequence[str],
+    topics: Collection[str],
     speed: float,
     scale: float,
     laser_yaw: float = 0.0,
     about: Mapping[str, str],
-    attached: Mapping[str, bytes],
+    attachments: Mapping[str, bytes],
 ) -> None:
-    """Write a recording with `/coil/POLICY/steering` and `cmd_vel` of each policy, and what they saw.
+    """Write a recording with the steering of each policy and the perceived cones and boundaries.
 
-    The same replay makes the same bytes. A metadata record `coil` has the SHA-256 of the recording and what is given.
+    Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue
+    right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers are in the
+    scanner's frame. A boundary that is only remembered is faded. Equal results make equal bytes.
 
     Args:
-        found: what was found in the recording.
-        path: the MCAP file to be.
-        copied: topics of the recording that come along, besides its transforms.
+        result: of one recording.
+        path: destination.
+        topics: of the recording, copied besides its transforms.
         speed: m/s of the robot, for the commands.
-        scale: metres of the simulation in one of the robot's.
-        laser_yaw: radians, the bearing of the LiDAR's 0 in the car's frame, anticlockwise.
-        about: what to note there besides.
-        attached: YAML files by name.
+        scale: factor from the robot's metres to those of the cone world.
+        laser_yaw: radians, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
+        about: entries of the metadata record `coil`, to which the SHA-256 of the recording is added.
+        attachments: YAML files by name.
 
     Raises:
         RecordingError: if the recording can no longer be read.
     """
-    recording = found.recording
+    recording = result.recording
+    contents = read_messages(recording.path, [*topics, *TRANSFORMS])
+    times = recording.log_time.tolist()
     with RecordingWriter(path) as writer:
-        copy_topics(writer, recording.path, [*copied, *TRANSFORMS])
-        for policy in found.policies:
-            steering = found.steering[policy]
-            add_steering(writer, policy, recording.log_time, steering.action * found.largest, steering.omega, speed)
-        add_sight(
-            writer, recording.log_time, found.cones, found.count, found.observation, found.valid,
-            frame=recording.frame, laser_yaw=laser_yaw, scale=scale,
-        )  # fmt: skip
-        for name, content in attached.items():
+        for messages in contents.messages.values():
+            for message in messages:
+                writer.copy(message)
+        if SIMULATED in contents.notes:
+            writer.describe(SIMULATED, contents.notes[SIMULATED])
+        for policy in result.policies:
+            steering = result.steering[policy]
+            angles = steering.action * result.max_steering
+            for time, angle, turn_rate in zip(times, angles.tolist(), steering.omega.tolist(), strict=True):
+                writer.add(f"/coil/{policy}/steering", FLOAT, time, {"data": angle})
+                writer.add(f"/coil/{policy}/cmd_vel", TWIST, time, twist(speed, turn_rate))
+        _add_view(writer, result, laser_yaw, scale)
+        for name, content in attachments.items():
             writer.attach(name, "application/yaml", content)
         writer.describe("coil", {**about, "input_sha256": digest(recording.path)})
 
 
-def foxglove_layout(found: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:
-    """The layout that comes with this package, for the policies, the frame and the topics of a replay.
+def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale: float) -> None:
+    cos, sin = math.cos(laser_yaw), math.sin(laser_yaw)
+    to_laser = np.array([[cos, -sin], [sin, cos]]) / scale
+    lines, cones = _boundaries(result.observation) @ to_laser, result.cones @ to_laser
+    ever_valid = np.logical_or.accumulate(result.valid, axis=0)
+    for row, time in enumerate(result.recording.log_time.tolist()):
+        top = header(time, result.recording.frame)
+        cone_markers = [{"header": top, "action": DELETE_ALL}]
+        line_markers = [{"header": top, "action": DELETE_ALL}]
+        for side, name in enumerate(SIDES):
+            cone_markers += _cone_markers(top, name, cones[row, side, : result.count[row, side]])
+            if ever_valid[row, side]:
+                opacity = 1.0 if result.valid[row, side] else FADED
+                line_markers.append(_line_marker(top, name, lines[row, side], opacity))
+        writer.add("/coil/cones", MARKERS, time, {"markers": cone_markers})
+        writer.add("/coil/boundary", MARKERS, time, {"markers": line_markers})
+        writer.add("/coil/valid", BOOL, time, {"data": bool(result.both_valid[row])})
 
-    Args:
-        found: of the replay.
-        scan: topic of the LiDAR.
-        command: topic of what the robot was told.
-    """
+
+def _cone_markers(top: dict[str, Any], side: str, positions: Floats) -> Iterator[dict[str, Any]]:
+    size = {"x": DIAMETERS[side], "y": DIAMETERS[side], "z": CONE_HEIGHT}
+    for number, (x, y) in enumerate(positions.tolist()):
+        pose = {"position": {"x": x, "y": y, "z": CONE_HEIGHT / 2}, "orientation": {"w": 1.0}}
+        colour = COLOURS[side] | {"a": 1.0}
+        yield {
+            "header": top, "ns": side, "id": number, "type": CYLINDER, "pose": pose, "scale": size, "color": colour,
+        }  # fmt: skip
+
+
+def _line_marker(top: dict[str, Any], side: str, points: Floats, opacity: float) -> dict[str, Any]:
+    return {
+        "header": top, "ns": side, "type": LINE_STRIP, "pose": {"orientation": {"w": 1.0}}, "scale": {"x": LINE_WIDTH},
+        "color": COLOURS[side] | {"a": opacity}, "points": [{"x": x, "y": y} for x, y in points.tolist()],
+    }  # fmt: skip
+
+
+def _boundaries(observation: Floats) -> Floats:
+    """Return the boundary samples of observations, [N, 2, 5, 2] m: the inverse of `sight.encode`."""
+    distance, angle = np.moveaxis(observation.reshape(len(observation), 2, SAMPLES, 2), -1, 0)
+    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
+
+
+def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:
+    """Return the shipped Foxglove layout with the policies, the frame and the topics of a recording."""
     text = files("coil_rl.replay").joinpath("foxglove_layout.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = json.loads(text)
     for name, panel in layout["configById"].items():
         if name.startswith("3D!"):
-            # Foxglove knows frames without the leading slash that old drivers write.
-            panel["followTf"] = found.recording.frame.removeprefix("/")
-            panel["topics"] = {scan if topic == SCAN else topic: look for topic, look in panel["topics"].items()}
+            # Old drivers write frames with a leading slash, Foxglove does not.
+            panel["followTf"] = result.recording.frame.removeprefix("/")
+            panel["topics"] = {scan if topic == SCAN else topic: value for topic, value in panel["topics"].items()}
         elif name.startswith("Plot!"):
-            panel["paths"] = [path for given in panel["paths"] for path in _paths(given, found, command)]
+            panel["paths"] = [line for path in panel["paths"] for line in _plot_lines(path, result, command)]
     return json.dumps(layout, indent=2) + "\n"
 
 
-def _paths(given: Mapping[str, Any], found: OpenLoop, command: str | None) -> list[dict[str, Any]]:
-    """What a line of the shipped layout becomes: one for each policy, or one of what was recorded, if anything was."""
-    if POLICY in given["value"]:
-        colours = style.strong_strokes(found.policies)
+def _plot_lines(path: Mapping[str, Any], result: OpenLoop, command: str | None) -> list[dict[str, Any]]:
+    """Return the lines for a path of the shipped layout: one per policy, or the recorded commands if there are any."""
+    if POLICY in path["value"]:
+        colours = style.strong_strokes(result.policies)
         return [
-            {**given, "value": given["value"].replace(POLICY, policy), "label": policy, "color": colours[policy].colour}
-            for policy in found.policies
+            {**path, "value": path["value"].replace(POLICY, policy), "label": policy, "color": colours[policy].colour}
+            for policy in result.policies
         ]
-    if command is None or RECORDED not in found.steering:
+    if command is None or RECORDED not in result.steering:
         return []
-    return [{**given, "value": given["value"].replace(COMMAND, command)}]
+    return [{**path, "value": path["value"].replace(COMMAND, command)}]

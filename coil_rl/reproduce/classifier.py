@@ -10,20 +10,20 @@ import numpy as np
 from tqdm import tqdm
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
-from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.cone_features import draw_cone_features
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
-from coil_rl.robot import (
+from coil_rl.robot.classifier import (
+    Scans,
     Share,
     accuracy,
-    cone_classifier,
+    clusters_in_range,
     label_clusters,
     recall,
     save_classifier,
     train_on_drives,
 )
-from coil_rl.robot.labelling import Scans, one_sided
 
 PAPER_ACCURACY = Share(240, 243)
 DRAW_EVERY = 4  # scans
@@ -43,7 +43,7 @@ of {kind} drives."""
 class Figure25(Result):
     """Cone classifier, trained on recordings past cones of one side and tested on recordings past both sides.
 
-    The classifier is saved as `cones.skops` next to the picture. Without recordings, drives are simulated.
+    The classifier is saved as `cones.json` next to the picture. Without recordings, drives are simulated.
 
     Args:
         left: recordings past thin cones only, on the left; at least two.
@@ -94,10 +94,10 @@ class Figure25(Result):
         suffix = " (simulated)" if simulated else ""
         left, right = _scans(self.left), _scans(self.right)
         training = train_on_drives(left, right)
-        save_classifier(training.pipeline, stem.with_name("cones.skops"))
-        classifier = cone_classifier(training.pipeline)
+        save_classifier(training.classifier, stem.with_name("cones.json"))
+        classifier = training.classifier
         shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
-        shares["cross-validation"] = {"all": Share(training.right, training.total)}
+        shares["cross-validation"] = {"all": Share(training.correct, training.total)}
         if self.surveyed:
             labelled = label_clusters(self.surveyed)
             shares["accuracy"] = accuracy(classifier, labelled)
@@ -105,7 +105,7 @@ class Figure25(Result):
             drawn = labelled.scan % DRAW_EVERY == 0
             features, thick = labelled.features[drawn], labelled.thick[drawn]
         else:
-            thin_features, thick_features = (one_sided(side, DRAW_EVERY).features for side in (left, right))
+            thin_features, thick_features = (clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
             features = np.concatenate([thin_features, thick_features])
             thick = np.arange(len(features)) >= len(thin_features)
         kind = "test" if self.surveyed else "training"
@@ -122,7 +122,7 @@ class Figure25(Result):
 
 def _row(of: str, share: Share) -> dict[str, Any]:
     low, high = share.interval
-    wrong = share.total - share.right
+    wrong = share.total - share.correct
     return {"of": of, "share": share.share, "low": low, "high": high, "wrong": wrong, "total": share.total}
 
 

@@ -19,9 +19,8 @@ from scipy.spatial import cKDTree
 
 from coil_rl.envs.recordings.reading import SIMULATED, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
-from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, middle_line
-from coil_rl.envs.robot.laps import laps
-from coil_rl.envs.robot.simulated_recordings import track_of
+from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_line
+from coil_rl.envs.robot.drives import track_of
 from coil_rl.envs.track import Track
 from coil_rl.report import style
 from coil_rl.reproduce.result import picture

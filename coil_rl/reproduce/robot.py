@@ -19,10 +19,10 @@ from coil_rl.report.statistics import stratified_bootstrap
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
-from coil_rl.robot.drives import Driver, agent_of, record
+from coil_rl.robot.drivers import Driver, agent_driver, record
 from coil_rl.train.build import build_guides
 from coil_rl.train.evaluate_run import driver_names
-from coil_rl.train.load import read_config
+from coil_rl.train.run_folder import read_config
 
 PAPER_ROBOT: dict[str, dict[str, Any]] = {
     "guide": {"smoothness": 0.265, "lap_time": 43.67, "remark": "sways, stays central"},
@@ -157,7 +157,7 @@ class Table6(Result):
             about = {"policy": display_name, "guide": config}
             yield Driver(display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide))
         for run in selected:
-            yield agent_of(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
+            yield agent_driver(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples: int, seed: int) -> str:

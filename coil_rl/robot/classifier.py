@@ -1,151 +1,254 @@
-"""Training of the cone classifier: a support vector machine, validated drive by drive, kept as a skops file."""
+"""Training and evaluation of the cone classifier: a support vector machine on the features of LiDAR clusters."""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import skops.io
 from numpy.typing import NDArray
-from sklearn.base import clone
-from sklearn.model_selection import GroupKFold
+from scipy.stats import binomtest
+from sklearn.model_selection import GroupKFold, cross_validate
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from coil_rl.envs.robot.clusters import FEATURES
-from coil_rl.envs.robot.cone_classifier import ConeClassifier
+from coil_rl.envs.robot.clusters import FEATURES, measure, points_of, single_linkage
+from coil_rl.envs.robot.drives import SimulatedDrive, labelling_drives
+from coil_rl.envs.robot.lidar import RANGE_MIN
+from coil_rl.envs.robot.perception import ConeClassifier
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
-from coil_rl.robot.labelling import Scans, one_sided
+from coil_rl.files import write_text
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and the bearings of their beams [P] radians
+
 FOLDS = 5
-EVERY = 4
+EVERY = 4  # scans, as neighbouring scans are nearly equal
+RANGE = 1.0  # m
+MARGIN = 0.15  # m, points this far beyond are clustered too
+RANGE_BINS = (RANGE_MIN, 0.25, 0.5, 0.75, 1.0)  # m
+VISIBILITY_BINS = (0.0, 0.5, 0.999, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """A trained classifier and how well others like it did on drives that they did not learn from.
+    """A classifier trained on all drives, and the accuracy of its cross-validation, by fold and in total."""
 
-    Attributes:
-        pipeline: the standardisation and the support vector machine, learned from everything.
-        accuracy: [folds], share of the clusters of left-out drives that were told right.
-        right: how many of them all.
-        total: of how many.
-    """
-
-    pipeline: Pipeline
+    classifier: ConeClassifier
     accuracy: Array
-    right: int
+    correct: int
     total: int
 
 
-def train_classifier(
-    features: Array,
-    thick: NDArray[np.bool_],
-    drives: NDArray[np.int64],
-    folds: int = FOLDS,
-    C: float = 100.0,
-    gamma: float | str = "scale",
-) -> Training:
-    """Learn to tell thick cones from thin ones.
+@dataclass(frozen=True, eq=False)
+class LabelledClusters:
+    """N clusters with their true cones.
 
-    Neighbouring scans show nearly the same, so a fold leaves out whole drives, never single clusters.
+    The features [N, 3] m are width, depth and girth; `drive`, `scan` and `cone` [N] are indices of the drive, of the
+    scan in the drive, and of the cone on its track; `distance` [N] m is that of the centroid; `visibility` [N] is the
+    share of the cone's beams that no nearer cone blocks.
+    """
+
+    features: Array
+    thick: Flags
+    drive: Integers
+    scan: Integers
+    cone: Integers
+    distance: Array
+    visibility: Array
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share, with a 95 % interval (Wilson) that assumes independent clusters."""
+
+    correct: int
+    total: int
+
+    @property
+    def share(self) -> float:
+        """Correct over total, NaN without any."""
+        return self.correct / self.total if self.total else float("nan")
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Lower and upper end of the interval."""
+        if not self.total:
+            return float("nan"), float("nan")
+        low, high = binomtest(self.correct, self.total).proportion_ci(method="wilson")
+        return float(low), float(high)
+
+
+def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS) -> Training:
+    """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Args:
         features: [N, 3] m, width, depth and girth of each cluster.
-        thick: [N], which are of thick cones.
-        drives: [N], from which drive. A drive past left cones and one past right cones that share a number are left out
-            together, so that both kinds are tested.
-        folds: of the cross-validation.
-        C: how much an error costs against a wide margin.
-        gamma: of the kernel, as scikit-learn has it.
+        thick: [N] whether the cone is thick.
+        drives: [N] group of each cluster; a group is held out as a whole and should have both kinds of cone.
+        folds: number of folds.
 
     Raises:
-        UserError: if there are fewer drives than folds, or only one kind of cone.
+        UserError: if there are fewer groups than folds, or only one kind of cone.
     """
-    found = len(np.unique(drives))
-    if found < max(2, folds):
-        raise UserError(f"{found} drives are too few for {folds} folds; record more, or set folds to at most {found}")
+    groups = len(np.unique(drives))
+    if groups < max(2, folds):
+        raise UserError(f"{groups} drives are too few for {folds} folds; record more, or set folds to at most {groups}")
     if thick.all() or not thick.any():
         raise UserError(f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing")
-    pipeline = make_pipeline(StandardScaler(), SVC(C=C, gamma=gamma))
-    right = []
-    for train, test in GroupKFold(folds).split(features, thick, drives):
-        if len(np.unique(thick[train])) < 2:
-            raise UserError("without one fold of drives only one kind of cone is left; number the drives in pairs")
-        fitted = clone(pipeline).fit(features[train], thick[train])
-        right.append(fitted.predict(features[test]) == thick[test])
-    accuracy = np.array([fold.mean() for fold in right])
-    return Training(pipeline.fit(features, thick), accuracy, sum(int(fold.sum()) for fold in right), len(features))
+    pipeline = make_pipeline(StandardScaler(), SVC(C=100.0))
+    splits = GroupKFold(folds).split(features, thick, drives)
+    try:
+        predicted = cross_validate(pipeline, features, thick, cv=splits, return_indices=True, error_score="raise")
+    except ValueError:
+        raise UserError(
+            "without one fold of drives only one kind of cone is left; number the drives in pairs"
+        ) from None
+    accuracy = predicted["test_score"]
+    correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
+    return Training(cone_classifier(pipeline.fit(features, thick)), accuracy, correct, len(features))
 
 
-def train_on_drives(left: Sequence[Scans], right: Sequence[Scans], folds: int = FOLDS, every: int = EVERY) -> Training:
-    """Learn from drives past left cones alone and drives past right cones alone: nobody has to label anything.
+def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
+    """Train on the scans of drives past left cones alone and past right cones alone.
 
-    Args:
-        left: scans of the former.
-        right: scans of the latter; the k-th drives of both are left out together.
-        folds: of the cross-validation, at most.
-        every: of so many scans one is learned from, for neighbouring ones show nearly the same.
+    The k-th drives of both are held out together.
 
     Raises:
         UserError: as `train_classifier`.
     """
-    if min(len(left), len(right)) < 2:
-        found = f"{len(left)} drives past left cones and {len(right)} past right ones"
-        raise UserError(f"{found} are too few to learn from; record two of each, better five")
     pairs = min(len(left), len(right))
-    thin, thick = one_sided(left, every), one_sided(right, every)
-    features = np.concatenate([thin.features, thick.features])
-    kind = np.arange(len(features)) >= len(thin.features)
-    return train_classifier(features, kind, np.concatenate([thin.drive, thick.drive]) % pairs, min(folds, pairs))
+    if pairs < 2:
+        given = f"{len(left)} drives past left cones and {len(right)} past right ones"
+        raise UserError(f"{given} are too few to learn from; record two of each, better five")
+    (thin, thin_drive), (thick, thick_drive) = clusters_in_range(left, EVERY), clusters_in_range(right, EVERY)
+    features = np.concatenate([thin, thick])
+    is_thick = np.arange(len(features)) >= len(thin)
+    return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs))
+
+
+def train_on_simulated_drives(seeds: Sequence[int] = range(5)) -> Training:
+    """Train on a pair of simulated drives per seed; the shipped classifier, `envs/robot/simulated_cones.json`."""
+    drives = [(drive.ranges.numpy(), drive.angles.numpy()) for drive in labelling_drives(seeds)]
+    return train_on_drives(drives[::2], drives[1::2])
 
 
 def cone_classifier(pipeline: Pipeline) -> ConeClassifier:
-    """The numbers of a fitted pipeline, which decide the same without scikit-learn."""
+    """Return the numbers of a fitted `make_pipeline(StandardScaler(), SVC())`."""
     scaler, machine = (step for _, step in pipeline.steps)
-    # What "scale" stood for when it was fitted has no public name.
     return ConeClassifier(
         mean=scaler.mean_,
         scale=scaler.scale_,
         support=machine.support_vectors_,
         weights=machine.dual_coef_[0],
         intercept=float(machine.intercept_[0]),
-        gamma=float(machine._gamma),
+        gamma=float(machine._gamma),  # the value of "scale" has no public name
     )
 
 
-def save_classifier(pipeline: Pipeline, path: str | os.PathLike[str]) -> None:
-    """Write a fitted pipeline as a skops file."""
-    with whole_file(path) as unfinished:
-        skops.io.dump(pipeline, unfinished)
+def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
+    """Write a classifier as JSON."""
+    lines = [
+        f'  "{field.name}": {json.dumps(getattr(classifier, field.name).tolist())}' for field in fields(classifier)
+    ]
+    write_text(Path(path), "{\n" + ",\n".join(lines) + "\n}")
 
 
 def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
-    """Read a skops file of `save_classifier`.
+    """Read a file of `save_classifier`.
 
     Raises:
-        UserError: if it is not there, cannot be read, holds anything that could run code or is no cone classifier.
+        UserError: if it is missing, or not a cone classifier.
     """
     try:
-        pipeline = skops.io.load(Path(path), trusted=[])
+        classifier = ConeClassifier(**json.loads(Path(path).read_text(encoding="utf-8")))
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot") from None
-    except Exception as error:
-        raise UserError(f"{path} holds no classifier to be trusted ({type(error).__name__}); train again") from None
-    if not _is_cone_classifier(pipeline):
-        raise UserError(f"{path} holds a {type(pipeline).__name__}, not a fitted cone classifier; train one")
-    return cone_classifier(pipeline)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-robot steps=[train]") from None
+    if len(classifier.mean) != len(FEATURES):
+        raise UserError(f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again")
+    return classifier
 
 
-def _is_cone_classifier(pipeline: object) -> bool:
-    if not isinstance(pipeline, Pipeline) or [type(step) for _, step in pipeline.steps] != [StandardScaler, SVC]:
-        return False
-    scaler, machine = (step for _, step in pipeline.steps)
-    fitted = hasattr(machine, "support_vectors_") and hasattr(scaler, "mean_")
-    return bool(fitted and machine.kernel == "rbf" and machine.n_features_in_ == len(FEATURES))
+def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, Integers]:
+    """Return the features [N, 3] m of all clusters within 1 m in one of `every` scans, and their drive [N]."""
+    features = []
+    for ranges, angles in drives:
+        points = points_of(ranges[::every], angles, RANGE_MIN, RANGE + MARGIN)
+        clusters = measure(points, single_linkage(points))
+        features.append(clusters.features[np.hypot(*clusters.centroid.T) <= RANGE])
+    return np.concatenate(features), np.repeat(np.arange(len(features)), [len(rows) for rows in features])
+
+
+def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE) -> LabelledClusters:
+    """Return the clusters of drives up to a distance in m, labelled with the cone of most of their points.
+
+    Clusters of outliers alone are left out.
+    """
+    columns: list[list[NDArray[np.generic]]] = []
+    for number, drive in enumerate(drives):
+        points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
+        label = single_linkage(points)
+        clusters = measure(points, label)
+        cone = majority(label, drive.hit.numpy()[points.scan, points.beam], drive.cones.shape[1])[clusters.label]
+        distance = np.hypot(*clusters.centroid.T)
+        rows = (distance <= max_distance) & (cone >= 0)
+        cone, scan = cone[rows], clusters.scan[rows]
+        thick, visibility = drive.thick.numpy()[cone], drive.visibility.numpy()[scan, cone]
+        drive_index = np.full(len(cone), number)
+        columns.append([clusters.features[rows], thick, drive_index, scan, cone, distance[rows], visibility])
+    return LabelledClusters(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+
+
+def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
+    """Return the share of correctly classified clusters: `all`, by range, and by visibility of the cone."""
+    correct = classifier.thick(labelled.features) == labelled.thick
+    return _shares(correct, labelled.distance, labelled.visibility)
+
+
+def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict[str, dict[str, Share]]:
+    """Return the share of `thin` and of `thick` cones with a correctly classified cluster.
+
+    A cone counts if its surface is in range and at least one beam hits it. Shares: `all`, by range, by visibility.
+    """
+    labelled = label_clusters(drives, RANGE + MARGIN)
+    correct = classifier.thick(labelled.features) == labelled.thick
+    columns: dict[str, list[list[Array]]] = {"thin": [], "thick": []}
+    for number, drive in enumerate(drives):
+        offset = drive.cones[:, None] - drive.poses[:2, :, 0, None]
+        distance = (offset.norm(dim=0) - drive.radius).numpy()
+        visibility = drive.visibility.numpy()
+        recognised = np.zeros(distance.shape, dtype=bool)
+        rows = (labelled.drive == number) & correct
+        recognised[labelled.scan[rows], labelled.cone[rows]] = True
+        in_range = (distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0)
+        for name, thick in (("thin", False), ("thick", True)):
+            cells = in_range & (drive.thick.numpy() == thick)
+            columns[name].append([recognised[cells].astype(float), distance[cells], visibility[cells]])
+    return {
+        name: _shares(*(np.concatenate(column) for column in zip(*rows, strict=True))) for name, rows in columns.items()
+    }
+
+
+def majority(label: Integers, cone: Integers, cones: int) -> Integers:
+    """Return the cone of most points of each label, -1 for none; `label` and `cone` [M] are those of each point."""
+    votes = np.zeros((int(label.max(initial=-1)) + 1, cones + 1), dtype=np.int64)
+    np.add.at(votes, (label, cone), 1)
+    return np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)
+
+
+def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
+    shares = {"all": Share(int(correct.sum()), len(correct))}
+    for name, value, bins in (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS)):
+        for low, high in pairwise(bins):
+            rows = (value > low) & (value <= high)
+            shares[f"{low:g}-{high:g} {name}"] = Share(int(correct[rows].sum()), int(rows.sum()))
+    return shares

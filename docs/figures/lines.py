@@ -28,6 +28,7 @@ from coil_rl.train import load
 from coil_rl.train.build import build, build_env
 from coil_rl.train.evaluate_run import drive_guides
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.run_folder import read_config
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track
@@ -74,7 +75,7 @@ class StraightTrack:
 
 def drive(runs: Sequence[Path], count: int, policy: str) -> tuple[list[Track], dict[str, EvaluationResult]]:
     """Return the first test tracks of the first run, and the drives of its guide and of every agent there."""
-    configs = [load.read_config(run, "run", {"device": "cpu"}) for run in runs]
+    configs = [read_config(run, "run", {"device": "cpu"}) for run in runs]
     tracks: list[Track] = build(configs[0].track.test, "track.test")[:count]
     names = [track.name for track in tracks]
     drives = drive_guides(configs[0], configs[0].evaluation.env, names)

@@ -18,15 +18,15 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Rectangle
 
 from coil_rl.envs import Perception, SimulatedDrive, simulated_cone_classifier, simulated_drive
-from coil_rl.envs.robot.boundary_memory import BoundaryMemory
 from coil_rl.envs.robot.clusters import measure, points_of, single_linkage
 from coil_rl.envs.robot.course import OUTLINE
-from coil_rl.envs.robot.lidar import MOST
+from coil_rl.envs.robot.lidar import RANGE_MAX
+from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.envs.sight import Frame
 from coil_rl.guides import SplineGuide
 from coil_rl.report import style
 from coil_rl.reproduce.result import picture
-from coil_rl.robot.labelling import majority
+from coil_rl.robot.classifier import majority
 
 SEED = 100  # of a drive that is not in the classifier's training set
 SCAN = 61  # one cluster of this scan is classified wrongly
@@ -42,7 +42,7 @@ def draw_scan(axes: Axes, drive: SimulatedDrive, perception: Perception) -> None
     for centre, radius, thick in zip(centres, drive.radius.tolist(), drive.thick.tolist(), strict=True):
         axes.add_patch(Circle(tuple(centre), radius, fc=CONE_COLOURS[thick], ec="none", alpha=0.35, zorder=2.5))
 
-    returns = points_of(ranges, angles + perception.laser_yaw, perception.range_min, MOST)
+    returns = points_of(ranges, angles + perception.laser_yaw, perception.range_min, RANGE_MAX)
     axes.plot(*facing_up(np.stack([returns.x, returns.y], 1)).T, ".", ms=3, color=style.KERB, zorder=3)
     points = perception.points(ranges, angles)
     label = single_linkage(points, perception.gap)
@@ -79,7 +79,7 @@ def draw_guidance(axes: Axes, drive: SimulatedDrive, perception: Perception) -> 
     boundary = memory.fit(cones.permute(3, 2, 1, 0), count.t())
     samples = memory.samples[..., 0].permute(2, 1, 0).double().numpy() / perception.scale
     for side in (0, 1):
-        if memory.known[side, 0] > 0:
+        if memory.ever_valid[side, 0] > 0:
             valid_side = bool(valid[0, side])
             ego_view.draw_boundary(axes, boundary, side, valid_side, samples[side], perception.scale)
     ego_view.draw_plan(axes, guide.plan(cones, count), perception.scale)

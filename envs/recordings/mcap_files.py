@@ -1,221 +1,257 @@
-"""MCAP files and rosbag2 directories: the messages in them, and in one sentence what is wrong with a file."""
+"""MCAP files and rosbag2 folders: reading and writing of encoded messages."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
+from mcap import records
 from mcap.exceptions import RecordLengthLimitExceeded
-from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.writer import CompressionType, Writer
+
+from coil_rl.envs.recordings.messages import definition, encode
 
 MAGIC = b"\x89MCAP0\r\n"
+# If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
+CHUNK = 128 * 1024  # bytes
 
-# What else is found under the name of a recording: its first bytes, what it is, and what to do.
-_OTHERS = {
-    b"version https://git-lfs": ("is a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
-    b"#ROSBAG V": ("is a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
+# First bytes of other files with the name of a recording, what they are, and the remedy.
+_OTHER_FORMATS = {
+    b"version https://git-lfs": ("a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
+    b"#ROSBAG V": ("a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
     b"SQLite format 3\0": (
-        "is the SQLite storage of a ROS 2 bag",
+        "the SQLite storage of a ROS 2 bag",
         "convert its folder: rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap",
     ),
-    b"\x28\xb5\x2f\xfd": ("is compressed as a whole with zstd", "unpack it: zstd -d FILE -o OTHER.mcap"),
-    b"\x1f\x8b": ("is compressed as a whole with gzip", "unpack it first"),
-    b"\x04\x22\x4d\x18": ("is compressed as a whole with lz4", "unpack it first"),
-    b"PK\x03\x04": ("is a zip archive", "unpack it first"),
+    b"\x28\xb5\x2f\xfd": ("compressed as a whole with zstd", "unpack it: zstd -d FILE -o OTHER.mcap"),
+    b"\x1f\x8b": ("compressed as a whole with gzip", "unpack it first"),
+    b"\x04\x22\x4d\x18": ("compressed as a whole with lz4", "unpack it first"),
+    b"PK\x03\x04": ("a zip archive", "unpack it first"),
 }
 
 
 class RecordingError(ValueError):
-    """A recording cannot be used; the message is one sentence for whoever made it."""
+    """A recording that cannot be used; the message is one sentence for the user."""
 
 
-class Source(NamedTuple):
-    """Where messages of a topic come from.
-
-    Attributes:
-        topic: its name.
-        kind: type of its messages, such as "sensor_msgs/msg/LaserScan"; empty where the file does not say.
-        encoding: of the messages, such as "cdr".
-        language: of the definition, such as "ros2msg".
-        definition: of the type.
-    """
+class Channel(NamedTuple):
+    """A topic with its message type and the type's definition; the type is empty if the file has none."""
 
     topic: str
-    kind: str
+    message_type: str
     encoding: str = "cdr"
     language: str = "ros2msg"
     definition: bytes = b""
 
 
-class Stored(NamedTuple):
-    """A message as it is stored.
+class RawMessage(NamedTuple):
+    """An encoded message; times in ns."""
 
-    Attributes:
-        source: where it comes from.
-        log_time: ns, when it was recorded.
-        publish_time: ns, when it was sent.
-        data: its bytes.
-    """
-
-    source: Source
+    channel: Channel
     log_time: int
     publish_time: int
     data: bytes
 
 
 class Contents(NamedTuple):
-    """What a recording holds.
+    """All channels of a recording, the messages by topic in order of log time, and the metadata records by name."""
 
-    Attributes:
-        sources: of all topics.
-        messages: of the topics asked for, each topic's in the order of their log times.
-        cut_off: whether the recording ends too early.
-        notes: its metadata records, by name.
-    """
-
-    sources: list[Source]
-    messages: dict[str, list[Stored]]
+    channels: list[Channel]
+    messages: dict[str, list[RawMessage]]
     cut_off: bool
     notes: dict[str, dict[str, str]]
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
-    """Read a recording from beginning to end, checksums verified.
+    """Read a recording from start to end, with its checksums verified.
 
     Args:
-        path: an MCAP file, or the directory of a rosbag2 recording in such files.
-        topics: names of those whose messages to keep; None keeps all. One that is not there has no messages.
+        path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
+        topics: topics to read; None for all. A missing one has no messages.
 
     Raises:
-        RecordingError: if this is no recording, or a damaged one. One that only ends too early is read as far as it
-            goes.
+        RecordingError: if this is not a recording, or a damaged one. One that ends early is read as far as it goes.
     """
-    sources: dict[Source, None] = {}
-    messages: dict[str, list[Stored]] = {topic: [] for topic in topics or ()}
-    notes: dict[str, dict[str, str]] = {}
-    cut_off = False
-    for file in _files(Path(path)):
-        cut_off |= _read_file(file, topics, sources, messages, notes)
-    for stored in messages.values():
-        stored.sort(key=lambda message: message.log_time)
-    return Contents(list(sources), messages, cut_off, notes)
+    contents = Contents([], {topic: [] for topic in topics or ()}, False, {})
+    cut_off = [_read_file(file, topics, contents) for file in _files(Path(path))]
+    for messages in contents.messages.values():
+        messages.sort(key=lambda message: message.log_time)
+    return contents._replace(channels=list(dict.fromkeys(contents.channels)), cut_off=any(cut_off))
 
 
 def digest(path: str | os.PathLike[str]) -> str:
-    """SHA-256 of a recording, in hexadecimal; of a directory, of all its files one after the other.
+    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files.
 
     Raises:
         RecordingError: if there is no such recording.
     """
-    whole = hashlib.sha256()
+    sha256 = hashlib.sha256()
     for file in _files(Path(path)):
-        _check_kind(file)
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                whole.update(block)
-    return whole.hexdigest()
+        _check_format(file)
+        sha256.update(file.read_bytes())
+    return sha256.hexdigest()
 
 
-def _read_file(
-    file: Path,
-    topics: Collection[str] | None,
-    sources: dict[Source, None],
-    messages: dict[str, list[Stored]],
-    notes: dict[str, dict[str, str]],
-) -> bool:
-    """Add what a file holds; returns whether it ends too early."""
-    size, whole = _check_kind(file)
-    wanted: dict[int, tuple[Source, list[Stored]]] = {}
-    schemas: dict[int, Schema] = {}
+class RecordingWriter:
+    """Collects messages and writes them as an MCAP file, ordered by time, at the end of a `with` block.
+
+    Nothing is written if the block raises. The file appears complete or not at all, and replaces an existing one. Equal
+    messages make equal bytes. See `read_recording` for an example.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._messages: list[RawMessage] = []
+        self._metadata: dict[str, dict[str, str]] = {}
+        self._attachments: dict[str, tuple[str, bytes]] = {}
+
+    def add(self, topic: str, message_type: str, time: int, fields: Mapping[str, Any]) -> None:
+        """Add a message; the time in ns, the type and fields as in `messages.encode`.
+
+        Raises:
+            ValueError: for an unknown type or field.
+        """
+        channel = Channel(topic, message_type, definition=definition(message_type))
+        self.copy(RawMessage(channel, time, time, encode(message_type, fields)))
+
+    def copy(self, message: RawMessage) -> None:
+        """Add an encoded message, such as one of another recording."""
+        self._messages.append(message)
+
+    def describe(self, name: str, entries: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        self._metadata[name] = dict(sorted(entries.items()))
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Add an attachment, such as a configuration."""
+        self._attachments[name] = media_type, data
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+        if error is not None:
+            return
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        unfinished = self.path.with_name(f".{self.path.stem}.{os.getpid()}{self.path.suffix}")
+        try:
+            with unfinished.open("wb") as stream:
+                self._write(Writer(stream, CHUNK, CompressionType.ZSTD, enable_data_crcs=True))
+                stream.flush()
+                os.fsync(stream.fileno())
+            unfinished.replace(self.path)
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+    def _write(self, writer: Writer) -> None:
+        writer.start(profile="ros2", library="coil-rl")
+        for name, entries in sorted(self._metadata.items()):
+            writer.add_metadata(name, entries)
+        start = min((message.log_time for message in self._messages), default=0)
+        for name, (media_type, data) in sorted(self._attachments.items()):
+            writer.add_attachment(start, start, name, media_type, data)
+
+        schemas: dict[tuple[str, str, bytes], int] = {}
+        channels: dict[Channel, int] = {}
+        for channel in sorted({message.channel for message in self._messages}):
+            schema = (channel.message_type, channel.language, channel.definition)
+            if channel.message_type and schema not in schemas:
+                schemas[schema] = writer.register_schema(*schema)
+            channels[channel] = writer.register_channel(channel.topic, channel.encoding, schemas.get(schema, 0))
+        for message in sorted(self._messages, key=lambda message: (message.log_time, message.channel)):
+            writer.add_message(channels[message.channel], message.log_time, message.data, message.publish_time)
+        writer.finish()
+
+
+def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -> bool:
+    """Add the contents of a file; return whether it ends early."""
+    size, complete = _check_format(file)
+    selected: dict[int, tuple[Channel, list[RawMessage]]] = {}
+    schemas: dict[int, records.Schema] = {}
     last = None
     with file.open("rb") as stream:
-        records = StreamReader(stream, validate_crcs=True, record_size_limit=size).records
+        reader = StreamReader(stream, validate_crcs=True, record_size_limit=size)
         try:
-            for record in records:
-                if type(record) is Message:
+            for record in reader.records:
+                if type(record) is records.Message:
                     last = record
-                    if record.channel_id in wanted:
-                        source, kept = wanted[record.channel_id]
-                        kept.append(Stored(source, record.log_time, record.publish_time, record.data))
-                elif type(record) is Schema:
+                    if record.channel_id in selected:
+                        channel, messages = selected[record.channel_id]
+                        messages.append(RawMessage(channel, record.log_time, record.publish_time, record.data))
+                elif type(record) is records.Schema:
                     schemas[record.id] = record
-                elif type(record) is Channel:
-                    source = _source(record, schemas)
-                    sources[source] = None
-                    if topics is None or source.topic in topics:
-                        wanted[record.id] = source, messages.setdefault(source.topic, [])
-                elif type(record) is Metadata:
-                    notes[record.name] = dict(record.metadata)
-        # Damaged bytes make the libraries beneath raise almost anything.
-        except Exception as error:
-            if not whole and (stream.tell() >= size or isinstance(error, RecordLengthLimitExceeded)):
+                elif type(record) is records.Channel:
+                    channel = _channel(record, schemas)
+                    contents.channels.append(channel)
+                    if topics is None or channel.topic in topics:
+                        selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
+                elif type(record) is records.Metadata:
+                    contents.notes[record.name] = dict(record.metadata)
+        except Exception as error:  # damaged bytes raise almost any exception in the libraries below
+            if not complete and (stream.tell() >= size or isinstance(error, RecordLengthLimitExceeded)):
                 return True
-            where = f"byte {stream.tell()}" + (f", after {last.log_time / 1e9:.3f} s" if last else "")
-            what = " ".join(str(error).split()) or type(error).__name__
+            position = f"byte {stream.tell()}" + (f", after {last.log_time / 1e9:.3f} s" if last else "")
+            reason = " ".join(str(error).split()) or type(error).__name__
             raise RecordingError(
-                f"{file} is damaged before {where} ({what}); copy it anew from where it was "
+                f"{file} is damaged before {position} ({reason}); copy it again from where it was "
                 "recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
             ) from None
     return False
 
 
-def _source(channel: Channel, schemas: dict[int, Schema]) -> Source:
-    if channel.schema_id == 0:
-        return Source(channel.topic, "", channel.message_encoding, "", b"")
-    schema = schemas[channel.schema_id]
-    return Source(channel.topic, schema.name, channel.message_encoding, schema.encoding, schema.data)
+def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:
+    if record.schema_id == 0:
+        return Channel(record.topic, "", record.message_encoding, "", b"")
+    schema = schemas[record.schema_id]
+    return Channel(record.topic, schema.name, record.message_encoding, schema.encoding, schema.data)
 
 
-def _check_kind(file: Path) -> tuple[int, bool]:
-    """The size of an MCAP file in bytes, and whether it ends as one does; whatever else it is, is refused."""
+def _check_format(file: Path) -> tuple[int, bool]:
+    """Return the size of an MCAP file in bytes and whether its end is there; raise for any other file."""
     try:
         with file.open("rb") as stream:
             start = stream.read(32)
             size = stream.seek(0, os.SEEK_END)
             stream.seek(max(0, size - len(MAGIC)))
-            whole = stream.read() == MAGIC and size > len(MAGIC)
+            complete = stream.read() == MAGIC and size > len(MAGIC)
     except OSError as error:
         raise RecordingError(f"{file} cannot be read ({error.strerror}); give the path of an MCAP file.") from None
     if not start:
-        raise RecordingError(f"{file} is empty; copy it anew from where it was recorded.")
+        raise RecordingError(f"{file} is empty; copy it again from where it was recorded.")
     if MAGIC.startswith(start[: len(MAGIC)]):
-        return size, whole
-    for magic, (what, remedy) in _OTHERS.items():
+        return size, complete
+    for magic, (description, remedy) in _OTHER_FORMATS.items():
         if start.startswith(magic):
-            raise RecordingError(f"{file} {what}; {remedy}.")
+            raise RecordingError(f"{file} is {description}; {remedy}.")
     raise RecordingError(f"{file} is not an MCAP file: it begins with {start[:8].hex(' ')}; give one that is.")
 
 
 def _files(path: Path) -> Iterator[Path]:
-    """The file, or those of which a rosbag2 directory says that it consists."""
+    """Yield the file itself, or the files that the metadata of a rosbag2 folder lists."""
     if not path.is_dir():
         yield path
         return
+    metadata, reindex = path / "metadata.yaml", "let ROS write it: ros2 bag reindex FOLDER."
     try:
-        # A machine wrote it, so two of its lines are found without a parser.
-        text = (path / "metadata.yaml").read_text(encoding="utf-8")
+        text = metadata.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise RecordingError(
-            f"{path} is a folder without a readable metadata.yaml; give one MCAP file, or let ROS write that file: "
-            "ros2 bag reindex FOLDER."
-        ) from None
+        raise RecordingError(f"{path} is a folder without a readable metadata.yaml; {reindex}") from None
+    # The file is written by a program, so two of its lines are found without a YAML parser.
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
     listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
     if storage and storage[1] != "mcap":
-        raise RecordingError(
-            f"{path} is a recording in {storage[1]}, not in MCAP; convert it: "
-            "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap."
-        )
+        convert = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
+        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {convert}.")
     if not listed:
-        raise RecordingError(f"{path / 'metadata.yaml'} lists no files; let ROS write it: ros2 bag reindex FOLDER.")
+        raise RecordingError(f"{metadata} lists no files; {reindex}")
     for line in listed[1].splitlines():
-        # Older versions of ROS write the folder's own name before the file's.
+        # Older versions of ROS put the folder's own name before the file's.
         file = path / Path(line.strip().removeprefix("-").strip(" \"'")).name
         if not file.is_file():
-            raise RecordingError(f"{path / 'metadata.yaml'} lists {file.name}, which is not there; copy all its files.")
+            raise RecordingError(f"{metadata} lists {file.name}, which is missing; copy all its files.")
         yield file

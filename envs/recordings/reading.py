@@ -1,24 +1,22 @@
-"""A robot's recording as arrays: turns of its LiDAR, where it was, and how it was told to move."""
+"""Robot recordings as arrays: LiDAR scans, odometry and commands."""
 
 from __future__ import annotations
 
 import os
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import Schema
 from numpy.typing import NDArray
 
-from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, Source, read_messages
-from coil_rl.envs.recordings.ros_messages import LaserScan, decoder, from_fields
+from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, read_messages
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, decode, pose_of, stamp_of
 
-SIMULATED = "simulated"  # the metadata record that says so
-SCAN, ODOMETRY, TWIST = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
+SIMULATED = "simulated"  # metadata record of simulated recordings
+REMEDY = "record it again, or correct the program that sent it"
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -26,22 +24,20 @@ Times = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Recording:
-    """N turns of a LiDAR, and what else is known about the drive.
+    """N scans of a LiDAR, with the odometry and the commands of the drive.
 
     Attributes:
-        path: where it was read from.
-        cut_off: whether the file ends too early.
-        log_time: [N] ns, when each turn was recorded, in order.
-        stamp: [N] ns, when each turn began, by the scanner's clock.
-        ranges: [N, P] m, float32; inf where nothing came back: what is no number or outside of the scanner's range, and
-            beyond the points that a turn has.
-        points: [N], how many ranges each turn has.
-        angle_min: [N] radians, of the first range.
-        angle_increment: [N] radians from one range to the next, negative for a scanner that turns clockwise.
-        odometry: where the robot was: [M, 3] m, m, radians, and at which log time and stamp [M] ns; None if unknown.
-        commands: how it was told to move: [M, 2] m/s, radians/s, and at which log time [M] ns; None if unknown.
-        frame: in which the scanner measures.
-        notes: its metadata records, by name.
+        path: of the file or folder.
+        cut_off: whether the file ends early.
+        log_time: [N] ns, ascending.
+        stamp: [N] ns, start of each scan by the scanner's clock.
+        ranges: [N, P] m, float32; inf for values that are not finite or outside the scanner's range, and for padding.
+        points: [N] number of ranges of each scan.
+        angle_min, angle_increment: [N] radians, bearing of the first range, and step, negative for clockwise rotation.
+        odometry: poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
+        commands: [M, 2] m/s, radians/s, with their log times [M] ns; None without commands.
+        frame: of the scanner.
+        notes: metadata records by name.
     """
 
     path: Path
@@ -59,35 +55,34 @@ class Recording:
 
     @property
     def simulated(self) -> bool:
-        """Whether the recording says that it is."""
+        """Whether the metadata marks the recording as simulated."""
         return SIMULATED in self.notes
 
     @property
     def seconds(self) -> Floats:
-        """[N] s since the first turn: by the scanner's clock unless that one ever runs backwards."""
-        clock = self.stamp if _runs_forwards(self.stamp) else self.log_time
+        """[N] s since the first scan, by the scanner's clock, or by log time if that clock is not ascending."""
+        clock = self.stamp if _ascending(self.stamp) else self.log_time
         return (clock - clock[0]) / 1e9
 
-    def angles(self, turn: int) -> Floats:
-        """[P] radians, the bearings of a turn's ranges."""
-        return self.angle_min[turn] + self.angle_increment[turn] * np.arange(self.ranges.shape[1])
+    def angles(self, scan: int) -> Floats:
+        """Return the bearings of a scan's ranges, [P] radians."""
+        return self.angle_min[scan] + self.angle_increment[scan] * np.arange(self.ranges.shape[1])
 
     def poses(self) -> Floats:
-        """[N, 3] m, m, radians: where the robot was when each turn began.
+        """Return the pose at the start of each scan, [N, 3] m, m, radians.
 
-        From the odometry, in between along straight lines; else from the commands, each obeyed until the next; else all
-        zeros, for then nothing says that it moved.
+        Interpolated from the odometry; without odometry integrated from the commands; zeros without either.
         """
         if self.odometry is not None:
             pose, log_time, stamp = self.odometry
-            stamped = _runs_forwards(self.stamp) and _runs_forwards(stamp)
-            when, known = (self.stamp, stamp) if stamped else (self.log_time, log_time)
-            # In floating point the nanoseconds of our days would only be known to a quarter of a microsecond.
-            at, times = (when - known[0]).astype(float), (known - known[0]).astype(float)
+            stamped = _ascending(self.stamp) and _ascending(stamp)
+            scan_time, pose_time = (self.stamp, stamp) if stamped else (self.log_time, log_time)
+            # Relative times, as floating point would round absolute nanoseconds to a quarter of a microsecond.
+            at, times = (scan_time - pose_time[0]).astype(float), (pose_time - pose_time[0]).astype(float)
             columns = [pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2])]
             return np.stack([np.interp(at, times, column) for column in columns], axis=1)
         if self.commands is not None:
-            return _obeyed(*self.commands, self.log_time)
+            return _integrate_commands(*self.commands, self.log_time)
         return np.zeros((len(self.log_time), 3))
 
 
@@ -99,177 +94,149 @@ def read_recording(
     *,
     strict: bool = False,
 ) -> Recording:
-    """Read a recording, an MCAP file or a rosbag2 directory, with ROS 2 messages in CDR.
+    """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
 
     Args:
-        path: where it is.
+        path: of the file or folder.
         scan: topic of the LiDAR.
-        odometry: topic of the odometry; None leaves it out, and one that the recording does not have is left out.
-        command: topic of the commands, likewise.
-        strict: refuse a recording that was cut off, instead of a warning that says how many scans it has.
+        odometry: its topic, or None; ignored if the recording does not have it.
+        command: likewise, for the commands.
+        strict: raise for a recording that is cut off, instead of a warning with the number of scans.
 
     Raises:
-        RecordingError: in one sentence, what is wrong with the recording and what to do.
+        RecordingError: in one sentence, the problem and its remedy.
 
     Example:
         >>> import tempfile
-        >>> from coil_rl.envs.recordings.writer import RecordingWriter
+        >>> from coil_rl.envs.recordings.mcap_files import RecordingWriter
         >>> path = Path(tempfile.mkdtemp()) / "drive.mcap"
-        >>> with RecordingWriter(path) as drive:
-        ...     for turn in range(3):
-        ...         scan = LaserScan(turn * 10**8, -3.14, 0.0175, 0.15, 12.0, np.ones(360))
-        ...         drive.add("/scan", SCAN, time=scan.stamp, data=scan.to_bytes())
+        >>> with RecordingWriter(path) as writer:
+        ...     for time in (0, 10**8, 2 * 10**8):
+        ...         writer.add("/scan", SCAN, time, {"range_max": 12.0, "ranges": np.ones(360)})
         >>> read_recording(path).ranges.shape
         (3, 360)
     """
     path = Path(path)
-    wanted = [(scan, SCAN), *((topic, kind) for topic, kind in ((odometry, ODOMETRY), (command, TWIST)) if topic)]
-    kinds = dict(wanted)
-    if len(kinds) < len(wanted):
+    topics = [(scan, SCAN), *((topic, kind) for topic, kind in ((odometry, ODOMETRY), (command, TWIST)) if topic)]
+    if len(dict(topics)) < len(topics):
         raise RecordingError(f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics.")
-    contents = read_messages(path, kinds)
-    for topic, kind in kinds.items():
-        _check_sources(path, topic, kind, contents)
+    contents = read_messages(path, dict(topics))
+    for topic, message_type in topics:
+        _check_channels(path, topic, message_type, contents)
     if not contents.messages[scan]:
-        raise _without_scans(path, scan, contents)
+        raise _no_scans(path, scan, contents)
     if contents.cut_off:
-        found = f"{path} is cut off: {len(contents.messages[scan])} scans can be read"
+        problem = f"{path} is cut off: {len(contents.messages[scan])} scans can be read"
         if strict:
-            raise RecordingError(
-                f"{found}; copy it anew from where it was recorded, or replay these with strict=false."
-            )
-        warnings.warn(found, stacklevel=2)
+            raise RecordingError(f"{problem}; copy it again from where it was recorded, or set strict=false.")
+        warnings.warn(problem, stacklevel=2)
 
-    time, turns = _decoded(path, scan, contents)
-    recording = _scans(path, scan, contents.cut_off, time, turns)
     extra: dict[str, Any] = {"notes": contents.notes}
     if odometry and contents.messages[odometry]:
-        time, places = _decoded(path, odometry, contents)
-        pose = np.array([(place.x, place.y, place.heading) for place in places])
-        _check_finite(path, odometry, time, pose, "the pose")
-        extra["odometry"] = pose, time, np.array([place.stamp for place in places])
+        time, rows = _decoded(path, odometry, contents, lambda message: (stamp_of(message), pose_of(message)))
+        poses = np.array([pose for _, pose in rows])
+        _check_finite(path, odometry, time, poses, "the pose")
+        extra["odometry"] = poses, time, np.array([stamp for stamp, _ in rows])
     if command and contents.messages[command]:
-        time, twists = _decoded(path, command, contents)
+        time, twists = _decoded(path, command, contents, lambda message: (message.linear.x, message.angular.z))
         _check_finite(path, command, time, np.array(twists), "the command")
         extra["commands"] = np.array(twists), time
-    return Recording(**recording, **extra)
+    return Recording(path=path, cut_off=contents.cut_off, **_scans(path, scan, contents), **extra)
 
 
-def _scans(path: Path, topic: str, cut_off: bool, log_time: Times, turns: Sequence[LaserScan]) -> dict[str, Any]:
-    points = np.array([len(turn.ranges) for turn in turns])
-    limits = np.array([turn[1:5] for turn in turns])  # angle_min, angle_increment, range_min, range_max
-    _check_finite(path, topic, log_time, limits[:, :2], "the angle of its first range, or from one to the next,")
+def _scans(path: Path, topic: str, contents: Contents) -> dict[str, Any]:
+    """Return the fields of a `Recording` that come from the scans."""
+
+    def fields(message: Any) -> tuple[Any, ...]:
+        limits = (message.angle_min, message.angle_increment, message.range_min, message.range_max)
+        return stamp_of(message), message.header.frame_id, limits, np.asarray(message.ranges, np.float32)
+
+    log_time, messages = _decoded(path, topic, contents, fields)
+    stamps, frames, limits_of_scans, scans = zip(*messages, strict=True)
+    limits, points = np.array(limits_of_scans), np.array([len(scan) for scan in scans])
+    _check_finite(path, topic, log_time, limits[:, :2], "the angle of its first range, or between ranges,")
     if not points.any():
         raise RecordingError(
-            f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record it anew."
+            f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record again."
         )
-    if points.min() == points.max():
-        ranges = np.stack([turn.ranges for turn in turns])
-    else:
-        ranges = np.full((len(turns), points.max()), np.inf, np.float32)
-        for row, turn in zip(ranges, turns, strict=True):
-            row[: len(turn.ranges)] = turn.ranges
-    nearest, farthest = limits[:, 2:3].astype(np.float32), limits[:, 3:4].astype(np.float32)
-    ranges[~((ranges >= nearest) & (ranges <= farthest))] = np.inf
+    ranges = np.full((len(scans), points.max()), np.inf, np.float32)
+    for row, scan in zip(ranges, scans, strict=True):
+        row[: len(scan)] = scan
+    range_min, range_max = limits[:, 2:3].astype(np.float32), limits[:, 3:4].astype(np.float32)
+    ranges[~((ranges >= range_min) & (ranges <= range_max))] = np.inf
     return {
-        "path": path, "cut_off": cut_off, "log_time": log_time, "stamp": np.array([turn.stamp for turn in turns]),
-        "ranges": ranges, "points": points, "angle_min": limits[:, 0], "angle_increment": limits[:, 1],
-        "frame": turns[0].frame,
+        "log_time": log_time, "stamp": np.array(stamps), "ranges": ranges, "points": points,
+        "angle_min": limits[:, 0], "angle_increment": limits[:, 1], "frame": frames[0],
     }  # fmt: skip
 
 
-def _obeyed(commands: Floats, since: Times, when: Times) -> Floats:
-    """Poses at the times `when` of a robot that does what it was told last; before the first command it stands."""
-    # Every moment at which a command begins or a pose is asked for, and which command holds from there on.
-    moments = np.union1d(since, when)
-    holds = np.searchsorted(since, moments, side="right") - 1
-    speed, turn_rate = np.where(holds[:, None] < 0, 0.0, commands[holds]).T
+def _integrate_commands(commands: Floats, command_time: Times, time: Times) -> Floats:
+    """Return the poses at `time` if each command holds until the next one; the robot stands before the first."""
+    moments = np.union1d(command_time, time)
+    index = np.searchsorted(command_time, moments, side="right") - 1
+    speed, turn_rate = np.where(index[:, None] < 0, 0.0, commands[index]).T
     step = np.diff(moments, append=moments[-1:]) / 1e9
-    heading = _sum_before(turn_rate * step)
-    # Along an arc the way goes in the direction of its middle.
-    middle = heading + turn_rate * step / 2
-    way = speed * step * np.sinc(turn_rate * step / (2 * np.pi))
-    x, y = _sum_before(way * np.cos(middle)), _sum_before(way * np.sin(middle))
-    return np.stack([x, y, heading], axis=1)[np.searchsorted(moments, when)]
+    heading = np.cumsum(turn_rate * step) - turn_rate * step
+    # The chord of an arc has the direction of the arc's middle.
+    direction = heading + turn_rate * step / 2
+    chord = speed * step * np.sinc(turn_rate * step / (2 * np.pi))
+    x, y = (np.cumsum(part) - part for part in (chord * np.cos(direction), chord * np.sin(direction)))
+    return np.stack([x, y, heading], axis=1)[np.searchsorted(moments, time)]
 
 
-def _sum_before(steps: Floats) -> Floats:
-    return np.cumsum(steps) - steps
-
-
-def _runs_forwards(times: Times) -> bool:
+def _ascending(times: Times) -> bool:
     return bool((np.diff(times) > 0).all())
 
 
-def _decoded(path: Path, topic: str, contents: Contents) -> tuple[Times, list[Any]]:
-    """The log times and the messages of a topic."""
-    stored = contents.messages[topic]
-    decode = decoder(stored[0].source.kind)
-    messages = []
-    for index, (source, log_time, _, data) in enumerate(stored):
+def _decoded(
+    path: Path, topic: str, contents: Contents, fields: Callable[[Any], tuple[Any, ...]]
+) -> tuple[Times, list[tuple[Any, ...]]]:
+    """Return the log times of a topic, and the chosen fields of its messages."""
+    rows = []
+    for index, (channel, log_time, _, data) in enumerate(contents.messages[topic]):
         try:
-            messages.append(decode(data))
-        except ValueError as error:
-            remedy = "record it anew, or mend the program that sent it"
-            try:
-                messages.append(from_fields(source.kind, _by_definition(source)(data)))
-                continue
-            except ImportError:
-                remedy += "; if its layout is another one, python -m pip install 'coil-rl[ros]' reads that too"
-            # The bytes and the definition may be anything, and so is what the library makes of them.
-            except Exception:
-                pass
-            raise _error(path, topic, index, log_time, str(error), remedy) from None
-    return np.array([message.log_time for message in stored]), messages
+            rows.append(fields(decode(data, channel.message_type, channel.language, channel.definition)))
+        except Exception as error:  # bytes and definition may be anything
+            problem = f"it is not a valid {channel.message_type} ({' '.join(str(error).split())})"
+            raise _message_error(path, topic, index, log_time, problem) from None
+    return np.array([message.log_time for message in contents.messages[topic]]), rows
 
 
-@lru_cache(maxsize=8)
-def _by_definition(source: Source) -> Callable[[bytes], Any]:
-    """Reads messages of another layout, such as another byte order, slowly by the definition stored with them."""
-    from mcap_ros2.decoder import DecoderFactory
-
-    schema = Schema(id=1, name=source.kind, encoding=source.language, data=source.definition)
-    decode = DecoderFactory().decoder_for(source.encoding, schema)
-    if decode is None:
-        raise ValueError(f"there is no decoder for definitions in {source.language or 'no language'}")
-    return decode
-
-
-def _check_sources(path: Path, topic: str, kind: str, contents: Contents) -> None:
-    """Refuse a topic with other messages than those of a type in CDR."""
-    for source in contents.sources:
-        if source.topic == topic and (source.kind != kind or source.encoding != "cdr"):
-            found = f"{source.kind or 'no type'} in {source.encoding or 'no encoding'}"
-            others = _topics(contents, kind)
+def _check_channels(path: Path, topic: str, message_type: str, contents: Contents) -> None:
+    """Raise if a topic has messages of another type or encoding."""
+    for channel in contents.channels:
+        if channel.topic == topic and (channel.message_type != message_type or channel.encoding != "cdr"):
+            given = f"{channel.message_type or 'no type'} in {channel.encoding or 'no encoding'}"
+            others = _topics(contents, message_type)
             remedy = f"give the topic of such messages, here {others}" if others else "record it with ROS 2"
-            raise RecordingError(f"{path}, topic {topic} has messages of {found}, not of {kind} in cdr; {remedy}.")
+            raise RecordingError(
+                f"{path}, topic {topic} has messages of {given}, not of {message_type} in cdr; {remedy}."
+            )
 
 
-def _without_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
+def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
     if contents.cut_off:
-        return RecordingError(f"{path} is cut off before its first scan; copy it anew from where it was recorded.")
-    if any(source.topic == topic for source in contents.sources):
-        return RecordingError(f"{path}, topic {topic} has no message; check that the scanner ran, and record it anew.")
-    others = _topics(contents, SCAN)
-    if others:
+        return RecordingError(f"{path} is cut off before its first scan; copy it again from where it was recorded.")
+    if any(channel.topic == topic for channel in contents.channels):
+        return RecordingError(f"{path}, topic {topic} has no message; check that the scanner ran, and record it again.")
+    if others := _topics(contents, SCAN):
         return RecordingError(f"{path} has no topic {topic}; give the topic of the LiDAR, here {others}.")
-    found = ", ".join(sorted({source.topic for source in contents.sources})) or "none"
-    return RecordingError(f"{path} has no scans of a LiDAR ({SCAN} in cdr), its topics are: {found}; record one too.")
+    topics = ", ".join(sorted({channel.topic for channel in contents.channels})) or "none"
+    return RecordingError(f"{path} has no scans of a LiDAR ({SCAN} in cdr), its topics are: {topics}; record one too.")
 
 
-def _topics(contents: Contents, kind: str) -> str:
-    fitting = {source.topic for source in contents.sources if source.kind == kind and source.encoding == "cdr"}
-    return " or ".join(sorted(fitting))
+def _topics(contents: Contents, message_type: str) -> str:
+    channels = (channel for channel in contents.channels if channel.encoding == "cdr")
+    return " or ".join(sorted({channel.topic for channel in channels if channel.message_type == message_type}))
 
 
 def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str) -> None:
-    """Refuse numbers [M, n] of which one is not finite."""
+    """Raise if a row of values [M, n] is not finite."""
     wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(wrong):
         index = int(wrong[0])
-        remedy = "record it anew, or mend the program that sent it"
-        raise _error(path, topic, index, time[index], f"{name} is not a finite number", remedy)
+        raise _message_error(path, topic, index, time[index], f"{name} is not a finite number")
 
 
-def _error(path: Path, topic: str, index: int, time: int, what: str, remedy: str) -> RecordingError:
-    return RecordingError(f"{path}, topic {topic}, message {index} at {time / 1e9:.3f} s: {what}; {remedy}.")
+def _message_error(path: Path, topic: str, index: int, time: int, problem: str) -> RecordingError:
+    return RecordingError(f"{path}, topic {topic}, message {index} at {time / 1e9:.3f} s: {problem}; {REMEDY}.")

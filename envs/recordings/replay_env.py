@@ -1,4 +1,4 @@
-"""Recorded drives of a robot as an env: what would a policy have steered, scan by scan?"""
+"""Replay of recorded robot drives as an env: the actions of a policy, scan by scan, without effect on the drive."""
 
 from __future__ import annotations
 
@@ -12,59 +12,48 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.envs.reward import HISTORY, recent_mean
-from coil_rl.envs.robot.boundary_memory import BoundaryMemory
-from coil_rl.envs.sight import SAMPLES, SIGHT, Frame
+from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
+from coil_rl.envs.sight import SIGHT, Frame
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
 AnyPath = str | os.PathLike[str]
 
 
 class McapReplayEnv(EnvBase):
-    """Recordings side by side, each replayed from its first scan to its last whatever the agent does.
+    """Recordings side by side, each replayed from its first to its last scan whatever the agent does.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes what an agent or a guide of
-    `ConeTrackEnv` reads: `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the simulation, `cone_count`
-    [B, 2], `steering` [B, 1] the action now in force; `omega` [B, 1] radians/s, how fast that turns the robot;
-    `reward`, `done`, `terminated`, `truncated` [B, 1]; and under `info`: `scan` (which one is shown), `time` (s since
-    the first one), `pose` [B, 3] (m, m, radians, since the first scan, if the recording tells), `valid` [B, 2] (whether
-    each side was seen in this scan), `smoothness` |a - a_avg| and `reward`, whose only term is `smooth`, for a replay
-    cannot know what another steering had led to.
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of `ConeTrackEnv`:
+    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
+    `reward`, `done`, `terminated`, `truncated` [B, 1]; `omega` [B, 1] radians/s, the turn rate of the robot at that
+    steering; and under `info`: `scan` (its index), `time` (s since the first scan), `pose` [B, 3] (m, m, radians,
+    relative to the first scan), `valid` [B, 2] (whether each side is valid in this scan), `smoothness` |a - a_avg| and
+    `reward`. The only term of the reward is `smooth`, as a replay cannot show the effect of other actions.
 
-    A step takes the action for the scan that was shown and shows the next one, so a recording of N scans takes N
-    actions; then the episode is truncated, and the last scan is shown once more.
+    A step takes the action for the current scan and moves on to the next scan, so a recording of N scans takes N
+    actions; then the episode is truncated, and the last scan is repeated.
 
     Args:
-        recordings: one or several, B of them: MCAP files, rosbag2 directories, or what `read_recording` made of them.
-        perception: from scans, [N, P] m and infinite where nothing came back, and the bearings [P] of their points in
-            radians, to cones in the car's frame, [N, 2, K, 2] m times `scale`, left side first and nearest first, and
-            how many there are, [N, 2]. It is asked once for all scans of a recording, or once for those whose points
-            have the same bearings.
-        scan: topic of the LiDAR.
-        odometry: topic of the odometry, or None.
-        command: topic of the commands that the robot was given, or None.
-        strict: refuse a recording that is cut off.
-        remembered: what becomes of a boundary while it is not seen. "held": its numbers stay as they were, as with a
-            robot that does not know how it moves. "moved": it stays where it is while the robot moves, by its odometry
-            or else its commands; see `Recording.poses`.
-        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
-        smoothing: lambda of the cubic smoothing spline, m^3.
-        smooth: weight of the reward, per unit of |a - mean of the last 20 actions|.
-        kept_cones: K.
-        scale: metres of the simulation in one of the robot's.
-        sight: m in the scale of the simulation, as far as cones are seen.
-        speed: m/s of the robot.
-        car_length: m, its L.
-        max_steering: degrees of an action of 1.
-        device: where everything lives.
+        recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
+        perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to cones [N, 2, K, 2] in
+            the car's frame, m times `scale`, left side first, nearest first; and their number [N, 2]. Called once for
+            all scans of a recording with equal bearings.
+        scan, odometry, command, strict: as in `read_recording`.
+        remembered: memory of a side that is not valid. "held" keeps its last numbers, as for a robot without a pose;
+            "moved" keeps its place on the ground, by odometry or commands (`Recording.poses`).
+        spline, smoothing, kept_cones, max_steering: as in `ConeTrackEnv`.
+        smooth: weight of the reward per unit of |a - mean of the last 20 actions|.
+        scale: factor from the robot's metres to those of the cone world.
+        sight: m, range of view in the scale of the cone world.
+        speed, car_length: of the robot, m/s and m.
+        device: of all tensors.
 
     Raises:
-        RecordingError: for a recording that cannot be used, in one sentence.
-        ValueError: for another value outside its range, naming it.
+        RecordingError: for a recording that cannot be used.
+        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs.recordings.reading import Recording
@@ -120,158 +109,133 @@ class McapReplayEnv(EnvBase):
             raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         if not math.isfinite(smooth):
             raise ValueError(f"smooth={smooth} must be a finite number")
-        given = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
-        if not given:
-            raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 directory")
+        sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
+        if not sources:
+            raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
         self.recordings = [
-            one if isinstance(one, Recording) else read_recording(one, scan, odometry, command, strict=strict)
-            for one in given
+            source if isinstance(source, Recording) else read_recording(source, scan, odometry, command, strict=strict)
+            for source in sources
         ]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
         self.kept_cones, self.scale, self.moves = kept_cones, scale, remembered == "moved"
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
         self.turn_rate = speed / car_length
-        self.memory = BoundaryMemory(len(given), spline, smoothing, sight=sight)
+        self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         self._load(perception)
-        self._declare_specs()
-        self.register_buffer("steps", torch.zeros(len(given), dtype=torch.int64))
-        self.register_buffer("history", torch.zeros(HISTORY, len(given)))
+        self.register_buffer("steps", torch.zeros(len(sources), dtype=torch.int64))
+        self.register_buffer("history", torch.zeros(HISTORY, len(sources)))
         self.to(self.device)
+        declare_specs(self, self._reset())
 
     def _load(self, perception: Perceive) -> None:
-        """Lay all recordings end to end, [T] scans in one tensor a quantity."""
-        seen = [_perceived(recording, perception, self.kept_cones) for recording in self.recordings]
+        """Perceive all scans; store them end to end, [T] scans per buffer."""
+        views = [_perceive(recording, perception, self.kept_cones) for recording in self.recordings]
         poses = [recording.poses() for recording in self.recordings]
         length = torch.tensor([len(pose) for pose in poses])
         for name, value in {
-            "cones": np.concatenate([cones for cones, _ in seen]),
-            "count": np.concatenate([count for _, count in seen]),
+            "cones": np.concatenate([cones for cones, _ in views]),
+            "count": np.concatenate([count for _, count in views]),
             "pose": np.concatenate([_from_start(pose) for pose in poses]).astype(np.float32),
             "seconds": np.concatenate([recording.seconds for recording in self.recordings]).astype(np.float32),
         }.items():
             self.register_buffer(name, torch.from_numpy(value), persistent=False)
-        # All at once here is many times as fast as one after the other while the recording is replayed.
+        # Much faster here, for all scans at once, than step by step.
         samples, valid = self.memory.estimate(self.cones, self.count)
         self.register_buffer("samples", samples, persistent=False)
         self.register_buffer("valid", valid, persistent=False)
         self.register_buffer("length", length, persistent=False)
         self.register_buffer("first", length.cumsum(0) - length, persistent=False)
 
-    def _declare_specs(self) -> None:
-        rows, device = self.batch_size, self.device
-
-        def real(*shape: int) -> Unbounded:
-            return Unbounded((*rows, *shape), dtype=torch.float32, device=device)
-
-        def whole(*shape: int) -> Unbounded:
-            return Unbounded((*rows, *shape), dtype=torch.int64, device=device)
-
-        def flags(count: int) -> Binary:
-            return Binary(count, shape=(*rows, count), dtype=torch.bool, device=device)
-
-        def bounded(*shape: int) -> Bounded:
-            return Bounded(-1, 1, (*rows, *shape), dtype=torch.float32, device=device)
-
-        info = Composite(
-            scan=whole(1), time=real(1), pose=real(3), valid=flags(2), smoothness=real(1),
-            reward=Composite(smooth=real(1), shape=rows), shape=rows,
-        )  # fmt: skip
-        self.observation_spec = Composite(
-            observation=bounded(4 * SAMPLES), cones=real(2, self.kept_cones, 2), cone_count=whole(2),
-            steering=bounded(1), omega=real(1), info=info, shape=rows,
-        )  # fmt: skip
-        self.action_spec = bounded(1)
-        self.reward_spec = real(1)
-        self.done_spec = Composite(
-            {key: flags(1) for key in ("done", "terminated", "truncated")}, shape=rows, device=device
-        )
-
     def _set_seed(self, seed: int | None) -> None:
-        """Nothing is drawn."""
+        """Do nothing: the env is deterministic."""
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        given = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones_like(self.steps, dtype=torch.bool) if given is None else given.view(-1)
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
         self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
-        before = self.memory.samples, self.memory.known
+        before = self.memory.samples, self.memory.ever_valid
         self.memory.reset(mask)
-        seen = self._see()
-        # Who is not reset has taken in this scan already.
-        now = self.memory.samples, self.memory.known
-        self.memory.samples, self.memory.known = (torch.where(mask, x, y) for x, y in zip(now, before, strict=True))
-        return self._tensordict(seen, torch.zeros_like(self.history[0]))
+        view = self._perceive()
+        # Rows that are not reset have this scan in their memory already.
+        now = self.memory.samples, self.memory.ever_valid
+        self.memory.samples, self.memory.ever_valid = (
+            torch.where(mask, x, y) for x, y in zip(now, before, strict=True)
+        )
+        return self._tensordict(view, torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
-        before = self._shown()
+        before = self._current()
         self.steps = self.steps + 1
         if self.moves:
-            then, now = Frame(self._place(before)), Frame(self._place(self._shown()))
+            then, now = Frame(self._pose_at(before)), Frame(self._pose_at(self._current()))
             self.memory.samples = now.to_car(then.to_world(self.memory.samples))
-        out = self._tensordict(self._see(), roughness)
+        out = self._tensordict(self._perceive(), roughness)
         out["reward"] = out["info", "reward", "smooth"]
-        over = (self.steps >= self.length).unsqueeze(-1)
-        out["done"], out["truncated"], out["terminated"] = over, over.clone(), torch.zeros_like(over)
+        done = (self.steps >= self.length).unsqueeze(-1)
+        out["done"], out["truncated"], out["terminated"] = done, done.clone(), torch.zeros_like(done)
         return out
 
-    def _shown(self) -> Tensor:
-        """Which of all scans each row shows now [B]."""
+    def _current(self) -> Tensor:
+        """Return the index of each row's current scan among all scans [B]."""
         return self.first + torch.minimum(self.steps, self.length - 1)
 
-    def _place(self, scan: Tensor) -> Tensor:
-        """The poses [3, B] at scans, in the scale of the simulation."""
+    def _pose_at(self, scan: Tensor) -> Tensor:
+        """Return the poses [3, B] at scans, in the scale of the cone world."""
         x, y, heading = self.pose.index_select(0, scan).unbind(1)
         return torch.stack([x * self.scale, y * self.scale, heading])
 
-    def _see(self) -> dict[str, Tensor]:
-        """What the scans show, and what is remembered from before."""
-        shown = self._shown()
-        cones, count = self.cones.index_select(0, shown), self.count.index_select(0, shown)
+    def _perceive(self) -> dict[str, Tensor]:
+        """Return the cones in the current scans, and the observation with the memory updated by them."""
+        current = self._current()
+        cones, count = self.cones.index_select(0, current), self.count.index_select(0, current)
         observation, valid = self.memory.remember(
-            self.samples.index_select(3, shown), self.valid.index_select(1, shown)
+            self.samples.index_select(3, current), self.valid.index_select(1, current)
         )
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 
-    def _tensordict(self, seen: dict[str, Tensor], roughness: Tensor) -> TensorDict:
-        shown, steering = self._shown(), self.history[0].unsqueeze(-1)
+    def _tensordict(self, view: dict[str, Tensor], roughness: Tensor) -> TensorDict:
+        current, steering = self._current(), self.history[0].unsqueeze(-1)
         info = {
-            "scan": (shown - self.first).unsqueeze(-1),
-            "time": self.seconds.index_select(0, shown).unsqueeze(-1),
-            "pose": self.pose.index_select(0, shown),
-            "valid": seen["valid"],
+            "scan": (current - self.first).unsqueeze(-1),
+            "time": self.seconds.index_select(0, current).unsqueeze(-1),
+            "pose": self.pose.index_select(0, current),
+            "valid": view["valid"],
             "smoothness": roughness.unsqueeze(-1),
             "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size),
         }
-        entries: dict[str, Any] = {key: seen[key] for key in ("observation", "cones", "cone_count")}
+        entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
         entries |= {"steering": steering, "omega": (steering * self.max_steering).sin() * self.turn_rate}
         entries |= {"info": TensorDict(info, self.batch_size, device=self.device)}
         return TensorDict(entries, self.batch_size, device=self.device)
 
 
 def _from_start(poses: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses [N, 3] as seen from the first of them; small numbers, whatever the origin of the odometry is."""
+    """Return poses [N, 3] relative to the first one."""
     x, y, heading = (poses - poses[0]).T
     cos, sin = np.cos(poses[0, 2]), np.sin(poses[0, 2])
     return np.stack([cos * x + sin * y, cos * y - sin * x, heading], axis=1)
 
 
-def _perceived(recording: Recording, perception: Perceive, kept: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """The cones [N, 2, K, 2] m and their counts [N, 2] in all scans of a recording."""
+def _perceive(
+    recording: Recording, perception: Perceive, kept_cones: int
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2]."""
     scans = len(recording.ranges)
-    cones, count = np.zeros((scans, 2, kept, 2), np.float32), np.zeros((scans, 2), np.int64)
+    all_cones, all_counts = np.zeros((scans, 2, kept_cones, 2), np.float32), np.zeros((scans, 2), np.int64)
     layouts = np.stack([recording.points, recording.angle_min, recording.angle_increment], axis=1)
     for layout in np.unique(layouts, axis=0):
         rows = np.flatnonzero((layouts == layout).all(axis=1))
         points = int(layout[0])
-        found, real = perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points])
-        found, real = np.asarray(found), np.asarray(real)
-        if found.ndim != 4 or found.shape[:2] + found.shape[3:] != (len(rows), 2, 2) or real.shape != (len(rows), 2):
+        cones, count = map(np.asarray, perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]))
+        expected = (len(rows), 2, 2)
+        if cones.ndim != 4 or cones.shape[:2] + cones.shape[3:] != expected or count.shape != expected[:2]:
             raise ValueError(
-                f"perception made cones {found.shape} and counts {real.shape} of {len(rows)} scans; it must make "
-                f"[{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
+                f"perception returned cones {cones.shape} and counts {count.shape} for {len(rows)} scans; it must "
+                f"return [{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
             )
-        nearest = min(kept, found.shape[2])
-        cones[rows, :, :nearest], count[rows] = found[:, :, :nearest], np.minimum(real, nearest)
-    return cones, count
+        nearest = min(kept_cones, cones.shape[2])
+        all_cones[rows, :, :nearest], all_counts[rows] = cones[:, :, :nearest], np.minimum(count, nearest)
+    return all_cones, all_counts

@@ -1,11 +1,9 @@
-"""LiDAR scans to clusters: single linkage around the whole turn, and what a cluster measures.
+"""Clusters of LiDAR points: exact single linkage over all scans of a recording, and three features per cluster.
 
-Two points belong together if they are closer than a gap, directly or by way of other points. Points next to each other
-in bearing are joined first, which leaves a few runs a scan. That alone would be wrong: an object in front splits the
-surface behind it. A point can only be close to others within arcsin(gap / distance) of its bearing, so those few are
-looked at, and the runs they belong to are joined. The result is exactly that of the whole matrix of distances.
-
-All scans of a recording are taken at once, as one list of points in the order of scan and bearing.
+Points closer than a gap are linked, directly or through other points. Neighbours in bearing are linked first, which
+leaves a few runs per scan. An object in front splits the surface behind it into several runs, so pairs of runs are
+tested too: points closer than the gap differ by at most arcsin(gap / distance) in bearing. The result equals the
+connected components of the full distance matrix.
 """
 
 from __future__ import annotations
@@ -19,22 +17,16 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 GAP = 0.05  # m
-TURN = 2 * np.pi
+TWO_PI = 2 * np.pi
 FEATURES = ("width", "depth", "girth")
 
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The points of several scans, scan by scan and in each by bearing.
+    """M points of several scans, ordered by scan and bearing.
 
-    Attributes:
-        scans: how many scans there are.
-        scan: [M], the scan of each point.
-        beam: [M], its place in the scan as it was given.
-        bearing: [M], 0 to 2 pi.
-        distance: [M] m.
-        x: [M] m, along bearing 0.
-        y: [M] m, along bearing pi / 2.
+    `scan` is the index of a point's scan, `beam` its index in the scan; `bearing` is in 0 to 2 pi, `distance`, `x`
+    (along bearing 0) and `y` are in m.
     """
 
     scans: int
@@ -48,15 +40,10 @@ class Points:
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Clusters of at least so many points that a feature means something.
+    """C clusters: label of the points, index of the scan, number of points, and mean point [C, 2] m.
 
-    Attributes:
-        label: [C], the number that the cluster's points carry.
-        scan: [C], the scan it was seen in.
-        size: [C], how many points it has.
-        centroid: [C, 2] m, mean of its points.
-        features: [C, 3] m, with the points in the order of bearing: width from the first to the last one, depth from
-            the least to the greatest distance, and girth, the length of the line through them all.
+    The features [C, 3] m, with the points in order of bearing, are the width (distance from the first to the last
+    point), the depth (greatest minus least range) and the girth (sum of the distances between neighbours).
     """
 
     label: Integers
@@ -66,79 +53,71 @@ class Clusters:
     features: Array
 
 
-def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], nearest: float, farthest: float) -> Points:
-    """The points of scans that lie within a distance; no return, whatever it is given as, is no point.
+def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float) -> Points:
+    """Return the points of scans between two distances.
 
     Args:
-        ranges: [N, P] m.
-        angles: [P] radians, of each beam, in any order.
-        nearest: m, a range below is dropped.
-        farthest: m, a range above is dropped.
+        ranges: [N, P] m; NaN and infinity are no point.
+        angles: [P] radians, bearings of the beams in any order.
+        range_min: m, smaller ranges are no point.
+        range_max: m, greater ranges are no point.
 
     Raises:
-        ValueError: for shapes that do not fit, or bearings that are not finite.
+        ValueError: if the shapes do not match or a bearing is not finite.
     """
     ranges, angles = np.asarray(ranges), np.asarray(angles, dtype=np.float64)
     if ranges.ndim != 2 or angles.shape != ranges.shape[1:]:
-        given = f"ranges {list(ranges.shape)} and angles {list(angles.shape)}"
-        raise ValueError(f"{given} must be [N, P] and [P], N scans of P beams")
+        shapes = f"ranges {list(ranges.shape)} and angles {list(angles.shape)}"
+        raise ValueError(f"{shapes} must be [N, P] and [P], N scans of P beams")
     if not np.isfinite(angles).all():
-        raise ValueError("angles holds a number that is not finite; give the bearing of each beam in radians")
-    bearings = np.mod(angles, TURN)
+        raise ValueError("angles contains a value that is not finite; give the bearing of each beam in radians")
+    bearings = np.mod(angles, TWO_PI)
     order = np.argsort(bearings, kind="stable")
-    # Neither NaN nor infinity is within the two.
-    scan, place = np.nonzero(((ranges >= nearest) & (ranges <= farthest))[:, order])
-    beam = order[place]
+    scan, index = np.nonzero(((ranges >= range_min) & (ranges <= range_max))[:, order])
+    beam = order[index]
     bearing, distance = bearings[beam], ranges[scan, beam].astype(np.float64)
     x, y = distance * np.cos(bearings)[beam], distance * np.sin(bearings)[beam]
     return Points(len(ranges), scan, beam, bearing, distance, x, y)
 
 
 def single_linkage(points: Points, gap: float = GAP) -> Integers:
-    """The number of the cluster that each point belongs to, [M]; clusters are counted through all scans from 0.
+    """Return the cluster label of each point [M], counted from 0 through all scans.
 
-    Args:
-        points: of any scans.
-        gap: m; points closer than this are joined, and those exactly so far apart are not.
+    Points at a distance of exactly `gap` m are not linked.
     """
     if not len(points.scan):
         return np.zeros(0, dtype=np.int64)
-    total = np.arange(len(points.scan))
-    scan_begin = np.searchsorted(points.scan, np.arange(points.scans + 1))
-    begin, end = scan_begin[points.scan], scan_begin[points.scan + 1]
-    apart = (points.scan[1:] != points.scan[:-1]) | ~_closer(points, total[:-1], total[1:], gap)
-    run = np.concatenate([[0], np.cumsum(apart)])
-    behind_run = np.append(np.flatnonzero(apart) + 1, len(total))[run]
+    index = np.arange(len(points.scan))
+    scan_starts = np.searchsorted(points.scan, np.arange(points.scans + 1))
+    start, end = scan_starts[points.scan], scan_starts[points.scan + 1]
+    breaks = (points.scan[1:] != points.scan[:-1]) | ~_close(points, index[:-1], index[1:], gap)
+    run = np.concatenate([[0], np.cumsum(breaks)])
+    run_end = np.append(np.flatnonzero(breaks) + 1, len(index))[run]
 
-    # Within half a turn: a pair farther apart one way around is nearer the other way. The slack is for rounding.
+    # Half a circle is enough, as each pair is within it in one of the two directions. 1e-9 covers rounding.
     with np.errstate(divide="ignore"):
         reach = np.where(points.distance > gap, np.arcsin(np.minimum(1, gap / points.distance)), np.pi) + 1e-9
-    farthest, turn = points.bearing + reach, points.scan * (2 * TURN)
-    around = farthest >= TURN
-    last = np.searchsorted(turn + points.bearing, turn + farthest - TURN * around, side="right")
-    count = np.maximum(np.minimum(last + around * (end - begin), total + end - begin) - behind_run, 0)
-    one = np.repeat(total, count)
-    other = np.arange(len(one)) + np.repeat(behind_run - np.cumsum(count) + count, count)
-    other = np.where(other < end[one], other, other - (end - begin)[one])
-    close = _closer(points, one, other, gap)
-    return _joined(run, run[one[close]], run[other[close]])
+    last_bearing, offset = points.bearing + reach, points.scan * (2 * TWO_PI)
+    wraps = last_bearing >= TWO_PI
+    last = np.searchsorted(offset + points.bearing, offset + last_bearing - TWO_PI * wraps, side="right")
+    # The candidates of a point are those behind its run and within reach; indices past the scan's end wrap around.
+    count = np.maximum(np.minimum(last + wraps * (end - start), index + end - start) - run_end, 0)
+    first = np.repeat(index, count)
+    second = np.arange(len(first)) + np.repeat(run_end - np.cumsum(count) + count, count)
+    second = np.where(second < end[first], second, second - (end - start)[first])
+    close = _close(points, first, second, gap)
+    return _merge_labels(run, run[first[close]], run[second[close]])
 
 
-def measure(points: Points, label: Integers, least: int = 2) -> Clusters:
-    """What the clusters of at least `least` points measure.
-
-    Args:
-        points: of any scans, M of them.
-        label: [M], the cluster of each.
-        least: clusters of fewer points are left out.
-    """
+def measure(points: Points, label: Integers, min_points: int = 2) -> Clusters:
+    """Return the clusters of at least `min_points` points; `label` [M] is that of each point."""
     order = np.argsort(label, kind="stable")
-    order = order[np.bincount(label)[label[order]] >= least]
+    order = order[np.bincount(label)[label[order]] >= min_points]
     if not len(order):
-        none = np.zeros(0, dtype=np.int64)
-        return Clusters(none, none, none, np.zeros((0, 2)), np.zeros((0, 3)))
-    first, last = _blocks(label[order])
-    order = _unwrapped(points.bearing, order, first, last)
+        empty = np.zeros(0, dtype=np.int64)
+        return Clusters(empty, empty, empty, np.zeros((0, 2)), np.zeros((0, 3)))
+    first, last = _block_bounds(label[order])
+    order = _sort_across_zero(points.bearing, order, first, last)
     x, y, distance = points.x[order], points.y[order], points.distance[order]
     size = last - first + 1
     step = np.zeros(len(order))
@@ -151,38 +130,38 @@ def measure(points: Points, label: Integers, least: int = 2) -> Clusters:
     return Clusters(label[order[first]], points.scan[order[first]], size, centroid, features)
 
 
-def _joined(label: Integers, one: Integers, other: Integers) -> Integers:
-    """The labels [M] after those of each pair have become one; again they are counted from 0."""
+def _merge_labels(label: Integers, first: Integers, second: Integers) -> Integers:
+    """Merge the labels of each pair; return the new labels [M], counted from 0."""
     lowest = np.arange(int(label[-1]) + 1)
-    while (lowest[one] != lowest[other]).any():
-        for low, high in ((one, other), (other, one)):
+    while (lowest[first] != lowest[second]).any():
+        for low, high in ((first, second), (second, first)):
             np.minimum.at(lowest, lowest[high], lowest[low])
         lowest = lowest[lowest]
-    kept = lowest == np.arange(len(lowest))
-    return (np.cumsum(kept) - 1)[lowest][label]
+    is_root = lowest == np.arange(len(lowest))
+    return (np.cumsum(is_root) - 1)[lowest][label]
 
 
-def _closer(points: Points, one: Integers, other: Integers, gap: float) -> NDArray[np.bool_]:
-    x, y = points.x[one] - points.x[other], points.y[one] - points.y[other]
+def _close(points: Points, first: Integers, second: Integers, gap: float) -> NDArray[np.bool_]:
+    x, y = points.x[first] - points.x[second], points.y[first] - points.y[second]
     return np.asarray(x * x + y * y < gap * gap)
 
 
-def _blocks(label: Integers) -> tuple[Integers, Integers]:
-    """Where each of the blocks of equal labels begins, and its last place."""
+def _block_bounds(label: Integers) -> tuple[Integers, Integers]:
+    """Return the first and the last index of each block of equal labels."""
     ends = np.flatnonzero(label[1:] != label[:-1])
     return np.append(0, ends + 1), np.append(ends, len(label) - 1)
 
 
-def _unwrapped(bearing: Array, order: Integers, first: Integers, last: Integers) -> Integers:
-    """The order [M] in which clusters that lie across bearing 0 begin behind their widest gap."""
-    turned = bearing[order]
-    # Whoever spans at most half a turn leaves the widest gap outside already.
-    if not (turned[last] - turned[first] > np.pi).any():
+def _sort_across_zero(bearing: Array, order: Integers, first: Integers, last: Integers) -> Integers:
+    """Return the order [M] in which each cluster across bearing 0 starts after its widest gap in bearing."""
+    sorted_bearing = bearing[order]
+    # A cluster that spans at most half a circle has its widest gap outside.
+    if not (sorted_bearing[last] - sorted_bearing[first] > np.pi).any():
         return order
     cluster = np.repeat(np.arange(len(first)), last - first + 1)
-    gap = np.diff(turned, prepend=turned[0])
-    gap[first] = TURN - (turned[last] - turned[first])
+    gap = np.diff(sorted_bearing, prepend=sorted_bearing[0])
+    gap[first] = TWO_PI - (sorted_bearing[last] - sorted_bearing[first])
     widest = np.flatnonzero(gap == np.maximum.reduceat(gap, first)[cluster])
-    start = widest[_blocks(cluster[widest])[0]]
+    start = widest[_block_bounds(cluster[widest])[0]]
     before = np.arange(len(order)) < start[cluster]
-    return order[np.lexsort((turned + TURN * before, cluster))]
+    return order[np.lexsort((sorted_bearing + TWO_PI * before, cluster))]

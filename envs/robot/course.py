@@ -1,12 +1,10 @@
-"""The track of the simulated robot: six metres in the shape of a bean, a straight, left turns and a right turn.
-
-And what a robot meets on any such track: where the cones stand, and how far it is from a crash.
-"""
+"""Tracks of the simulated robot: the 6 m track, cone positions and radii, distance to a crash, laps of a drive."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -20,47 +18,46 @@ from coil_rl.envs.track import SIDES, Track, TrackError, resample
 Array = NDArray[np.float64]
 
 THIN, THICK = 0.020, 0.045  # m, radius of a cone on the left and on the right
-# m: half the width, between the middles of the cones; and the radius of all turns.
-HALF_WIDTH = 0.18
-RADIUS = 0.58
+HALF_WIDTH = 0.18  # m, from the centre line to the middle of a cone
+RADIUS = 0.58  # m, of all bends
 RIGHT_TURN = np.pi / 3
-CONE_GAP = 0.23
-STEP = 0.005  # m, of lines that are sampled
+CONE_GAP = 0.23  # m
+STEP = 0.005  # m, spacing of sampled lines
 
 OUTLINE = (0.20, 0.12)  # m, length and width of the robot
-ON_THE_LINE = 0.02  # m: the middle of the robot this close to a boundary has left the track
-FAR = 1e3  # m
+BOUNDARY_MARGIN = 0.02  # m, the centre of the robot this close to a boundary has left the track
+FAR = 1e3  # m, position of padding
+
+LINE_HALF_WIDTH = 0.5  # m to either side of the start of a drive
+SHORTEST_LAP = 1.0  # m, a shorter lap is swaying at the line
+LINE_OFFSET = 1e-3  # m, so that a robot that stands on the line has not crossed it
 
 
 @cache
 def robot_track() -> Track:
-    """The track, in the robot's own metres: 6 m a lap, driven anticlockwise, starting half-way along a straight."""
-    place, normal = _centre_line()
-    left, right = (_cones(place + sign * HALF_WIDTH * normal) for sign in (1, -1))
+    """Return the track in the robot's own metres: a closed line of 6 m with left bends, a right bend and a straight."""
+    centre, normal = _centre_line()
+    left, right = (_cones(centre + sign * HALF_WIDTH * normal) for sign in (1, -1))
     return Track("robot (simulated)", left, right)
 
 
 def robot_tracks(scale: float = 1.0) -> list[Track]:
-    """The robot's track, as a list of one.
-
-    Args:
-        scale: times its size: at 7 a car of the cone world drives where the robot does.
-    """
+    """Return a list with the robot's track, `scale` times as large; 7 suits the cars of the cone world."""
     track = robot_track()
     return [track if scale == 1 else Track(track.name, track.left * scale, track.right * scale)]
 
 
 def track_notes(track: Track) -> dict[str, str]:
-    """A track as notes for a recording, which `noted_track` reads."""
-    places = {"left": track.left.tolist(), "right": track.right.tolist(), "start": track.start}
-    return {"name": track.name, **{key: json.dumps(value) for key, value in places.items()}}
+    """Return a track as a metadata record, the inverse of `noted_track`."""
+    values = {"left": track.left.tolist(), "right": track.right.tolist(), "start": track.start}
+    return {"name": track.name, **{key: json.dumps(value) for key, value in values.items()}}
 
 
 def noted_track(notes: Mapping[str, str]) -> Track:
-    """The track of `track_notes`; the notes of other programs need `left` and `right`, each [[x, y], ...] m.
+    """Return the track of a metadata record; `left` and `right`, each [[x, y], ...] m, are required.
 
     Raises:
-        TrackError: in one sentence, what is wrong with the notes.
+        TrackError: if the record is not valid.
     """
     try:
         left, right, start = (json.loads(notes.get(key, "null")) for key in ("left", "right", "start"))
@@ -71,77 +68,105 @@ def noted_track(notes: Mapping[str, str]) -> Track:
 
 
 class RobotCourse:
-    """Where everything stands on each of T tracks, and how far robots are from a crash there.
+    """Cones and boundaries of T tracks, with the distance of robots to a crash.
 
     Args:
         tracks: in the robot's own metres.
-
-    Example:
-        >>> course = RobotCourse([robot_track()])
-        >>> clearance, _ = course.clearance(torch.tensor([0]), torch.tensor([robot_track().start]).t())
-        >>> round(clearance.item(), 2)
-        0.08
     """
 
     def __init__(self, tracks: Sequence[Track]) -> None:
-        stands = [cones_of(track) for track in tracks]
-        # What a track has fewer of is filled up far away.
-        self.cones = _stacked([place for place, _ in stands], FAR)  # [2, T, M] m
-        self.radius = _stacked([radius.unsqueeze(0) for _, radius in stands], 0.0)[0]  # [T, M] m
+        cones = [cones_of(track) for track in tracks]
+        self.cones = _stack_padded([centres for centres, _ in cones], FAR)  # [2, T, M] m
+        self.radius = _stack_padded([radius.unsqueeze(0) for _, radius in cones], 0.0)[0]  # [T, M] m
         lines = ([torch.tensor(track.boundary(side, STEP).T) for track in tracks] for side in SIDES)
-        self.boundaries = [_stacked(of_side, FAR) for of_side in lines]  # [2, T, points] m each
+        self.boundaries = [_stack_padded(side, FAR) for side in lines]  # [2, T, points] m each
 
     def clearance(self, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """How far robots are from a crash: their outline from a cone, their middle from the line between two.
+        """Return the distances of robots to a crash: of the outline to a cone, of the centre to a boundary.
 
         Args:
-            track: [B], on which each is.
+            track: [B] index of the track.
             pose: [3, B] m, m, radians.
 
         Returns:
-            [B] m, zero or less is a crash; and how far their middles are from the left and the right boundary, [2, B].
+            [B] m, a crash if not positive; and the distances of the centre to the left and right boundary, [2, B] m.
         """
-        stand, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
-        beyond = Frame(pose).to_car(stand).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
-        to_cone = (beyond.clamp(min=0).norm(dim=0) - radius).amin(0)
-        place = pose[:2].unsqueeze(-1)
-        to_boundaries = torch.stack([(line[:, track] - place).norm(dim=0).amin(-1) for line in self.boundaries])
-        return torch.minimum(to_cone, to_boundaries.amin(0) - ON_THE_LINE), to_boundaries
+        cones, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
+        outside = Frame(pose).to_car(cones).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
+        to_cone = (outside.clamp(min=0).norm(dim=0) - radius).amin(0)
+        centre = pose[:2].unsqueeze(-1)
+        to_boundaries = torch.stack([(line[:, track] - centre).norm(dim=0).amin(-1) for line in self.boundaries])
+        return torch.minimum(to_cone, to_boundaries.amin(0) - BOUNDARY_MARGIN), to_boundaries
 
 
 def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Tensor, Tensor]:
-    """The cones of a robot's track: centres [2, M] m and radii [M] m, thin ones on the left and thick on the right."""
-    chosen = [(ring, size) for ring, size, on in ((track.left, THIN, left), (track.right, THICK, right)) if on]
-    if not chosen:
-        raise ValueError("cones_of a track with neither left nor right leaves no cone; choose one side or both")
-    place = torch.as_tensor(np.vstack([ring for ring, _ in chosen]).T.copy(), dtype=torch.float32)
-    return place, torch.cat([torch.full((len(ring),), size) for ring, size in chosen])
+    """Return the cones of a robot's track: centres [2, M] m and radii [M] m, thin ones left, thick ones right."""
+    rings = [(ring, size) for ring, size, use in ((track.left, THIN, left), (track.right, THICK, right)) if use]
+    if not rings:
+        raise ValueError("cones_of a track with neither left nor right has no cone; choose one side or both")
+    centres = torch.as_tensor(np.vstack([ring for ring, _ in rings]).T.copy(), dtype=torch.float32)
+    return centres, torch.cat([torch.full((len(ring),), size) for ring, size in rings])
 
 
 def middle_line(track: Track, spacing: float) -> Array:
-    """Points half-way between the boundaries of a track, evenly spaced, from the start on: [T, 2] m."""
+    """Return evenly spaced points midway between the boundaries of a track, from the start on: [T, 2] m."""
     middle = track.middle(STEP)
     middle = np.roll(middle, -int(((middle - np.array(track.start[:2])) ** 2).sum(1).argmin()), axis=0)
     return resample(middle, spacing)
 
 
+@dataclass(frozen=True)
+class Laps:
+    """Duration and length of L completed laps, [L] each."""
+
+    seconds: Array
+    metres: Array
+
+
+def laps(poses: Array, seconds: Array) -> Laps:
+    """Return the laps of a drive. A lap ends where the drive crosses, forwards, the line across its start.
+
+    Args:
+        poses: [N, 3] m, m, radians, ordered by time.
+        seconds: [N].
+
+    Example:
+        >>> angle = np.linspace(0, 4.2 * np.pi, 500)  # two laps of a circle of 1 m, at 1 m/s
+        >>> poses = np.stack([np.sin(angle), 1 - np.cos(angle), angle], axis=1)
+        >>> laps(poses, angle).seconds.round(3).tolist()
+        [6.283, 6.283]
+    """
+    x, y, heading = poses[0]
+    forward = (poses[:, 0] - x) * np.cos(heading) + (poses[:, 1] - y) * np.sin(heading) - LINE_OFFSET
+    sideways = (poses[:, 1] - y) * np.cos(heading) - (poses[:, 0] - x) * np.sin(heading)
+    travelled = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
+    before = np.flatnonzero((forward[:-1] <= 0) & (forward[1:] > 0) & (np.abs(sideways[1:]) < LINE_HALF_WIDTH))
+    share = forward[before] / (forward[before] - forward[before + 1])
+    time, way = (values[before] + share * (values[before + 1] - values[before]) for values in (seconds, travelled))
+    crossings: list[int] = []
+    for index in range(len(before)):
+        if not crossings or way[index] - way[crossings[-1]] > SHORTEST_LAP:
+            crossings.append(index)
+    return Laps(np.diff(time[crossings]), np.diff(way[crossings]))
+
+
 def _centre_line() -> tuple[Array, Array]:
-    """Points along the middle of the track and the directions to the left of it, [T, 2] each."""
-    # The lap closes if the straight is as long as the three circles make it.
+    """Return points on the centre line of the track and its normals to the left, [T, 2] each."""
+    # With a straight of this length the three arcs close the lap.
     straight = 4 * RADIUS * np.sin(RIGHT_TURN / 2)
-    around = np.pi + RIGHT_TURN / 2
-    half, left, right = (straight / 2, 0.0), (RADIUS * around, 1 / RADIUS), (RADIUS * RIGHT_TURN, -1 / RADIUS)
+    left_turn = np.pi + RIGHT_TURN / 2
+    half, left, right = (straight / 2, 0.0), (RADIUS * left_turn, 1 / RADIUS), (RADIUS * RIGHT_TURN, -1 / RADIUS)
     pieces = [half, left, right, left, half]
     ends = np.cumsum([length for length, _ in pieces])
-    # Each step in the middle of its length: then a turn is as long as it should be, to a fraction of a step.
+    # Steps are evaluated at their midpoints: then the length of each bend is exact to a fraction of a step.
     steps = round(ends[-1] / STEP)
-    at = (np.arange(steps) + 0.5) * ends[-1] / steps
-    bend = np.array([bend for _, bend in pieces])[np.searchsorted(ends, at)]
-    heading = np.cumsum(bend) * ends[-1] / steps
-    place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * ends[-1] / steps
-    # What is left open after the lap is rounding of the steps; it is shared out.
-    place -= np.outer(np.linspace(0, 1, steps), place[-1])
-    return place, np.stack([-np.sin(heading), np.cos(heading)], axis=1)
+    midpoints = (np.arange(steps) + 0.5) * ends[-1] / steps
+    curvature = np.array([curvature for _, curvature in pieces])[np.searchsorted(ends, midpoints)]
+    heading = np.cumsum(curvature) * ends[-1] / steps
+    position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * ends[-1] / steps
+    # Spread the rounding error that keeps the lap open.
+    position -= np.outer(np.linspace(0, 1, steps), position[-1])
+    return position, np.stack([-np.sin(heading), np.cos(heading)], axis=1)
 
 
 def _cones(ring: Array) -> Array:
@@ -149,10 +174,10 @@ def _cones(ring: Array) -> Array:
     return resample(ring, length / round(length / CONE_GAP))
 
 
-def _stacked(tables: Sequence[Tensor], padding: float) -> Tensor:
-    """Tables [D, any] as one, [D, T, most]."""
+def _stack_padded(tables: Sequence[Tensor], padding: float) -> Tensor:
+    """Stack tables [D, any] to [D, T, most]."""
     most = max(table.shape[1] for table in tables)
-    wide = torch.full((len(tables[0]), len(tables), most), padding)
+    stacked = torch.full((len(tables[0]), len(tables), most), padding)
     for index, table in enumerate(tables):
-        wide[:, index, : table.shape[1]] = table
-    return wide
+        stacked[:, index, : table.shape[1]] = table
+    return stacked

@@ -1,39 +1,110 @@
-"""A LiDAR scan to the cones in sight, as the paper's robot has it (section 4.2, appendix A.3)."""
+"""Perception of the robot (paper 4.2, A.3): from LiDAR scans to thin and thick cones, and to the observation."""
 
 from __future__ import annotations
 
+import json
 import math
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from importlib import resources
+from typing import Literal
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import make_composite_from_td
 
 from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
-from coil_rl.envs.robot.cone_classifier import ConeClassifier
+from coil_rl.envs.sight import SAMPLES, SIGHT, encode
+from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-AT_ONCE = 512  # scans, so that their points stay in the cache
+SCANS_PER_BATCH = 512  # keeps the points in the cache
+MIN_DISTANCE = 0.5  # m, least plausible distance of a boundary sample, in the scale of the cone world
+MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of view
+
+
+@dataclass(frozen=True, eq=False)
+class ConeClassifier:
+    """Support vector machine that separates thick from thin cones: a radial kernel on standardised features.
+
+    `coil_rl.robot` trains it with scikit-learn; the decision in NumPy is many times faster for a few clusters. F
+    features are standardised by `mean` and `scale` [F] and compared with the support vectors [S, F], of weights [S], by
+    the kernel exp(-gamma |a - b|^2).
+
+    Raises:
+        ValueError: if shapes do not match, a value is not finite, or `scale` or `gamma` is not positive.
+
+    Example:
+        >>> from coil_rl.envs import simulated_cone_classifier
+        >>> simulated_cone_classifier().thick([[0.035, 0.01, 0.04], [0.085, 0.03, 0.10]])
+        array([False,  True])
+    """
+
+    mean: Array
+    scale: Array
+    support: Array
+    weights: Array
+    intercept: float
+    gamma: float
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = np.array(getattr(self, field.name), dtype=np.float64)
+            if not np.isfinite(value).all():
+                raise ValueError(f"{field.name} of a cone classifier contains a value that is not finite")
+            object.__setattr__(self, field.name, value)
+        shapes = [list(getattr(self, field.name).shape) for field in fields(self)]
+        vectors, features = len(np.atleast_1d(self.weights)), len(np.atleast_1d(self.mean))
+        if shapes != [[features], [features], [vectors, features], [vectors], [], []]:
+            raise ValueError(f"shapes {shapes} of a cone classifier must be [F], [F], [S, F], [S], [], []")
+        if not (self.scale > 0).all() or not self.gamma > 0:
+            raise ValueError("scale and gamma of a cone classifier must be more than 0")
+
+    @cached_property
+    def _squared_norms(self) -> Array:
+        return np.asarray((self.support * self.support).sum(1))
+
+    def decision(self, features: NDArray[np.floating]) -> Array:
+        """Return the decision values [C] of features [C, F]: above 0 for thick cones, below 0 for thin ones."""
+        x = (np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean) / self.scale
+        squared_distance = (x * x).sum(1)[:, None] + self._squared_norms - 2 * (x @ self.support.T)
+        return np.asarray(np.exp(-self.gamma * squared_distance) @ self.weights + self.intercept, dtype=np.float64)
+
+    def thick(self, features: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Return whether each cluster is a thick cone: [C, F] to [C]."""
+        return self.decision(features) > 0
+
+
+def simulated_cone_classifier() -> ConeClassifier:
+    """Return the shipped classifier, trained on simulated scans (`SimulatedLidar`)."""
+    text = (resources.files("coil_rl.envs.robot") / "simulated_cones.json").read_text(encoding="utf-8")
+    return ConeClassifier(**json.loads(text))
 
 
 class Perception:
-    """Clusters the points of scans, tells thin cones from thick ones, and keeps those in sight.
+    """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep those in range.
 
-    Thin cones are on the left of the track, thick ones on the right. A cluster is where the mean of its points is.
+    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points.
 
     Args:
-        classifier: which clusters are thick.
-        range_min: m, what the LiDAR cannot measure below; smaller ranges are codes for no return.
-        range_max: m, how far a cone is seen.
-        bearing_max: degrees to either side of the heading, in which one is seen.
-        scale: distances are multiplied by this, so that the robot's world has the size of the simulation's.
-        laser_yaw: degrees, the bearing of the LiDAR's 0 in the car's frame, anticlockwise.
-        margin: m, points are kept so far beyond `range_max`, so that a cone there is whole.
-        gap: m, points closer than this are one cluster.
-        kept_cones: K, at most this many a side are kept, the nearest ones.
+        classifier: separates thick from thin cones.
+        range_min, range_max: m, smaller ranges are no return, and range of view.
+        bearing_max: degrees to either side of the heading.
+        scale: factor from the robot's metres to those of the cone world.
+        laser_yaw: degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
+        margin: m, points this far beyond `range_max` are clustered too, so that cones there are complete.
+        gap: m, points closer than this are linked.
+        kept_cones: K, the nearest cones kept per side.
 
     Raises:
-        ValueError: for a value outside its range, naming it.
+        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
@@ -61,9 +132,7 @@ class Perception:
             if not 0 < value < math.inf:
                 raise ValueError(f"{name}={value} must be a finite number above 0")
         if not 0 < range_min < range_max:
-            raise ValueError(
-                f"range_min={range_min} must be above 0, for ranges of 0 are no return, and below range_max"
-            )
+            raise ValueError(f"range_min={range_min} must be above 0, the code for no return, and below range_max")
         if not 0 <= margin < math.inf:
             raise ValueError(f"margin={margin} must be a finite number of at least 0")
         if not 0 < bearing_max <= 180 or not math.isfinite(laser_yaw):
@@ -74,45 +143,128 @@ class Perception:
         self.scale, self.kept_cones = scale, kept_cones
 
     def __call__(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
-        """The cones in sight.
-
-        Args:
-            ranges: [N, P] m, N scans; what is not finite is no return.
-            angles: [P] radians in the LiDAR's frame, anticlockwise.
+        """Return the cones in view of scans [N, P] m, whose beams have the bearings [P] radians in the LiDAR's frame.
 
         Returns:
-            [N, 2, K, 2] m times `scale` in the car's frame (x ahead, y left), left side first, nearest first, zeros
-            after the last; and how many there are, [N, 2].
+            Cones [N, 2, K, 2] m times `scale` in the car's frame (x forward, y left), left side first, nearest first,
+            padded with zeros; and their number [N, 2].
         """
         ranges = np.asarray(ranges)
-        parts = [self._cones(ranges[begin : begin + AT_ONCE], angles) for begin in range(0, len(ranges) or 1, AT_ONCE)]
-        return np.concatenate([cones for cones, _ in parts]), np.concatenate([count for _, count in parts])
+        starts = range(0, len(ranges) or 1, SCANS_PER_BATCH)
+        cones, count = zip(*(self._cones(ranges[i : i + SCANS_PER_BATCH], angles) for i in starts), strict=True)
+        return np.concatenate(cones), np.concatenate(count)
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
-        """All clusters of at least two points, in the car's frame but not scaled, whether they are cones or not."""
+        """Return all clusters of at least two points, in the car's frame, unscaled."""
         points = self.points(ranges, angles)
         return measure(points, single_linkage(points, self.gap))
 
     def points(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Points:
-        """What is near enough to be looked at, in the car's frame but not scaled."""
-        turned = np.asarray(angles, dtype=np.float64) + self.laser_yaw
-        return points_of(ranges, turned, self.range_min, self.range_max + self.margin)
+        """Return all points up to `range_max + margin`, in the car's frame, unscaled."""
+        bearings = np.asarray(angles, dtype=np.float64) + self.laser_yaw
+        return points_of(ranges, bearings, self.range_min, self.range_max + self.margin)
 
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
-        """Which clusters [C] the car sees, by the mean of their points."""
+        """Return whether the centroid of each cluster is in range and bearing, [C]."""
         x, y = clusters.centroid.T
         return (np.hypot(x, y) <= self.range_max) & (np.abs(np.arctan2(y, x)) <= self.bearing_max)
 
     def _cones(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
         clusters = self.clusters(ranges, angles)
-        seen = self.in_sight(clusters)
-        place, scan = clusters.centroid[seen], clusters.scan[seen]
-        side = scan * 2 + self.classifier.thick(clusters.features[seen])
-        order = np.lexsort((np.hypot(*place.T), side))
-        place, side = place[order], side[order]
-        count = np.bincount(side, minlength=2 * len(ranges))
-        rank = np.arange(len(side)) - (np.cumsum(count) - count)[side]
-        kept = rank < self.kept_cones
+        visible = self.in_sight(clusters)
+        position, scan = clusters.centroid[visible], clusters.scan[visible]
+        row = scan * 2 + self.classifier.thick(clusters.features[visible])
+        order = np.lexsort((np.hypot(*position.T), row))
+        position, row = position[order], row[order]
+        count = np.bincount(row, minlength=2 * len(ranges))
+        rank = np.arange(len(row)) - (np.cumsum(count) - count)[row]
+        near = rank < self.kept_cones
         cones = np.zeros((2 * len(ranges), self.kept_cones, 2))
-        cones[side[kept], rank[kept]] = place[kept] * self.scale
+        cones[row[near], rank[near]] = position[near] * self.scale
         return cones.reshape(-1, 2, self.kept_cones, 2), np.minimum(count, self.kept_cones).reshape(-1, 2)
+
+
+class BoundaryMemory(nn.Module):
+    """The observation of a robot without a pose: the boundaries in view, or the last valid ones (paper A.3).
+
+    A side is valid if it has at least two cones and each of the five boundary samples is at a plausible distance.
+    Errors of perception last several scans, as a cone stays in the shadow of another one; an invalid side keeps its
+    last valid numbers. The state is in buffers.
+
+    Args:
+        batch: B.
+        spline, smoothing: of the boundary estimate, as in `ConeTrackEnv`.
+        sight: m, range of view in the scale of the cone world.
+
+    Raises:
+        ValueError: for an unknown spline.
+
+    Example:
+        >>> cones = torch.zeros(1, 2, 16, 2)
+        >>> cones[0, 0, :2] = torch.tensor([[2.0, 1.0], [4.0, 1.0]])
+        >>> observation, valid = BoundaryMemory(1)(cones, torch.tensor([[2, 0]]))
+        >>> observation.shape, valid.tolist()
+        (torch.Size([1, 20]), [[True, False]])
+    """
+
+    samples: Tensor
+    ever_valid: Tensor
+
+    def __init__(
+        self,
+        batch: int,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        sight: float = SIGHT,
+    ) -> None:
+        super().__init__()
+        if spline not in ("cubic", "quadratic"):
+            raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
+        self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
+        self.sight = sight
+        self.register_buffer("samples", torch.zeros(2, SAMPLES, 2, batch))
+        self.register_buffer("ever_valid", torch.zeros(2, batch))
+
+    def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """Update the memory with the cones in view.
+
+        Args:
+            cones: [B, 2, K, 2] m in the car's frame and the scale of the cone world, nearest first, left side first.
+            count: [B, 2] number of cones.
+
+        Returns:
+            The observation [B, 20], zeros for a side that was never valid; and which sides are valid now [B, 2].
+        """
+        return self.remember(*self.estimate(cones, count))
+
+    def estimate(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the boundary samples [2, 5, 2, B] m of cones, and which sides are valid [2, B], without the memory."""
+        samples = self.fit(cones.permute(3, 2, 1, 0), count.t()).equidistant(SAMPLES)
+        distance = samples.square().sum(0).sqrt()
+        plausible = (distance >= MIN_DISTANCE) & (distance <= self.sight * MAX_DISTANCE)
+        return samples, (count.t() >= 2) & plausible.all(0)
+
+    def remember(self, samples: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+        """Update the memory with the output of `estimate`; return what `forward` does."""
+        self.samples = torch.where(valid, samples, self.samples)
+        self.ever_valid = torch.where(valid, torch.ones_like(self.ever_valid), self.ever_valid)
+        return encode(self.samples, self.ever_valid, self.sight), valid.t()
+
+    def reset(self, mask: Tensor) -> None:
+        """Clear the rows where mask [B] is true."""
+        self.samples = self.samples.masked_fill(mask, 0)
+        self.ever_valid = self.ever_valid.masked_fill(mask, 0)
+
+
+def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
+    """Set the specs of a simulated or replayed robot from an example of the entries of its reset."""
+    batch, device = env.batch_size, env.device
+    spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
+    for key in ("observation", "steering"):
+        spec[key] = Bounded(-1, 1, example[key].shape, device=device, dtype=torch.float32)
+    env.observation_spec = spec
+    env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=torch.float32)
+    env.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
+    flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
+    done = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+    env.done_spec = Composite(done, shape=batch, device=device)

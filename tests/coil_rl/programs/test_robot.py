@@ -1,3 +1,5 @@
+"""coil-robot."""
+
 import csv
 from pathlib import Path
 
@@ -18,7 +20,7 @@ SMALL = [*SHORT, "figure_25.pairs=2", "figure_25.tests=1"]
 
 
 def make_run(folder, *overrides):
-    """What coil-train leaves, as far as coil-robot reads it; the agent has learned nothing."""
+    """The parts of an untrained run that coil-robot reads."""
     folder.mkdir()
     torch.manual_seed(0)
     with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
@@ -52,11 +54,11 @@ def rows_of(path):
 
 
 @pytest.mark.slow
-def test_all_steps_leave_recordings_a_classifier_and_both_tables(runs):
+def test_all_steps_write_recordings_a_classifier_and_both_pages(runs):
     done = called("robot", *SMALL, f"runs=[{runs}/coil]", "hydra.run.dir=run")
     run = Path("run")
     names = {f"{page}.{ending}" for page in ("figure_25", "table_6") for ending in ("md", "csv", "png")}
-    assert {path.name for path in run.iterdir()} - {".hydra"} == {*names, "cones.skops", "labelling", "drives"}
+    assert {path.name for path in run.iterdir()} - {".hydra"} == {*names, "cones.json", "labelling", "drives"}
     assert {path.name for path in (run / "drives").iterdir()} == {"00_guide_0.mcap", "01_coil_seed3_0.mcap"}
     assert len(list((run / "labelling").iterdir())) == 5
     pages = [(run / f"{page}.md").read_text() for page in ("figure_25", "table_6")]
@@ -65,21 +67,21 @@ def test_all_steps_leave_recordings_a_classifier_and_both_tables(runs):
     assert [row["method"] for row in rows_of(run / "table_6.csv")] == ["guide", "coil"]
 
 
-def test_recordings_make_the_table_of_the_drives_again(runs):
+def test_table_is_reproduced_from_the_recordings(runs):
     called("robot", "steps=[drive,table]", *SHORT, f"runs=[{runs}/coil]", "hydra.run.dir=run")
     assert [row["method"] for row in rows_of(Path("run/table_6.csv"))] == ["guide", "coil"]
     called("robot", "steps=[table]", "recordings=[run/drives]", "hydra.run.dir=again")
     assert Path("again/table_6.csv").read_bytes() == Path("run/table_6.csv").read_bytes()
 
 
-def test_what_a_transform_made_of_the_action_is_what_the_robot_was_told(runs):
+def test_recorded_command_is_the_transformed_action(runs):
     called("robot", "steps=[drive]", *SHORT, f"runs=[{runs}/residual]", "hydra.run.dir=run")
     recording = read_recording("run/drives/01_residual_seed0_0.mcap")
     guide = McapReplayEnv(recording, Perception(simulated_cone_classifier())).rollout(100, SplineGuide())
-    told = recording.commands[0][:, 1]
-    # A residual agent that has not learned yet adds little to its guide.
+    turn_rate = torch.from_numpy(recording.commands[0][:, 1])
+    # An untrained residual agent adds little to its guide.
     advised = (guide["action"][0, :, 0] * torch.pi * 80 / 180).sin() * 0.15 / (2 / 7)
-    assert 0 < (torch.from_numpy(told) - advised).abs().mean() < 0.2
+    assert 0 < (turn_rate - advised).abs().mean() < 0.2
 
 
 @pytest.mark.parametrize(
@@ -87,7 +89,7 @@ def test_what_a_transform_made_of_the_action_is_what_the_robot_was_told(runs):
     [
         ("steps=[]", "steps=[] must be some of record, train, drive, table"),
         ("steps=[dirve]", "steps=['dirve'] must be some of record, train, drive, table"),
-        ("steps=[table]", "recordings is empty and nothing is driven; give recordings=[FILE,...]"),
+        ("steps=[table]", "recordings is empty and there is no drive; give recordings=[FILE,...]"),
         ("steps=[table] recordings=[none.mcap]", "none.mcap cannot be read (No such file or directory)"),
         ("steps=[train] figure_25.left=[none.mcap]", "figure_25: left=['none.mcap'] and right=[] must both be given"),
         ("runs=[nowhere]", "runs=nowhere is not the folder of a run: it has no config.yaml"),
@@ -97,7 +99,7 @@ def test_what_a_transform_made_of_the_action_is_what_the_robot_was_told(runs):
         ("step=[table]", "there is no key step"),
     ],
 )
-def test_a_mistake_is_one_sentence_and_leaves_nothing(arguments, words, runs):
+def test_errors_are_one_sentence_and_leave_no_files(arguments, words, runs):
     done = called("robot", *arguments.format(runs=runs).split(), code=2)
     (sentence,) = done.stderr.splitlines()
     assert sentence.startswith("robot: ")

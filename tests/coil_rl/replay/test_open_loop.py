@@ -1,4 +1,4 @@
-"""What policies would have steered, scan by scan, and what the robot was told instead."""
+"""Open-loop evaluation of policies on recordings, and its report."""
 
 import math
 from pathlib import Path
@@ -6,108 +6,123 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from drives import drive
 from tensordict.nn import TensorDictModule
 
-from coil_rl.envs import (
-    McapReplayEnv,
-    Perception,
-    Recording,
-    SimulatedRobotEnv,
-    record_drives,
-    simulated_cone_classifier,
-)
-from coil_rl.guides import ConstantGuide, SplineGuide
-from coil_rl.replay import RECORDED, open_loop
+from coil_rl.envs import McapReplayEnv, Recording
+from coil_rl.guides import ConstantGuide
+from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop
+from coil_rl.replay.report import describe, disagreement, extent, notes, outcome, over_time
 
-TURN_RATE, LARGEST = 0.15 / (2 / 7), math.radians(80)
+TURN_RATE, MAX_STEERING = 0.15 / (2 / 7), math.radians(80)
 
 
 def blind(ranges, angles):
-    """Perception that sees no cone."""
+    """Perception without cones."""
     return np.zeros((len(ranges), 2, 16, 2)), np.zeros((len(ranges), 2))
 
 
-def told(omegas=(), since=(), scans=4):
-    """A recording of scans at 0, 100, 200 ... ns with commands at other times, if any."""
-    times, ones = np.arange(scans) * 100, np.ones(scans)
-    commands = np.stack([np.full(len(omegas), 0.15), omegas], axis=1), np.array(since)
-    return Recording(
-        Path("drive"), False, times, times, np.ones((scans, 9), np.float32), ones.astype(int) * 9, -ones, ones / 9,
-        commands=commands if len(omegas) else None,
-    )  # fmt: skip
+def recording(omegas=(), times=(), scans=4, period=100, **options):
+    """A recording of scans at 0, 100, 200 ... ns with commands at other times."""
+    scan_times, ones = np.arange(scans) * period, np.ones(scans)
+    if len(omegas):
+        options["commands"] = np.stack([np.full(len(omegas), 0.15), omegas], axis=1), np.array(times)
+    ranges, points = np.ones((scans, 9), np.float32), ones.astype(int) * 9
+    return Recording(Path("drive.mcap"), False, scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
 
 
-def asked(recordings, *guides, **options):
-    replay = McapReplayEnv(recordings, blind)
-    return open_loop(replay, {str(n): (replay, guide) for n, guide in enumerate(guides)}, **options)
+def run(recordings, *guides, **options):
+    env = McapReplayEnv(recordings, blind)
+    return open_loop(env, {str(n): (env, guide) for n, guide in enumerate(guides)}, **options)
 
 
-def test_the_policy_that_drove_says_again_what_was_recorded(tmp_path):
-    path = tmp_path / "drive.mcap"
-    record_drives(SimulatedRobotEnv(time_limit=25 / 5.5, seed=4), SplineGuide(), [path])
-    replay = McapReplayEnv(path, Perception(simulated_cone_classifier()))
-    [found] = open_loop(replay, {"driver": (replay, SplineGuide())})
-    driver, recorded = found.steering["driver"], found.steering[RECORDED]
-    assert np.abs(driver.omega).max() > 0.1
-    for one, other in zip(vars(driver).values(), vars(recorded).values(), strict=True):
-        np.testing.assert_allclose(one, other, atol=1e-3)
-    assert found.policies == ["driver"]
-
-
-def test_smoothness_and_omega_are_those_of_the_simulation():
-    [found] = asked(told(), ConstantGuide(0.5))
-    steering = found.steering["0"]
+def test_smoothness_and_omega_are_those_of_the_cone_world():
+    [result] = run(recording(), ConstantGuide(0.5))
+    steering = result.steering["0"]
     assert steering.action.tolist() == [0.5] * 4
-    np.testing.assert_allclose(steering.omega, TURN_RATE * math.sin(LARGEST / 2), rtol=1e-6)
+    np.testing.assert_allclose(steering.omega, TURN_RATE * math.sin(MAX_STEERING / 2), rtol=1e-6)
     weights = np.exp(-0.1 * np.arange(20))
     expected = [0.5 - 0.5 * weights[:before].sum() / weights.sum() for before in range(4)]
     np.testing.assert_allclose(steering.smoothness, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("since", "expected"),
+    ("times", "expected"),
     [
-        ([0, 100, 200, 300], [0.1, 0.2, 0.3, 0.4]),  # told together with the scan
+        ([0, 100, 200, 300], [0.1, 0.2, 0.3, 0.4]),  # at the times of the scans
         ([30, 130, 230, 330], [0.1, 0.2, 0.3, 0.4]),  # a little later
-        ([30, 60, 230, 250], [0.1, 0.2, 0.3, 0.4]),  # the first after a scan; without one the last still holds
-        ([110, 120, 130, 140], [math.nan, 0.1, 0.4, 0.4]),  # before the first one nothing is known
+        ([30, 60, 230, 250], [0.1, 0.2, 0.3, 0.4]),  # the first after a scan, else the last before it
+        ([110, 120, 130, 140], [math.nan, 0.1, 0.4, 0.4]),  # unknown before the first
         ([-90, -80, -70, -60], [0.4, 0.4, 0.4, 0.4]),
     ],
 )
-def test_command_of_a_scan_is_the_first_one_that_may_answer_it(since, expected):
-    [found] = asked(told([0.1, 0.2, 0.3, 0.4], since), ConstantGuide(0.0))
-    np.testing.assert_array_equal(found.steering[RECORDED].omega, expected)
+def test_command_of_a_scan_is_the_first_one_until_the_next_scan(times, expected):
+    [result] = run(recording([0.1, 0.2, 0.3, 0.4], times), ConstantGuide(0.0))
+    np.testing.assert_array_equal(result.steering[RECORDED].omega, expected)
 
 
-def test_recorded_command_becomes_the_action_that_turns_as_fast_or_the_largest():
+def test_recorded_action_has_the_recorded_turn_rate_or_is_the_maximum():
     action = [0.25, -1.0, 1.0, 0.0]
-    omegas = TURN_RATE * np.sin(np.array(action) * LARGEST)
-    omegas[2] = 3.0  # which no steering gives
-    [found] = asked(told(omegas, [0, 100, 200, 300]), ConstantGuide(0.0))
-    np.testing.assert_allclose(found.steering[RECORDED].action, action, atol=1e-12)
-    assert found.steering[RECORDED].omega[2] == 3.0
+    omegas = TURN_RATE * np.sin(np.array(action) * MAX_STEERING)
+    omegas[2] = 3.0  # beyond the greatest turn rate
+    [result] = run(recording(omegas, [0, 100, 200, 300]), ConstantGuide(0.0))
+    np.testing.assert_allclose(result.steering[RECORDED].action, action, atol=1e-12)
+    assert result.steering[RECORDED].omega[2] == 3.0
 
 
-def test_recordings_side_by_side_give_what_each_gives_alone(tmp_path):
-    paths = [drive(tmp_path / f"{scans}.mcap", scans, seed=scans) for scans in (4, 7)]
-    both = asked(paths, SplineGuide())
-    for path, found, scans in zip(paths, both, (4, 7), strict=True):
-        [alone] = asked(path, SplineGuide())
-        assert len(found.valid) == len(found.steering["0"].action) == scans
-        np.testing.assert_array_equal(found.steering["0"].smoothness, alone.steering["0"].smoothness)
-
-
-def test_what_a_policy_draws_depends_on_the_seed_and_not_on_who_was_asked_before():
+def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     def drawing():
-        return TensorDictModule(lambda seen: torch.rand(len(seen), 1), in_keys=["observation"], out_keys=["action"])
+        return TensorDictModule(lambda x: torch.rand(len(x), 1), in_keys=["observation"], out_keys=["action"])
 
-    [both], [other] = (asked(told(), drawing(), drawing(), seed=seed) for seed in (0, 1))
+    [both], [other] = (run(recording(), drawing(), drawing(), seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(both.steering["0"].action, both.steering["1"].action)
     assert (both.steering["0"].action != other.steering["0"].action).all()
-
-
-def test_every_scan_of_every_policy_is_announced():
     names = []
-    asked(told(), ConstantGuide(0.0), ConstantGuide(1.0), tick=names.append)
+    run(recording(), ConstantGuide(0.0), ConstantGuide(1.0), tick=names.append)
     assert names == ["0"] * 4 + ["1"] * 4
+
+
+def result_of(cut_off=False, **actions):
+    """A result with given actions; both sides are valid in the first and the last of 4 scans."""
+    steering = {name: Steering(a, a / 2, np.abs(a) / 4) for name, a in ((n, np.array(x)) for n, x in actions.items())}
+    valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
+    one = recording(period=10**9, notes={"simulated": {}})
+    vars(one)["cut_off"] = cut_off
+    arrays = np.zeros((4, 2, 1, 2)), np.zeros((4, 2)), np.zeros((4, 20))
+    return OpenLoop(one, *arrays, valid, steering, MAX_STEERING)
+
+
+@pytest.fixture
+def result():
+    return result_of(left=[1.0] * 4, both=[1.0, -1.0, 1.0, -1.0], recorded=[math.nan, 0.0, 0.0, 0.5])
+
+
+def test_disagreement_is_a_mean_over_the_scans_with_both_known(result):
+    distances = disagreement(result)
+    assert distances.loc["left", "both"] == distances.loc["both", "left"] == 1.0
+    assert distances.loc["left", RECORDED] == pytest.approx((1 + 1 + 0.5) / 3)
+    assert outcome(result).endswith("; both and recorded disagree most, by 1.167 on average")
+    alone = result_of(left=[1.0] * 4)
+    assert "disagree" not in outcome(alone)
+    assert "from" not in describe(alone)
+
+
+def test_table_has_a_row_and_a_column_per_policy(result):
+    text = describe(result)
+    assert "## drive.mcap (simulated)" in text
+    assert "4 scans in 3.0 s; both boundaries valid in 50% of them." in text
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
+    assert rows[0] == ["policy", "smoothness", "omega (rad/s)", "from left", "from both", "from recorded"]
+    assert rows[2:] == [
+        ["left", "0.250", "0.500", "-", "1.000", "0.833"],
+        ["both", "0.250", "0.500", "1.000", "-", "1.167"],
+        ["recorded", "0.042", "0.083", "0.833", "1.167", "-"],
+    ]
+    assert "fractions of 80 degrees" in notes(result.max_steering)
+    assert "3.0 s, all that can be read of a file that is cut off" in extent(result_of(cut_off=True))
+
+
+def test_every_scan_has_a_row(result):
+    rows = over_time(result)
+    assert [(row["time"], row["valid"]) for row in rows] == [(0.0, 1), (1.0, 0), (2.0, 0), (3.0, 1)]
+    assert (rows[1]["both/steering"], rows[1]["both/omega"]) == (-1.0, -0.5)
+    assert math.isnan(rows[0]["recorded/omega"])

@@ -5,10 +5,10 @@ import pytest
 from reproduced_runs import read_csv
 
 from coil_rl.envs import RecordingError, read_recording, save_drive, simulated_drive
-from coil_rl.envs.robot.simulated_recordings import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
 from coil_rl.errors import UserError
 from coil_rl.reproduce import Figure25
-from coil_rl.robot import accuracy, label_clusters, load_classifier
+from coil_rl.robot.classifier import accuracy, label_clusters, load_classifier
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,7 @@ def drives(tmp_path_factory):
 def test_the_page_has_the_accuracy_of_the_saved_classifier(drives, tmp_path):
     page = Figure25(**drives).make(tmp_path / "figure_25")
     tested = surveyed_drive(read_recording(drives["both"][0]))
-    shares = accuracy(load_classifier(tmp_path / "cones.skops"), label_clusters([tested]))
+    shares = accuracy(load_classifier(tmp_path / "cones.json"), label_clusters([tested]))
     assert page.startswith("## Figure 25: thin cones and thick ones (simulated)\n")
     for name, share in shares.items():
         assert re.search(rf"\| accuracy +\| {re.escape(name)} +\| +{share.share:.4f} \|.*\| +{share.total} \|", page)
@@ -36,7 +36,7 @@ def test_without_test_drives_there_is_only_the_cross_validation(drives, tmp_path
     page = Figure25(drives["left"], drives["right"]).make(tmp_path / "figure_25")
     assert "| cross-validation " in page
     assert "| recall" not in page
-    assert (tmp_path / "cones.skops").exists()
+    assert (tmp_path / "cones.json").exists()
 
 
 def test_unusable_drives_are_rejected(drives, tmp_path):
@@ -44,7 +44,7 @@ def test_unusable_drives_are_rejected(drives, tmp_path):
         Figure25(left=drives["left"])
     with pytest.raises(ValueError, match="pairs=1 must be at least 2"):
         Figure25(pairs=1)
-    with pytest.raises(RecordingError, match="does not tell where its cones stood"):
+    with pytest.raises(RecordingError, match="lacks the positions of its cones"):
         Figure25(drives["left"], drives["right"], both=drives["left"])
     with pytest.raises(UserError, match="are too few to learn from"):
         Figure25(drives["left"][:1], drives["right"]).make(tmp_path / "figure_25")

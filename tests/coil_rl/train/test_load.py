@@ -9,6 +9,7 @@ from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
 from coil_rl.train import load
+from coil_rl.train.run_folder import read_config
 
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]
 
@@ -28,7 +29,7 @@ def replay(tmp_path):
 
 def acts(run, replay):
     """Return all steps of the policy of a run in a replay."""
-    env, policy = load.load_policy_in_env(run, load.read_config(run, "run"), replay)
+    env, policy = load.load_policy_in_env(run, read_config(run, "run"), replay)
     with torch.no_grad():
         return env.eval().rollout(6, policy)[0]
 

@@ -1,4 +1,4 @@
-"""Recordings: what was recorded comes back as arrays, and what cannot be used is refused in one sentence."""
+"""Reading of recordings, and one-sentence errors for those that cannot be used."""
 
 import hashlib
 import json
@@ -8,18 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import ODOMETRY, SCAN, START, TURN, TWIST, drive, flipped, scan, store, uncompressed
+from drives import PERIOD, START, drive, flipped, odometry_fields, scan, store, uncompressed
 from rosbags import rosbag1, rosbag2
 from rosbags.convert.cli import main as convert
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from coil_rl.envs.recordings.cdr import definition
 from coil_rl.envs.recordings.mcap_files import digest
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, twist
 from coil_rl.envs.recordings.reading import RecordingError, read_recording
-from coil_rl.envs.recordings.ros_messages import Odometry, Twist
 
 REAL = Path(__file__).parents[3] / "../shared/recordings"
+EITHER_COMPRESSION = pytest.mark.parametrize("compression", [lambda path: path, uncompressed], ids=["zstd", "none"])
+ANGLE = 0.15 * np.arange(300) * PERIOD / 1e9
+CIRCLE = np.stack([np.sin(ANGLE), 1 - np.cos(ANGLE), ANGLE], axis=1)
 
 
 @pytest.fixture(scope="module")
@@ -28,99 +30,11 @@ def whole(tmp_path_factory):
     return drive(tmp_path_factory.mktemp("drives") / "whole.mcap", scans=300, odometry=True, commands=True)
 
 
-def copy(path, folder):
-    made = folder / path.name
-    made.write_bytes(path.read_bytes())
+def copy(path, folder, share=1.0):
+    """A copy of the first bytes of a file."""
+    data, made = path.read_bytes(), folder / path.name
+    made.write_bytes(data[: int(share * len(data))])
     return made
-
-
-def cut(path, share):
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
-    return path
-
-
-def refusal(path, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        with pytest.raises(RecordingError) as caught:
-            read_recording(path, **options)
-    message = str(caught.value)
-    assert message.startswith(str(path.parent))
-    assert message.endswith(".")
-    assert "\n" not in message
-    return message
-
-
-def test_scans_come_back_as_one_array(whole):
-    recording = read_recording(whole)
-    turns = [scan(turn) for turn in range(300)]
-    np.testing.assert_array_equal(recording.ranges, [turn.ranges for turn in turns])
-    assert recording.ranges.flags.c_contiguous
-    assert recording.ranges.dtype == np.float32
-    np.testing.assert_array_equal(recording.stamp, [turn.stamp for turn in turns])
-    np.testing.assert_allclose(recording.angles(7), np.linspace(-3.1241, 3.1241, 360), atol=1e-4)
-    np.testing.assert_allclose(recording.seconds, np.arange(300) * TURN / 1e9)
-    assert not recording.cut_off
-
-
-def test_what_is_out_of_range_did_not_come_back(tmp_path):
-    turn = scan(0)._replace(ranges=np.array([0.0, 0.1, 0.15, 1.0, 12.0, 12.5, np.nan, np.inf, -1.0], np.float32))
-    ranges = read_recording(store(tmp_path / "a.mcap", turn.to_bytes())).ranges
-    np.testing.assert_array_equal(ranges, [[np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4]])
-
-
-def test_turns_may_have_different_numbers_of_points(tmp_path):
-    turns = [scan(turn, points) for turn, points in enumerate([5, 3, 0, 4])]
-    recording = read_recording(store(tmp_path / "a.mcap", *[turn.to_bytes() for turn in turns]))
-    assert recording.points.tolist() == [5, 3, 0, 4]
-    for row, turn in zip(recording.ranges, turns, strict=True):
-        np.testing.assert_array_equal(row[: len(turn.ranges)], turn.ranges)
-        assert np.isinf(row[len(turn.ranges) :]).all()
-
-
-def test_pose_is_that_of_the_odometry_between_its_messages(tmp_path, whole):
-    angle = 0.15 * np.arange(300) * TURN / 1e9
-    circle = np.stack([np.sin(angle), 1 - np.cos(angle), angle], axis=1)
-    np.testing.assert_allclose(read_recording(whole).poses(), circle, atol=1e-9)
-    turned = [Odometry(START + 10**9, 2.0, 0.0, 3.1), Odometry(START + 3 * 10**9, 4.0, 1.0, -3.1)]
-    store(tmp_path / "odometry.mcap", *[place.to_bytes() for place in turned], kind=ODOMETRY, topic="/odom")
-    store(tmp_path / "scans.mcap", *[scan(0)._replace(stamp=START + s * 10**9).to_bytes() for s in range(5)])
-    folder = rosbag(tmp_path, "odometry.mcap", "scans.mcap")
-    expected = [[2, 0, 3.1], [2, 0, 3.1], [3, 0.5, np.pi], [4, 1, 2 * np.pi - 3.1], [4, 1, 2 * np.pi - 3.1]]
-    np.testing.assert_allclose(read_recording(folder).poses(), expected)
-
-
-def test_pose_follows_from_the_commands_where_there_is_no_odometry(whole):
-    angle = 0.15 * np.arange(300) * TURN / 1e9
-    circle = np.stack([np.sin(angle), 1 - np.cos(angle), angle], axis=1)
-    np.testing.assert_allclose(read_recording(whole, odometry=None).poses(), circle, atol=1e-9)
-
-
-def test_command_holds_until_the_next(tmp_path):
-    store(tmp_path / "scans.mcap", *[scan(0).to_bytes()] * 4)
-    twists = [Twist(1.0, 0.0).to_bytes(), Twist(2.0, 0.0).to_bytes(), Twist(0.0, 0.5).to_bytes()]
-    store(tmp_path / "commands.mcap", *twists, kind=TWIST, topic="/cmd_vel")
-    folder = rosbag(tmp_path, "scans.mcap", "commands.mcap")
-    np.testing.assert_allclose(read_recording(folder).poses(), [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0, 0.5]])
-
-
-def test_nothing_says_that_the_robot_moved(whole):
-    assert not read_recording(whole, odometry=None, command=None).poses().any()
-
-
-def test_order_is_that_of_the_log(tmp_path):
-    turns = [scan(turn).to_bytes() for turn in range(4)]
-    store(tmp_path / "b.mcap", *turns[:2])
-    store(tmp_path / "a.mcap", *turns[2:])
-    recording = read_recording(rosbag(tmp_path, "b.mcap", "a.mcap"))
-    np.testing.assert_array_equal(recording.log_time - START, np.array([0, 0, 1, 1]) * 10**9)
-    np.testing.assert_array_equal((recording.stamp - START) // TURN, [0, 2, 1, 3])
-
-
-def test_time_is_that_of_the_log_where_the_stamps_run_backwards(tmp_path):
-    turns = [scan(turn).to_bytes() for turn in (3, 1, 2)]
-    assert read_recording(store(tmp_path / "a.mcap", *turns)).seconds.tolist() == [0, 1, 2]
 
 
 def rosbag(folder, *files, storage="mcap"):
@@ -133,42 +47,111 @@ def rosbag(folder, *files, storage="mcap"):
     return folder
 
 
+def refusal(path, **options):
+    """The message of the error, which is one sentence about the file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RecordingError) as caught:
+            read_recording(path, **options)
+    message = str(caught.value)
+    assert message.startswith(str(path.parent))
+    assert message.endswith(".")
+    assert "\n" not in message
+    return message
+
+
+def test_scans_are_read_as_one_array(whole):
+    recording = read_recording(whole)
+    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in range(300)])
+    assert recording.ranges.dtype == np.float32
+    np.testing.assert_array_equal(recording.stamp, START + np.arange(300) * PERIOD)
+    np.testing.assert_allclose(recording.angles(7), np.linspace(-3.1241, 3.1241, 360), atol=1e-4)
+    np.testing.assert_allclose(recording.seconds, np.arange(300) * PERIOD / 1e9)
+    assert (recording.frame, recording.cut_off) == ("laser", False)
+
+
+def test_ranges_outside_the_scanners_limits_are_no_return(tmp_path):
+    ranges = np.array([0.0, 0.1, 0.15, 1.0, 12.0, 12.5, np.nan, np.inf, -1.0], np.float32)
+    read = read_recording(store(tmp_path / "a.mcap", scan(0, ranges=ranges))).ranges
+    np.testing.assert_array_equal(read, [[np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4]])
+
+
+def test_scans_may_have_different_numbers_of_points(tmp_path):
+    scans = [scan(number, points) for number, points in enumerate([5, 3, 0, 4])]
+    recording = read_recording(store(tmp_path / "a.mcap", *scans))
+    assert recording.points.tolist() == [5, 3, 0, 4]
+    for row, fields in zip(recording.ranges, scans, strict=True):
+        points = len(fields["ranges"])
+        np.testing.assert_array_equal(row[:points], fields["ranges"])
+        assert np.isinf(row[points:]).all()
+
+
+def test_poses_are_interpolated_from_the_odometry(tmp_path, whole):
+    np.testing.assert_allclose(read_recording(whole).poses(), CIRCLE, atol=1e-9)
+    poses = [odometry_fields(START + 10**9, 2.0, 0.0, 3.1), odometry_fields(START + 3 * 10**9, 4.0, 1.0, -3.1)]
+    store(tmp_path / "odometry.mcap", *poses, kind=ODOMETRY, topic="/odom")
+    store(tmp_path / "scans.mcap", *[scan(0, header=header(START + s * 10**9, "laser")) for s in range(5)])
+    folder = rosbag(tmp_path, "odometry.mcap", "scans.mcap")
+    expected = [[2, 0, 3.1], [2, 0, 3.1], [3, 0.5, np.pi], [4, 1, 2 * np.pi - 3.1], [4, 1, 2 * np.pi - 3.1]]
+    np.testing.assert_allclose(read_recording(folder).poses(), expected)
+
+
+def test_poses_without_odometry_are_integrated_from_the_commands(tmp_path, whole):
+    np.testing.assert_allclose(read_recording(whole, odometry=None).poses(), CIRCLE, atol=1e-9)
+    assert not read_recording(whole, odometry=None, command=None).poses().any()
+    store(tmp_path / "scans.mcap", *[scan(0)] * 4)
+    twists = [twist(1.0, 0.0), twist(2.0, 0.0), twist(0.0, 0.5)]
+    store(tmp_path / "commands.mcap", *twists, kind=TWIST, topic="/cmd_vel")
+    folder = rosbag(tmp_path, "scans.mcap", "commands.mcap")
+    np.testing.assert_allclose(read_recording(folder).poses(), [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0, 0.5]])
+
+
+def test_messages_are_ordered_by_log_time(tmp_path):
+    scans = [scan(number) for number in range(4)]
+    store(tmp_path / "b.mcap", *scans[:2])
+    store(tmp_path / "a.mcap", *scans[2:])
+    recording = read_recording(rosbag(tmp_path, "b.mcap", "a.mcap"))
+    np.testing.assert_array_equal(recording.log_time - START, np.array([0, 0, 1, 1]) * 10**9)
+    np.testing.assert_array_equal((recording.stamp - START) // PERIOD, [0, 2, 1, 3])
+    # The stamps are not ascending, so the log times are the clock.
+    assert recording.seconds.tolist() == [0, 0, 1, 1]
+
+
 def test_folder_of_split_files_is_one_recording(tmp_path):
-    turns = [scan(turn).to_bytes() for turn in range(5)]
-    store(tmp_path / "drive_0.mcap", *turns[:3])
-    store(tmp_path / "drive_1.mcap", *turns[3:])
-    store(tmp_path / "another.mcap", turns[0])
+    scans = [scan(number) for number in range(5)]
+    store(tmp_path / "drive_0.mcap", *scans[:3])
+    store(tmp_path / "drive_1.mcap", *scans[3:])
+    store(tmp_path / "another.mcap", scans[0])
     recording = read_recording(rosbag(tmp_path, "drive/drive_0.mcap", '"drive_1.mcap"'))
-    np.testing.assert_array_equal(np.sort((recording.stamp - START) // TURN), range(5))
-
-
-def written_by_rosbags(writer, release):
-    """Three scans, written by a library that shares nothing with this one."""
-    ros = get_typestore(release)
-    with writer:
-        topic = writer.add_connection("/scan", SCAN, typestore=ros)
-        for turn in range(3):
-            fields = vars(get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(scan(turn).to_bytes(), SCAN))
-            stamp = ros.types["builtin_interfaces/msg/Time"](**vars(fields["header"].stamp))
-            number = {"seq": turn} if release is Stores.ROS1_NOETIC else {}
-            fields["header"] = ros.types["std_msgs/msg/Header"](**number, stamp=stamp, frame_id="laser")
-            message = ros.types[SCAN](**fields)
-            serialize = ros.serialize_ros1 if number else ros.serialize_cdr
-            writer.write(topic, scan(turn).stamp, serialize(message, SCAN))
+    np.testing.assert_array_equal(np.sort((recording.stamp - START) // PERIOD), range(5))
 
 
 def test_digest_is_that_of_all_files_in_their_order(tmp_path):
-    parts = [store(tmp_path / f"{name}.mcap", scan(turn).to_bytes()) for turn, name in enumerate("ab")]
-    whole = hashlib.sha256(parts[0].read_bytes() + parts[1].read_bytes()).hexdigest()
-    assert digest(rosbag(tmp_path, "a.mcap", "b.mcap")) == whole
-    assert digest(rosbag(tmp_path, "b.mcap", "a.mcap")) != whole
+    parts = [store(tmp_path / f"{name}.mcap", scan(number)) for number, name in enumerate("ab")]
+    expected = hashlib.sha256(parts[0].read_bytes() + parts[1].read_bytes()).hexdigest()
+    assert digest(rosbag(tmp_path, "a.mcap", "b.mcap")) == expected
+    assert digest(rosbag(tmp_path, "b.mcap", "a.mcap")) != expected
     assert digest(parts[0]) == hashlib.sha256(parts[0].read_bytes()).hexdigest()
     with pytest.raises(RecordingError, match="No such file"):
         digest(tmp_path / "missing.mcap")
 
 
+def written_by_rosbags(writer, release):
+    """Three scans, written by the writer of another library."""
+    ros = get_typestore(release)
+    with writer:
+        topic = writer.add_connection("/scan", SCAN, typestore=ros)
+        for number in range(3):
+            fields = vars(get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(encode(SCAN, scan(number)), SCAN))
+            stamp = ros.types["builtin_interfaces/msg/Time"](**vars(fields["header"].stamp))
+            sequence = {"seq": number} if release is Stores.ROS1_NOETIC else {}
+            fields["header"] = ros.types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id="laser")
+            serialize = ros.serialize_ros1 if sequence else ros.serialize_cdr
+            writer.write(topic, START + number * PERIOD, serialize(ros.types[SCAN](**fields), SCAN))
+
+
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
-def test_recording_of_another_library_is_read_once_it_is_in_mcap(tmp_path, monkeypatch, kind):
+def test_recordings_of_another_library_are_read_after_conversion_to_mcap(tmp_path, monkeypatch, kind):
     path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
     if kind == "ros1":
         written_by_rosbags(rosbag1.Writer(path), Stores.ROS1_NOETIC)
@@ -176,25 +159,33 @@ def test_recording_of_another_library_is_read_once_it_is_in_mcap(tmp_path, monke
         storage = rosbag2.StoragePlugin[kind.upper()]
         written_by_rosbags(rosbag2.Writer(path, version=9, storage_plugin=storage), Stores.ROS2_HUMBLE)
     if kind != "mcap":
-        # What the refusal says is what helps.
+        # The command in the error message works.
         remedy = re.search(r"rosbags-convert .*mcap", refusal(path))[0]
         remedy = re.sub("FILE|FOLDER", str(path), remedy).replace("OTHER", str(tmp_path / "new"))
         monkeypatch.setattr("sys.argv", remedy.split())
         with pytest.raises(SystemExit, match="0"):
             convert()
         path = tmp_path / "new"
-    np.testing.assert_array_equal(read_recording(path).ranges, [scan(turn).ranges for turn in range(3)])
+    np.testing.assert_array_equal(read_recording(path).ranges, [scan(number)["ranges"] for number in range(3)])
 
 
-def test_folder_that_is_no_whole_recording_is_refused(tmp_path):
-    store(tmp_path / "drive_0.mcap", scan(0).to_bytes())
-    assert "folder without a readable metadata.yaml" in refusal(tmp_path)
-    assert "lists drive_1.mcap, which is not there" in refusal(rosbag(tmp_path, "drive_0.mcap", "drive_1.mcap"))
-    assert "rosbags-convert" in refusal(rosbag(tmp_path, "drive_0.db3", storage="sqlite3"))
-    assert "lists no files" in refusal(rosbag(tmp_path))
+def test_message_definition_of_the_recording_is_used(tmp_path):
+    little_endian = encode(TWIST, twist(0.15, -0.5))
+    big_endian = b"\0\0\0\0" + np.frombuffer(little_endian, "<f8", 6, 4).astype(">f8").tobytes()
+    store(tmp_path / "commands.mcap", little_endian, big_endian, kind=TWIST, topic="/cmd_vel")
+    # A scanner's own definition, with one more number at the end of each message.
+    message, parts = definition(SCAN).decode().split("=" * 80, 1)
+    own = f"{message}float32 temperature\n{'=' * 80}{parts}".encode()
+    data = encode(SCAN, scan(0))
+    store(tmp_path / "scans.mcap", data + np.float32(36.6).tobytes(), data + bytes(4), definition=own)
+    recording = read_recording(rosbag(tmp_path, "commands.mcap", "scans.mcap"))
+    assert recording.commands[0].tolist() == [[0.15, -0.5]] * 2
+    np.testing.assert_array_equal(recording.ranges, [scan(0)["ranges"]] * 2)
+    # A text that cannot be parsed is replaced by the standard definition.
+    assert len(read_recording(store(tmp_path / "c.mcap", scan(0), definition=b"?")).ranges) == 1
 
 
-OTHERS = {
+OTHER_FILES = {
     "is empty": b"",
     "git lfs pull": b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n",
     "is a ROS 1 bag; convert it": b"#ROSBAG V2.0\nE\x00\x00\x00",
@@ -207,30 +198,34 @@ OTHERS = {
 }
 
 
-@pytest.mark.parametrize(("reason", "data"), OTHERS.items(), ids=list(OTHERS))
-def test_another_file_under_the_name_of_a_recording_is_refused(tmp_path, reason, data):
-    path = tmp_path / "drive.mcap"
-    path.write_bytes(data)
-    assert reason in refusal(path)
+@pytest.mark.parametrize(("reason", "data"), OTHER_FILES.items(), ids=list(OTHER_FILES))
+def test_other_files_are_refused(tmp_path, reason, data):
+    (tmp_path / "drive.mcap").write_bytes(data)
+    assert reason in refusal(tmp_path / "drive.mcap")
 
 
-def test_missing_file_is_refused(tmp_path):
+def test_missing_files_and_incomplete_folders_are_refused(tmp_path):
     assert "No such file" in refusal(tmp_path / "missing.mcap")
+    store(tmp_path / "drive_0.mcap", scan(0))
+    assert "folder without a readable metadata.yaml" in refusal(tmp_path)
+    assert "lists drive_1.mcap, which is missing" in refusal(rosbag(tmp_path, "drive_0.mcap", "drive_1.mcap"))
+    assert "rosbags-convert" in refusal(rosbag(tmp_path, "drive_0.db3", storage="sqlite3"))
+    assert "lists no files" in refusal(rosbag(tmp_path))
 
 
-def test_what_is_left_of_a_recording_that_was_cut_off_is_read(tmp_path, whole):
-    path = cut(copy(whole, tmp_path), 0.6)
+def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
+    path = copy(whole, tmp_path, 0.6)
     with pytest.warns(UserWarning, match=r"whole\.mcap is cut off: \d+ scans can be read"):
         recording = read_recording(path)
     assert recording.cut_off
     scans = len(recording.ranges)
     assert 120 < scans < 180
-    np.testing.assert_array_equal(recording.ranges, [scan(turn).ranges for turn in range(scans)])
-    message = refusal(path, strict=True)
-    assert f"is cut off: {scans} scans can be read; copy it anew" in message
+    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in range(scans)])
+    assert f"is cut off: {scans} scans can be read; copy it again" in refusal(path, strict=True)
+    assert "cut off before its first scan" in refusal(copy(whole, tmp_path, 0.01))
 
 
-@pytest.mark.parametrize("compression", [lambda path: path, uncompressed], ids=["zstd", "none"])
+@EITHER_COMPRESSION
 def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
     path = compression(copy(whole, tmp_path))
     data = path.read_bytes()
@@ -239,15 +234,9 @@ def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
         assert "cut off" in refusal(path, strict=True)
 
 
-def test_recording_cut_off_before_its_first_scan_is_refused(tmp_path, whole):
-    assert "cut off before its first scan" in refusal(cut(copy(whole, tmp_path), 0.01))
-
-
-@pytest.mark.parametrize("compression", [lambda path: path, uncompressed], ids=["zstd", "none"])
+@EITHER_COMPRESSION
 def test_damaged_chunk_is_refused(tmp_path, whole, compression):
-    path = compression(copy(whole, tmp_path))
-    read_recording(path)
-    message = refusal(flipped(path, chunk=1))
+    message = refusal(flipped(compression(copy(whole, tmp_path)), chunk=1))
     assert "is damaged before byte" in message
     assert ", after 17000000" in message
     assert "mcap recover" in message
@@ -261,8 +250,8 @@ def test_damaged_length_is_refused(tmp_path, whole):
     assert "is damaged before byte 17 (" in refusal(path)
 
 
-@pytest.mark.parametrize("compression", [lambda path: path, uncompressed], ids=["zstd", "none"])
-def test_damage_anywhere_is_found_or_does_no_harm(tmp_path, compression):
+@EITHER_COMPRESSION
+def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
     path = compression(drive(tmp_path / "a.mcap", scans=9, commands=True))
     expected, data = read_recording(path), path.read_bytes()
     draw = np.random.default_rng(0)
@@ -278,69 +267,60 @@ def test_damage_anywhere_is_found_or_does_no_harm(tmp_path, compression):
         np.testing.assert_array_equal(recording.commands[0], expected.commands[0])
 
 
-def test_recording_without_the_topic_is_refused(tmp_path, whole):
-    assert "has no topic /front; give the topic of the LiDAR, here /scan" in refusal(whole, scan="/front")
-    path = store(tmp_path / "a.mcap", Twist(0, 0).to_bytes(), kind=TWIST, topic="/cmd_vel")
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scan": "/front"}, "has no topic /front; give the topic of the LiDAR, here /scan"),
+        (
+            {"scan": "/odom", "odometry": None},
+            f"has messages of {ODOMETRY} in cdr, not of {SCAN} in cdr; give the topic",
+        ),
+        ({"command": "/odom", "odometry": None}, "give the topic of such messages, here /cmd_vel"),
+        ({"scan": "/odom"}, "must be different topics"),
+    ],
+)
+def test_wrong_topics_are_refused_and_the_right_one_is_named(whole, options, words):
+    assert words in refusal(whole, **options)
+
+
+def test_recording_without_scans_is_refused(tmp_path):
+    path = store(tmp_path / "a.mcap", twist(0, 0), kind=TWIST, topic="/cmd_vel")
     assert "has no scans of a LiDAR" in refusal(path)
     assert "its topics are: /cmd_vel;" in refusal(path)
     assert "its topics are: none" in refusal(store(tmp_path / "b.mcap"))
+    assert "no scan has a range" in refusal(store(tmp_path / "c.mcap", scan(0, 0), scan(1, 0)))
 
 
-@pytest.mark.parametrize("encoding", ["json", "protobuf", "ros1", ""])
-def test_other_encodings_are_refused(tmp_path, encoding):
-    path = store(tmp_path / "a.mcap", json.dumps({"ranges": [1.0]}).encode(), encoding=encoding)
-    message = refusal(path)
-    assert f"topic /scan has messages of {SCAN} in {encoding or 'no encoding'}, not of {SCAN} in cdr" in message
-
-
-@pytest.mark.parametrize("kind", ["sensor_msgs/msg/PointCloud2", "sensor_msgs/LaserScan", "foxglove.LaserScan", ""])
-def test_other_types_are_refused(tmp_path, kind):
-    message = refusal(store(tmp_path / "a.mcap", bytes(64), kind=kind))
-    assert f"topic /scan has messages of {kind or 'no type'} in cdr, not of {SCAN}" in message
-
-
-def test_topic_of_another_type_is_refused_and_the_right_one_named(whole):
-    message = refusal(whole, scan="/odom", odometry=None)
-    assert f"topic /odom has messages of {ODOMETRY} in cdr, not of {SCAN} in cdr" in message
-    assert "give the topic of such messages, here /scan" in message
-    assert "here /cmd_vel" in refusal(whole, command="/odom", odometry=None)
-    assert "must be different topics" in refusal(whole, scan="/odom")
+@pytest.mark.parametrize(
+    "channel",
+    [
+        *({"encoding": encoding} for encoding in ("json", "protobuf", "ros1", "")),
+        *(
+            {"kind": kind}
+            for kind in ("sensor_msgs/msg/PointCloud2", "sensor_msgs/LaserScan", "foxglove.LaserScan", "")
+        ),
+    ],
+)
+def test_other_encodings_and_types_are_refused(tmp_path, channel):
+    message = refusal(store(tmp_path / "a.mcap", json.dumps({"ranges": [1.0]}).encode(), **channel))
+    kind, encoding = channel.get("kind", SCAN) or "no type", channel.get("encoding", "cdr") or "no encoding"
+    assert f"topic /scan has messages of {kind} in {encoding}, not of {SCAN} in cdr" in message
 
 
 @pytest.mark.parametrize("size", [0, 3, 10, 40, 500, 1483])
-def test_message_shorter_than_its_lengths_say_is_refused(tmp_path, size):
-    turns = [scan(turn).to_bytes() for turn in range(3)]
-    message = refusal(store(tmp_path / "a.mcap", turns[0], turns[1][:size], turns[2]))
-    assert "topic /scan, message 1 at 1700000001.000 s: it " in message
-    assert "record it anew" in message
+def test_truncated_message_is_refused(tmp_path, size):
+    scans = [encode(SCAN, scan(number)) for number in range(3)]
+    message = refusal(store(tmp_path / "a.mcap", scans[0], scans[1][:size], scans[2]))
+    assert f"topic /scan, message 1 at 1700000001.000 s: it is not a valid {SCAN} (" in message
+    assert "record it again" in message
 
 
-def test_message_that_is_no_number_is_refused(tmp_path):
-    turns = [scan(0).to_bytes(), scan(1)._replace(angle_min=np.nan).to_bytes()]
-    assert "message 1 at 1700000001.000 s: the angle" in refusal(store(tmp_path / "a.mcap", *turns))
-    place = Odometry(START, np.inf, 0, 0).to_bytes()
-    store(tmp_path / "b.mcap", place, kind=ODOMETRY, topic="/odom")
-    store(tmp_path / "c.mcap", scan(0).to_bytes())
+def test_values_that_are_not_finite_are_refused(tmp_path):
+    path = store(tmp_path / "a.mcap", scan(0), scan(1, angle_min=np.nan))
+    assert "message 1 at 1700000001.000 s: the angle" in refusal(path)
+    store(tmp_path / "b.mcap", odometry_fields(START, np.inf, 0, 0), kind=ODOMETRY, topic="/odom")
+    store(tmp_path / "c.mcap", scan(0))
     assert "topic /odom, message 0" in refusal(rosbag(tmp_path, "b.mcap", "c.mcap"))
-
-
-def test_scans_without_ranges_are_refused(tmp_path):
-    assert "no scan has a range" in refusal(store(tmp_path / "a.mcap", scan(0, 0).to_bytes(), scan(1, 0).to_bytes()))
-
-
-def test_other_layouts_are_read_by_their_definition(tmp_path):
-    big = Twist(0.15, -0.5).to_bytes()
-    big = b"\0\0\0\0" + np.frombuffer(big, "<f8", 6, 4).astype(">f8").tobytes()
-    store(tmp_path / "commands.mcap", big, big, kind=TWIST, topic="/cmd_vel")
-    # A scanner's own definition, with one more number at the end of each message.
-    own = definition(SCAN).replace(b"intensities\n", b"intensities\nfloat32 temperature\n")
-    turn = scan(0)
-    longer = turn.to_bytes() + np.float32(36.6).tobytes()
-    store(tmp_path / "scans.mcap", longer, turn.to_bytes() + bytes(4), definition=own)
-    recording = read_recording(rosbag(tmp_path, "commands.mcap", "scans.mcap"))
-    assert recording.commands[0].tolist() == [[0.15, -0.5]] * 2
-    np.testing.assert_array_equal(recording.ranges, [turn.ranges] * 2)
-    np.testing.assert_array_equal(recording.stamp, [START] * 2)
 
 
 SENSORS = {
@@ -353,18 +333,18 @@ SENSORS = {
 
 
 @pytest.mark.parametrize(("name", "topic"), SENSORS)
-def test_recordings_of_real_sensors_are_read_as_another_library_reads_them(name, topic):
+def test_recordings_of_real_sensors_are_read_like_another_library_does(name, topic):
     path = REAL / f"{name}.mcap"
     if not path.is_file():
-        pytest.skip("the recordings of real sensors lie beside the repository only")
+        pytest.skip("the recordings of real sensors are not part of the repository")
     recording = read_recording(path, scan=topic, strict=True)
     assert recording.ranges.shape == SENSORS[name, topic]
     assert np.isfinite(recording.poses()).all()
     assert (recording.odometry is not None) == ("odom" in name)
     assert (np.diff(recording.seconds) > 0).all()
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        sources = [source for source in reader.connections if source.topic == topic]
-        turns = [reader.deserialize(data, source.msgtype) for source, _, data in reader.messages(sources)]
-    for row, turn in zip(recording.ranges, turns, strict=True):
-        came_back = (turn.ranges >= turn.range_min) & (turn.ranges <= turn.range_max)
-        np.testing.assert_array_equal(row, np.where(came_back, turn.ranges, np.inf))
+        channels = [channel for channel in reader.connections if channel.topic == topic]
+        messages = [reader.deserialize(data, channel.msgtype) for channel, _, data in reader.messages(channels)]
+    for row, message in zip(recording.ranges, messages, strict=True):
+        in_range = (message.ranges >= message.range_min) & (message.ranges <= message.range_max)
+        np.testing.assert_array_equal(row, np.where(in_range, message.ranges, np.inf))

@@ -1,16 +1,22 @@
+"""Clusters of LiDAR points."""
+
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
+from coil_rl.envs import read_recording
 from coil_rl.envs.robot.clusters import GAP, Points, measure, points_of, single_linkage
 
-FULL_TURN = np.arange(360) * 2 * np.pi / 360 - np.pi
+RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"
+CIRCLE = np.arange(360) * 2 * np.pi / 360 - np.pi
 
 
 def dense(points: Points, scan: int, gap: float) -> list[frozenset[int]]:
-    """The connected components of one scan's whole matrix of distances, as sets of points."""
+    """The connected components of the full distance matrix of a scan, as sets of points."""
     rows = np.flatnonzero(points.scan == scan)
     x, y = (axis[rows][:, None] - axis[rows] for axis in (points.x, points.y))
     return as_sets(connected_components(x * x + y * y < gap * gap)[1], rows) if len(rows) else []
@@ -23,8 +29,8 @@ def as_sets(labels, rows) -> list[frozenset[int]]:
     return sorted(map(frozenset, groups.values()), key=min)
 
 
-def expect_exact(ranges, angles, nearest=0.02, farthest=1.15, gap=GAP) -> int:
-    points = points_of(ranges, angles, nearest, farthest)
+def expect_exact(ranges, angles, range_min=0.02, range_max=1.15, gap=GAP) -> int:
+    points = points_of(ranges, angles, range_min, range_max)
     label = single_linkage(points, gap)
     for scan in range(points.scans):
         rows = np.flatnonzero(points.scan == scan)
@@ -34,7 +40,7 @@ def expect_exact(ranges, angles, nearest=0.02, farthest=1.15, gap=GAP) -> int:
 
 
 def scans(seed: int, count: int, beams: int = 360):
-    """Discs, walls, dropouts and clutter: surfaces that hide one another, and points everywhere."""
+    """Discs, walls, dropouts and clutter, some in front of others."""
     rng = np.random.default_rng(seed)
     angles = np.sort(rng.uniform(-np.pi, np.pi, beams)) if seed % 2 else np.linspace(-np.pi, np.pi, beams)
     ranges = np.full((count, beams), np.inf)
@@ -51,7 +57,7 @@ def scans(seed: int, count: int, beams: int = 360):
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_clusters_are_the_components_of_all_distances_on_generated_scans(seed):
+def test_clusters_of_generated_scans_are_connected_components(seed):
     assert expect_exact(*scans(seed, 100)) > 300
 
 
@@ -62,24 +68,24 @@ def test_clusters_are_the_components_of_all_distances_on_generated_scans(seed):
     st.sampled_from([2 * np.pi, -2 * np.pi, 4.2, 0.3, 9.0]),
     st.floats(0.01, 0.5),
 )
-def test_clusters_are_the_components_of_all_distances_for_any_scan(ranges, start, span, gap):
+def test_clusters_of_any_scan_are_connected_components(ranges, start, span, gap):
     angles = start + np.arange(len(ranges)) * span / len(ranges)
-    expect_exact(np.array([ranges, ranges[::-1]]), angles, nearest=1e-4, gap=gap)
+    expect_exact(np.array([ranges, ranges[::-1]]), angles, range_min=1e-4, gap=gap)
 
 
 def test_an_object_in_front_does_not_split_the_surface_behind_it():
     ranges = np.full((1, 360), np.inf)
     ranges[0, 170:191] = 0.5
     ranges[0, 180] = 0.3
-    points = points_of(ranges, FULL_TURN, 0.15, 1.15)
+    points = points_of(ranges, CIRCLE, 0.15, 1.15)
     assert sorted(np.bincount(single_linkage(points))) == [1, 20]
 
 
-def test_points_are_joined_across_the_seam_and_measured_in_their_order():
+def test_clusters_across_the_seam_are_measured_in_order():
     ranges = np.full((2, 360), np.inf)
     ranges[0, [358, 359, 0, 1]] = 0.6  # behind the robot
     ranges[1, [178, 179, 180, 181]] = 0.6  # at bearing 0
-    points = points_of(ranges, FULL_TURN, 0.15, 1.15)
+    points = points_of(ranges, CIRCLE, 0.15, 1.15)
     found = measure(points, single_linkage(points))
     assert found.scan.tolist() == [0, 1]
     assert found.size.tolist() == [4, 4]
@@ -90,20 +96,20 @@ def test_points_are_joined_across_the_seam_and_measured_in_their_order():
     assert found.centroid[0, 0] < 0 < found.centroid[1, 0]
 
 
-def test_points_exactly_the_gap_apart_are_not_joined():
+def test_points_at_exactly_the_gap_are_not_linked():
     ranges, angles = np.array([[0.25, 0.5]]), np.zeros(2)
     assert len(set(single_linkage(points_of(ranges, angles, 0.1, 1.0), gap=0.25))) == 2
     assert len(set(single_linkage(points_of(ranges, angles, 0.1, 1.0), gap=0.2500001))) == 1
 
 
-def test_what_is_out_of_range_or_no_number_is_no_point():
+def test_ranges_outside_the_limits_are_no_points():
     ranges = np.array([[np.nan, np.inf, -np.inf, 0.0, 0.1499, 0.15, 1.15, 1.1501, -1.0]])
     assert points_of(ranges, np.arange(9.0), 0.15, 1.15).beam.tolist() == [5, 6]
-    nothing = points_of(np.full((3, 4), np.inf), np.arange(4.0), 0.15, 1.15)
-    assert measure(nothing, single_linkage(nothing)).features.shape == (0, 3)
+    empty = points_of(np.full((3, 4), np.inf), np.arange(4.0), 0.15, 1.15)
+    assert measure(empty, single_linkage(empty)).features.shape == (0, 3)
 
 
-def test_features_are_those_of_the_definition():
+def test_features_match_their_definition():
     ranges, angles = scans(3, 40)
     points = points_of(ranges, angles, 0.02, 1.15)
     label = single_linkage(points)
@@ -112,7 +118,7 @@ def test_features_are_those_of_the_definition():
     for row, number in enumerate(found.label):
         of = np.flatnonzero(label == number)
         if np.ptp(points.bearing[of]) > np.pi:
-            continue  # the test of the seam has those
+            continue  # tested above
         place = np.stack([points.x[of], points.y[of]], axis=1)
         girth = np.linalg.norm(np.diff(place, axis=0), axis=1).sum()
         expected = [np.linalg.norm(place[-1] - place[0]), np.ptp(points.distance[of]), girth]
@@ -121,15 +127,44 @@ def test_features_are_those_of_the_definition():
     assert sorted(found.label) == [n for n in np.unique(label) if (label == n).sum() >= 2]
 
 
-def test_turning_the_robot_changes_no_feature():
+def test_features_do_not_depend_on_the_heading():
     ranges, angles = scans(5, 30)
     found = [measure(p, single_linkage(p)) for p in (points_of(ranges, angles + turn, 0.02, 1.15) for turn in (0, 2))]
     first, second = (one.features[np.lexsort(np.round(one.features, 9).T)] for one in found)
     np.testing.assert_allclose(first, second, atol=1e-9)
 
 
-def test_shapes_that_do_not_fit_are_refused():
+def test_shapes_that_do_not_match_are_refused():
     with pytest.raises(ValueError, match=r"ranges \[3, 4\] and angles \[5\] must be \[N, P\] and \[P\]"):
         points_of(np.zeros((3, 4)), np.zeros(5), 0, 1)
     with pytest.raises(ValueError, match="not finite"):
         points_of(np.zeros((3, 2)), np.array([0, np.nan]), 0, 1)
+
+
+# Number of scans, of clusters within 1.15 m, and of those with at least two points.
+COUNTS = {
+    ("breezyslam_exp1_urg_odom", "/scan"): (756, 3241, 2817),
+    ("rplidar_c1_lab446a", "/scan"): (10, 81, 81),
+    ("urg04lx_obstacle_detector_demo", "/rear_scan"): (330, 1955, 1926),
+    ("urg04lx_obstacle_detector_demo", "/scan"): (331, 722, 719),
+    ("urg_legs_positive_7", "/scan"): (510, 1247, 1229),
+}
+
+
+@pytest.mark.parametrize(("name", "topic"), COUNTS)
+def test_clusters_of_real_scans_are_connected_components(name, topic):
+    path = RECORDINGS / f"{name}.mcap"
+    if not path.exists():
+        pytest.skip("the recordings of real sensors are not part of the repository")
+    recording = read_recording(path, scan=topic)
+    points = points_of(recording.ranges, recording.angles(0), 0.0, 1.15)
+    label = single_linkage(points)
+    clusters = measure(points, label)
+    for scan in range(points.scans):
+        rows = np.flatnonzero(points.scan == scan)
+        assert as_sets(label[rows], rows) == dense(points, scan, GAP)
+    assert (points.scans, int(label.max()) + 1, len(clusters.size)) == COUNTS[name, topic]
+    assert np.isfinite(clusters.features).all()
+    assert (clusters.features >= 0).all()
+    # The girth is at least the width, up to rounding.
+    assert (clusters.features[:, 2] - clusters.features[:, 0] > -1e-12).all()

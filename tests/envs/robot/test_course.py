@@ -1,3 +1,5 @@
+"""The track of the simulated robot, distances to a crash, and laps."""
+
 import math
 
 import numpy as np
@@ -5,25 +7,25 @@ import pytest
 import torch
 
 from coil_rl.envs import TrackError, robot_track, robot_tracks
-from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, cones_of, middle_line, noted_track, track_notes
+from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, cones_of, laps, middle_line, noted_track, track_notes
 
 
-def test_a_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
+def test_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
     track = robot_track()
     line = middle_line(track, 0.03)
     assert track.length == pytest.approx(6.0, abs=0.05)
     way = np.roll(line, -1, axis=0) - line
     heading = np.unwrap(np.arctan2(way[:, 1], way[:, 0]))
-    # Over 15 cm, for the middle between two splines is a little rough.
-    bend = (np.roll(heading, -5) - heading)[:-10] / 0.15
-    assert bend.max() > 1.2  # 1/m, left
-    assert bend.min() < -1.2
-    straight = np.abs(bend) < 0.2
+    # Over 15 cm, as the line midway between two splines is a little rough.
+    curvature = (np.roll(heading, -5) - heading)[:-10] / 0.15
+    assert curvature.max() > 1.2  # 1/m, left
+    assert curvature.min() < -1.2
+    straight = np.abs(curvature) < 0.2
     assert straight.mean() > 0.12
     assert heading[-1] - heading[0] == pytest.approx(2 * np.pi, abs=0.1)
 
 
-def test_cones_stand_evenly_and_leave_room_for_the_robot():
+def test_cones_are_evenly_spaced_and_leave_room_for_the_robot():
     track = robot_track()
     for ring in (track.left, track.right):
         gaps = np.linalg.norm(np.roll(ring, -1, axis=0) - ring, axis=1)
@@ -34,8 +36,8 @@ def test_cones_stand_evenly_and_leave_room_for_the_robot():
 
 def test_thin_cones_are_left_and_thick_ones_right():
     track = robot_track()
-    place, radius = cones_of(track)
-    assert place.shape == (2, len(track.left) + len(track.right))
+    centres, radius = cones_of(track)
+    assert centres.shape == (2, len(track.left) + len(track.right))
     assert radius.tolist() == pytest.approx([THIN] * len(track.left) + [THICK] * len(track.right))
     np.testing.assert_allclose(cones_of(track, left=False)[0].T, track.right, atol=1e-6)
     np.testing.assert_allclose(cones_of(track, right=False)[0].T, track.left, atol=1e-6)
@@ -44,7 +46,7 @@ def test_thin_cones_are_left_and_thick_ones_right():
 
 
 @pytest.mark.parametrize(("heading", "half"), [(0.0, 0.06), (math.pi / 2, 0.10)])
-def test_clearance_is_from_the_outline_to_a_cone(heading, half):
+def test_clearance_is_the_distance_of_the_outline_to_a_cone(heading, half):
     course = RobotCourse([robot_track()])
     x, y, _ = robot_track().start
     course.cones, course.radius = torch.tensor([x, y + 0.15]).view(2, 1, 1), torch.tensor([[0.045]])
@@ -52,7 +54,7 @@ def test_clearance_is_from_the_outline_to_a_cone(heading, half):
     assert clearance.item() == pytest.approx(0.15 - half - 0.045, abs=1e-5)
 
 
-def test_a_noted_track_is_the_track():
+def test_noted_track_is_equal():
     again = noted_track(track_notes(robot_track()))
     assert np.array_equal(again.left, robot_track().left)
     assert np.array_equal(again.right, robot_track().right)
@@ -61,11 +63,50 @@ def test_a_noted_track_is_the_track():
 
 
 @pytest.mark.parametrize("notes", [{}, {"left": "[[0, 0]", "right": "[]"}, {"left": "[1, 2, 3]", "right": "[]"}])
-def test_notes_that_hold_no_track_are_refused(notes):
+def test_invalid_track_notes_are_refused(notes):
     with pytest.raises(TrackError, match="note each side as"):
         noted_track(notes)
 
 
-def test_a_track_seven_times_as_large_is_as_long_as_seven():
+def test_scaled_track_is_proportionally_long():
     (large,) = robot_tracks(scale=7.0)
     assert large.length == pytest.approx(7 * robot_track().length, rel=1e-3)
+
+
+def circle(rounds, points=400, radius=1.0, speed=0.5):
+    """Poses and times on a circle, anticlockwise from its lowest point."""
+    angle = np.linspace(0, rounds * 2 * np.pi, points)
+    return np.stack([radius * np.sin(angle), -radius * np.cos(angle), angle], axis=1), angle * radius / speed
+
+
+def test_laps_of_a_circle_have_its_length_and_duration():
+    found = laps(*circle(3.2))
+    assert found.metres == pytest.approx([2 * np.pi] * 3, rel=1e-3)
+    assert found.seconds == pytest.approx([4 * np.pi] * 3, rel=1e-3)
+
+
+def test_incomplete_lap_does_not_count():
+    assert len(laps(*circle(0.99)).seconds) == 0
+    assert len(laps(*circle(1.01)).seconds) == 1
+
+
+@pytest.mark.parametrize("turn", [0.7, 2.5, -1.9])
+def test_laps_do_not_depend_on_the_origin_of_the_odometry(turn):
+    poses, seconds = circle(2.3)
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y, heading = poses.T
+    moved = np.stack([cos * x - sin * y + 5, sin * x + cos * y - 3, heading + turn], axis=1)
+    assert laps(moved, seconds).seconds == pytest.approx(laps(poses, seconds).seconds)
+
+
+def test_standing_at_the_start_does_not_count():
+    poses, seconds = circle(1.2)
+    poses = np.concatenate([np.repeat(poses[:1], 50, axis=0), poses])
+    seconds = np.concatenate([np.arange(50), seconds + 50])
+    assert laps(poses, seconds).seconds == pytest.approx([4 * np.pi], rel=1e-3)
+
+
+def test_swaying_at_the_line_is_no_lap():
+    x = np.array([0, 0.1, -0.1, 0.1, -0.1, 0.1])
+    poses = np.stack([x, 0 * x, 0 * x], axis=1)
+    assert len(laps(poses, np.arange(6.0)).seconds) == 0

@@ -1,32 +1,83 @@
+"""The cone classifier, the cones in view, and the memory of the boundaries."""
+
 import numpy as np
 import pytest
 import torch
 
-from coil_rl.envs import Perception, SimulatedLidar, simulated_cone_classifier, simulated_drive
+from coil_rl.envs import (
+    ConeClassifier,
+    ConeTrackEnv,
+    Perception,
+    SimulatedLidar,
+    shipped_tracks,
+    simulated_cone_classifier,
+    simulated_drive,
+)
 from coil_rl.envs.robot.course import THICK, THIN
+from coil_rl.envs.robot.lidar import cast_beams
+from coil_rl.envs.robot.perception import BoundaryMemory
+from coil_rl.guides import SplineGuide
 
 EXACT = SimulatedLidar(noise=0.0, noise_growth=0.0, no_return=0.0, outliers=0.0)
 
 
+def one_vector(**changed) -> ConeClassifier:
+    """A single support vector: exp(-0.5 |x - s|^2) of features in cm, minus a half."""
+    numbers = {"mean": [0.0, 0], "scale": [0.01, 0.01], "support": [[3.0, 4]], "weights": [1.0], "intercept": -0.5}
+    return ConeClassifier(**{**numbers, "gamma": 0.5, **changed})
+
+
+def test_decision_is_the_kernel_expansion():
+    decision = one_vector().decision(np.array([[0.03, 0.04], [0.0, 0.0], [0.04, 0.04]]))
+    np.testing.assert_allclose(decision, [0.5, np.exp(-12.5) - 0.5, np.exp(-0.5) - 0.5], atol=1e-12)
+    assert one_vector().thick(np.array([[0.03, 0.04], [0.0, 0.0]])).tolist() == [True, False]
+
+
+def test_clusters_are_classified_independently():
+    features = np.random.default_rng(0).uniform(0, 0.12, (900, 3))
+    classifier = simulated_cone_classifier()
+    together = classifier.decision(features)
+    np.testing.assert_allclose(together[[0, 450, 899]], classifier.decision(features[[0, 450, 899]]))
+    assert classifier.decision(features[:0]).shape == (0,)
+    assert classifier.thick([[0.03, 0.01, 0.035], [0.085, 0.03, 0.1]]).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"weights": [1.0, 2.0]}, "shapes"),
+        ({"mean": [0.0]}, "shapes"),
+        ({"support": [1.0, 2.0]}, "shapes"),
+        ({"gamma": -1.0}, "more than 0"),
+        ({"scale": [1.0, 0.0]}, "more than 0"),
+        ({"intercept": np.nan}, "intercept of a cone classifier contains a value that is not finite"),
+    ],
+)
+def test_invalid_classifiers_are_refused(changed, words):
+    with pytest.raises(ValueError, match=words):
+        one_vector(**changed)
+
+
 def scan_of(*cones: tuple[float, float, float]):
-    """One noiseless scan of cones at (distance m, degrees, radius m), seen from a robot that stands still."""
+    """One noiseless scan of cones at (distance m, degrees, radius m) from a standing robot."""
     distance, degrees, radius = torch.tensor(cones).T
-    place = distance * torch.stack([degrees.deg2rad().cos(), degrees.deg2rad().sin()])
-    true, _ = EXACT.cast(torch.zeros(3, 1, EXACT.beams), place, radius)
+    centres = distance * torch.stack([degrees.deg2rad().cos(), degrees.deg2rad().sin()])
+    true, _ = cast_beams(torch.zeros(3, 1, EXACT.beams), EXACT.angles, centres, radius)
     return EXACT.measure(true, torch.Generator())[0].numpy(), EXACT.angles.numpy()
 
 
-def perceive(*cones, **rules):
-    found, count = Perception(simulated_cone_classifier(), **rules)(*scan_of(*cones))
+def perceive(*cones, **options):
+    """The left and the right cones in view."""
+    found, count = Perception(simulated_cone_classifier(), **options)(*scan_of(*cones))
     return [found[0, side, : count[0, side]] for side in (0, 1)]
 
 
-def test_thin_cones_are_left_and_thick_ones_right_nearest_first_and_seven_times_as_far():
+def test_thin_cones_are_left_thick_cones_right_nearest_first_and_scaled():
     left, right = perceive((0.9, 20, THIN), (0.4, 30, THIN), (0.5, -40, THICK), (0.8, -10, THICK), (0.6, 0, THIN))
     assert np.round(np.hypot(*left.T) / 7 + 0.015, 1).tolist() == [0.4, 0.6, 0.9]
     np.testing.assert_allclose(np.degrees(np.arctan2(left[:, 1], left[:, 0])), [30, 0, 20], atol=0.6)
     np.testing.assert_allclose(np.degrees(np.arctan2(right[:, 1], right[:, 0])), [-40, -10], atol=0.6)
-    # The mean of the points that are seen lies before the middle of a cone.
+    # The mean of the visible points is in front of the cone's centre.
     assert np.hypot(*right[0]) == pytest.approx(7 * (0.5 - THICK), abs=7 * THICK / 2)
 
 
@@ -36,18 +87,18 @@ def test_range_and_bearing_are_those_of_the_centroid():
     assert [len(side) for side in perceive(far)] == [0, 0]
     assert [len(side) for side in perceive((0.5, 59, THICK), (0.5, -61, THICK))] == [0, 1]
     assert [len(side) for side in perceive((0.5, 59, THICK), (0.5, -61, THICK), bearing_max=120)] == [0, 2]
-    # With the authors' rules.
+    # With the preset of the authors.
     (cone,) = perceive(far, range_max=1.25, bearing_max=120, scale=5.625)[1]
     assert 5.625 * 1.015 < cone[0] < 5.625 * 1.06
 
 
-def test_the_yaw_of_the_lidar_turns_what_is_seen():
+def test_laser_yaw_rotates_the_view():
     (cone,) = perceive((0.5, 170, THICK), laser_yaw=-180)[1]
     assert np.degrees(np.arctan2(cone[1], cone[0])) == pytest.approx(-10, abs=0.6)
     assert [len(side) for side in perceive((0.5, 170, THICK))] == [0, 0]
 
 
-def test_what_is_no_cone_in_sight_is_zero():
+def test_missing_cones_are_zero():
     perception = Perception(simulated_cone_classifier(), kept_cones=2)
     cones, count = perception(*scan_of((0.4, 30, THIN), (0.6, 0, THIN), (0.9, -20, THIN)))
     assert count.tolist() == [[2, 0]]
@@ -57,15 +108,15 @@ def test_what_is_no_cone_in_sight_is_zero():
     assert (cones.shape, count.shape) == ((0, 2, 2, 2), (0, 2))
 
 
-@pytest.mark.parametrize("nothing", [np.inf, np.nan, 0.0, 0.003, -1.0, 65.0])
-def test_no_return_is_nothing_however_a_driver_spells_it(nothing):
+@pytest.mark.parametrize("no_return", [np.inf, np.nan, 0.0, 0.003, -1.0, 65.0])
+def test_all_codes_for_no_return_are_equal(no_return):
     ranges, angles = scan_of((0.4, 30, THIN), (0.6, -20, THICK))
-    expected = Perception(simulated_cone_classifier())(ranges, angles)
-    found = Perception(simulated_cone_classifier())(np.where(np.isfinite(ranges), ranges, nothing), angles)
+    perception = Perception(simulated_cone_classifier())
+    expected, found = perception(ranges, angles), perception(np.where(np.isfinite(ranges), ranges, no_return), angles)
     assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
-def test_a_scan_is_perceived_by_itself_in_any_order_of_the_beams():
+def test_scans_are_perceived_independently_in_any_order_of_the_beams():
     drive, perception = simulated_drive("both", seed=3, laps=3), Perception(simulated_cone_classifier())
     ranges, angles = drive.ranges.numpy(), drive.angles.numpy()
     cones, count = perception(ranges, angles)
@@ -77,17 +128,78 @@ def test_a_scan_is_perceived_by_itself_in_any_order_of_the_beams():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [
-        {"range_max": 0},
-        {"range_min": 0},
-        {"range_min": 2},
-        {"bearing_max": 181},
-        {"scale": -7},
-        {"margin": -1},
-        {"gap": 0},
-    ],
+    "option",
+    [{"range_max": 0}, {"range_min": 0}, {"range_min": 2}, {"bearing_max": 181}, {"scale": -7}, {"margin": -1}],
 )
-def test_rules_that_cannot_be_are_refused(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
-        Perception(simulated_cone_classifier(), **wrong)
+def test_invalid_options_are_refused(option):
+    with pytest.raises(ValueError, match=f"{next(iter(option))}="):
+        Perception(simulated_cone_classifier(), **option)
+    with pytest.raises(ValueError, match="spline='linear' must be one of cubic, quadratic"):
+        BoundaryMemory(1, spline="linear")
+
+
+def view(left=(), right=(), batch=1):
+    """Cones of one car, equal in every row, and their number."""
+    cones = torch.zeros(batch, 2, 16, 2)
+    for side, positions in enumerate((left, right)):
+        for slot, position in enumerate(positions):
+            cones[:, side, slot] = torch.tensor(position)
+    return cones, torch.tensor([[len(left), len(right)]]).expand(batch, 2)
+
+
+LEFT, RIGHT = [(1.5, 1.0), (3.0, 1.2), (5.0, 1.0)], [(1.5, -1.0), (3.0, -1.2)]
+
+
+def test_observation_of_valid_sides_is_that_of_the_cone_world():
+    env = ConeTrackEnv(shipped_tracks("test"), 3, assignment="cyclic")
+    memory = BoundaryMemory(3)
+    rollout = env.rollout(60, SplineGuide(), break_when_any_done=False)
+    both = 0
+    for step in range(60):
+        state = rollout[:, step]
+        observation, valid = memory(state["cones"], state["cone_count"])
+        assert torch.equal(valid, state["cone_count"] >= 2)
+        sides = valid.repeat_interleave(10, 1)
+        torch.testing.assert_close(observation[sides], state["observation"][sides])
+        both += int(valid.all(1).sum())
+    assert both > 50
+
+
+@pytest.mark.parametrize("run", [1, 7])
+@pytest.mark.parametrize(
+    "invalid",
+    [LEFT[:1], [], [(1.5, 1.0), (9.5, 1.0)], [(0.2, 0.1), (0.4, -0.2)]],
+    ids=["one cone", "none", "too far", "inside the robot"],
+)
+def test_invalid_side_keeps_its_last_valid_numbers(invalid, run):
+    memory = BoundaryMemory(1)
+    last, valid = memory(*view(LEFT, RIGHT))
+    assert valid.all()
+    for step in range(run):
+        moved = [(x - 0.1 * step, y) for x, y in RIGHT]
+        held, valid = memory(*view(invalid, moved))
+        assert valid.tolist() == [[False, True]]
+        assert torch.equal(held[:, :10], last[:, :10])
+        assert torch.equal(held[:, 10:], BoundaryMemory(1)(*view([], moved))[0][:, 10:])
+    fresh, valid = memory(*view(LEFT[1:], RIGHT))
+    assert valid.all()
+    assert torch.equal(fresh, BoundaryMemory(1)(*view(LEFT[1:], RIGHT))[0])
+    assert not torch.equal(fresh[:, :10], last[:, :10])
+
+
+def test_side_that_was_never_valid_is_zero():
+    observation, _ = BoundaryMemory(1)(*view(LEFT[:1], RIGHT))
+    assert not observation[:, :10].any()
+    assert observation[:, 10:].any()
+
+
+def test_rows_are_reset_independently_and_the_state_can_be_loaded():
+    memory, other = BoundaryMemory(2), BoundaryMemory(2)
+    full, _ = memory(*view(LEFT, RIGHT, batch=2))
+    other.load_state_dict(memory.state_dict())
+    memory.reset(torch.tensor([True, False]))
+    observation, valid = memory(*view(batch=2))
+    assert not valid.any()
+    assert not observation[0].any()
+    assert torch.equal(observation[1], full[1])
+    assert torch.equal(other(*view(batch=2))[0], full)

@@ -1,11 +1,14 @@
+"""The simulated robot as an env."""
+
 import math
 
+import numpy as np
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
 
+import coil_rl.train.config  # noqa: F401  registers the typed roots
 from coil_rl import testing
 from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, Track, robot_track, shipped_tracks
 from coil_rl.envs import simulated_cone_classifier as classifier
@@ -14,76 +17,82 @@ from coil_rl.train.build import build_env
 from coil_rl.train.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
+EXACT = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
+
 
 def robots(count=2, **world) -> SimulatedRobotEnv:
     return SimulatedRobotEnv(num_cars=count, **world)
 
 
 def steered(env, actions):
-    """The states after constant or listed actions."""
+    """The states before and after each of the actions."""
     states = [env.reset()]
     for action in actions:
         states.append(env.step(states[-1].set("action", torch.full((*env.batch_size, 1), action)))["next"])
     return states
 
 
-def test_it_is_an_env():
+def test_contract_of_an_env():
     testing.check_env(robots(3))
 
 
-def test_it_is_the_cone_world_to_whoever_drives():
+def test_entries_are_those_of_the_cone_world():
     robot, world = robots(2), ConeTrackEnv(shipped_tracks("test"), 2)
     given, expected = (env.rollout(2, break_when_any_done=False) for env in (robot, world))
     for key in expected.keys(True, True):
         assert given[key].shape == expected[key].shape, key
         assert given[key].dtype == expected[key].dtype, key
-    more = set(given.keys(True, True)) - set(expected.keys(True, True))
-    assert more == {("info", "valid"), ("next", "info", "valid")}
+    assert set(given.keys(True, True)) - set(expected.keys(True, True)) == {
+        ("info", "valid"),
+        ("next", "info", "valid"),
+    }
     assert robot.action_spec == world.action_spec
 
 
-def test_the_guide_and_the_advice_of_the_cone_world_work_here():
+def test_guides_and_advice_of_the_cone_world_work():
     env = TransformedEnv(robots(3), GuideActions({"spline": SplineGuide()}))
     rollout = env.rollout(4, SplineGuide(), break_when_any_done=False)
     torch.testing.assert_close(rollout["guide_action"].squeeze(-2), rollout["action"])
     testing.check_guide(SplineGuide(), rollout[:, -1])
 
 
-def test_it_turns_as_the_bicycle_model_says():
-    env = robots(1, speed=0.15)
-    before, after = (state["info", "pose"][0] for state in steered(env, [0.5]))
+def test_motion_is_that_of_the_bicycle_model():
+    before, after = (state["info", "pose"][0] for state in steered(robots(1, speed=0.15), [0.5]))
     turn = 0.15 / 5.5 / (2 / 7) * math.sin(math.radians(40))
     assert (after[2] - before[2]).item() == pytest.approx(turn, rel=1e-4)
     assert (after[:2] - before[:2]).norm().item() == pytest.approx(0.15 / 5.5, rel=1e-3)
 
 
-def test_the_cones_it_sees_are_those_that_stand_there():
-    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
-    env = robots(1, lidar=exact)
-    state = env.reset()
+def test_cones_in_view_are_those_of_the_track():
+    state = robots(1, lidar=EXACT).reset()
     (left, right), (lefts, rights) = state["cones"][0] / 7, state["cone_count"][0]
     x, y, heading = robot_track().start
     turn = torch.tensor([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
-    for seen, ring, radius in ((left[:lefts], robot_track().left, 0.02), (right[:rights], robot_track().right, 0.045)):
-        stand = (torch.tensor(ring).float() - torch.tensor([x, y])) @ turn.T
-        assert len(seen) >= 3
-        off = torch.cdist(seen, stand).amin(1)
-        assert (off <= radius).all()
+    for found, ring, radius in ((left[:lefts], robot_track().left, 0.02), (right[:rights], robot_track().right, 0.045)):
+        centres = (torch.tensor(ring).float() - torch.tensor([x, y])) @ turn.T
+        assert len(found) >= 3
+        assert (torch.cdist(found, centres).amin(1) <= radius).all()
+    near = robots(1, perception=Perception(classifier(), range_max=0.4)).reset()["cone_count"]
+    assert (near < state["cone_count"]).all()
 
 
-def test_the_same_seed_is_the_same_drive_and_another_one_is_not():
+def test_drive_is_determined_by_the_seed():
     first, second, third = (steered(robots(2, seed=seed), [0.1, -0.2])[-1]["observation"] for seed in (1, 1, 2))
     assert torch.equal(first, second)
     assert not torch.equal(first, third)
 
 
-def test_a_robot_does_not_depend_on_who_drives_beside_it_but_for_the_noise():
-    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
-    alone, many = (steered(robots(count, lidar=exact), [0.3, -0.1, 0.2])[-1] for count in (1, 4))
+def test_robots_are_independent_but_for_the_noise():
+    alone, many = (steered(robots(count, lidar=EXACT), [0.3, -0.1, 0.2])[-1] for count in (1, 4))
     torch.testing.assert_close(alone["observation"][0], many["observation"][3])
+    options = {"lidar": EXACT, "assignment": "cyclic"}
+    alone = steered(robots(1, **options), [0.2, -0.1])[-1]
+    among = steered(robots(2, tracks=[robot_track(), ring()], **options), [0.2, -0.1])[-1]
+    torch.testing.assert_close(alone["observation"][0], among["observation"][0])
+    torch.testing.assert_close(alone["info", "clearance"][0], among["info", "clearance"][0])
 
 
-def test_its_state_is_all_of_it():
+def test_state_dict_is_the_whole_state():
     first, second = robots(2, seed=1), robots(2, seed=9)
     state = steered(first, [0.2] * 3)[-1]
     second.load_state_dict(first.state_dict())
@@ -94,37 +103,38 @@ def test_its_state_is_all_of_it():
 
 
 @pytest.mark.parametrize("action", [1.0, -1.0, 0.0])
-def test_whoever_does_not_steer_well_crashes_into_a_cone_or_leaves_the_track(action):
+def test_constant_steering_crashes(action):
     episodes = evaluate_policy(robots(2), ConstantGuide(action)).episodes
     assert all(episode["crashed"] and not episode["completed"] for episode in episodes)
     assert all(-0.03 < episode["clearance"] <= 0 for episode in episodes)
     assert all(episode["reward"] < -90 for episode in episodes)
 
 
-def test_the_guide_drives_its_laps_without_a_crash():
+def test_guide_completes_its_laps():
     result = evaluate_policy(robots(3, laps=1), SplineGuide())
     assert all(episode["completed"] and not episode["crashed"] for episode in result.episodes)
-    # A lap of 6 m takes 40 s at 0.15 m/s, a little less where corners are cut.
+    # A lap of 6 m takes 40 s at 0.15 m/s, a little less with cut corners.
     assert all(36 < episode["lap_time"] < 42 for episode in result.episodes)
 
 
-def test_an_episode_ends_with_its_laps_or_its_time():
-    env = robots(1, time_limit=1.0)
-    states = steered(env, [0.0] * 6)
-    # 5.5 steps, rounded to the even one.
+def test_episode_is_truncated_at_the_time_limit():
+    states = steered(robots(1, time_limit=1.0), [0.0] * 6)
+    # 5.5 steps, rounded to the even number.
     assert [bool(state["truncated"]) for state in states[1:]] == [False] * 5 + [True]
     assert not states[-1]["terminated"].any()
 
 
-def test_what_it_sees_follows_the_rules_of_its_perception():
-    near = robots(1, perception=Perception(classifier(), range_max=0.4)).reset()["cone_count"]
-    assert (near < robots(1).reset()["cone_count"]).all()
-
-
 def mirrored() -> Track:
-    """The robot's track driven the other way round."""
-    here = robot_track()
-    return Track("mirrored", left=here.right * [1, -1], right=here.left * [1, -1])
+    """The robot's track in the other direction."""
+    track = robot_track()
+    return Track("mirrored", left=track.right * [1, -1], right=track.left * [1, -1])
+
+
+def ring() -> Track:
+    """A track with fewer cones."""
+    angle = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return Track("ring", left=0.4 * circle, right=0.8 * circle)
 
 
 def test_robots_drive_on_their_own_tracks():
@@ -132,55 +142,36 @@ def test_robots_drive_on_their_own_tracks():
     result = evaluate_policy(env, SplineGuide(), names=["one", "other"])
     assert [episode["track"] for episode in result.episodes] == ["one", "other"] * 2
     assert all(episode["completed"] for episode in result.episodes)
-    ends = [line[:, 1].max() - line[:, 1].min() for line in result.lines]
-    assert all(end > 1 for end in ends)
     assert result.lines[0][:, 1].mean() > 0.3 > -0.3 > result.lines[1][:, 1].mean()
 
 
-def test_a_robots_world_does_not_depend_on_the_tracks_of_others():
-    exact = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
-    kept = {"lidar": exact, "assignment": "cyclic"}
-    alone = steered(robots(1, **kept), [0.2, -0.1])[-1]
-    among = steered(robots(2, tracks=[robot_track(), shorter()], **kept), [0.2, -0.1])[-1]
-    torch.testing.assert_close(alone["observation"][0], among["observation"][0])
-    torch.testing.assert_close(alone["info", "clearance"][0], among["info", "clearance"][0])
-
-
-def shorter() -> Track:
-    """A track with fewer cones."""
-    turn = torch.arange(0, 2 * math.pi, 2 * math.pi / 12).numpy()
-    circle = torch.tensor([[math.cos(t), math.sin(t)] for t in turn]).numpy()
-    return Track("ring", left=0.4 * circle, right=0.8 * circle)
-
-
-def test_tracks_are_drawn_at_random_at_each_reset():
+def test_tracks_are_drawn_at_each_reset():
     env = robots(64, tracks=[robot_track(), mirrored()])
     first, second = (env.reset()["info", "track"] for _ in range(2))
     assert 15 < first.sum() < 49
     assert not torch.equal(first, second)
 
 
-def test_a_policy_may_be_any_module_of_the_observation():
-    policy = TensorDictModule(lambda seen: seen[..., :1] * 0, in_keys=["observation"], out_keys=["action"])
-    assert evaluate_policy(robots(1), policy).episodes[0]["crashed"]
-
-
 @pytest.mark.parametrize(
-    "wrong", [{"num_cars": 0}, {"speed": -1}, {"laps": 0}, {"max_steering": 100}, {"car_length": math.inf}]
+    ("options", "words"),
+    [
+        ({"num_cars": 0}, "num_cars="),
+        ({"speed": -1}, "speed="),
+        ({"laps": 0}, "laps="),
+        ({"max_steering": 100}, "max_steering="),
+        ({"car_length": math.inf}, "car_length="),
+        ({"tracks": []}, "tracks is empty"),
+        ({"assignment": "all"}, "assignment='all' must be one of random, cyclic"),
+        ({"reward": {"speed": 1.0}}, "reward has no weight"),
+    ],
 )
-def test_what_cannot_be_is_refused(wrong):
-    with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
-        SimulatedRobotEnv(**wrong)
-    with pytest.raises(ValueError, match="tracks is empty"):
-        SimulatedRobotEnv([])
-    with pytest.raises(ValueError, match="assignment='all' must be one of random, cyclic"):
-        SimulatedRobotEnv(assignment="all")
-    with pytest.raises(ValueError, match="reward has no weight"):
-        SimulatedRobotEnv(reward={"speed": 1.0})
+def test_invalid_options_are_refused(options, words):
+    with pytest.raises(ValueError, match=words):
+        SimulatedRobotEnv(**options)
 
 
 @pytest.mark.parametrize("program", ["train", "evaluate"])
-def test_configuration_builds_the_env_as_its_defaults_are(program):
+def test_configuration_agrees_with_the_defaults(program):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose(program, ["env=simulated_robot", "track=robot", "budget.cars=2", "run_dir=unused"])
     env = build_env(config, {**config.evaluation.env, "num_cars": 3}).base_env

@@ -1,0 +1,120 @@
+"""Report of an open-loop evaluation: a Markdown table, a row per scan, and a figure of the steering over time."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from coil_rl.files import whole_file
+from coil_rl.replay.open_loop import RECORDED, OpenLoop
+from coil_rl.report import markdown_table, style
+
+NOTES = """
+Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
+|omega|. from X: mean |a - x|. No policy controlled the drive: each action is the policy's choice at a scan of a drive
+that went another way. recorded: the recorded commands, as actions with the same turn rate."""
+HEIGHT = 5.0  # inches
+
+
+def describe(result: OpenLoop) -> str:
+    """Return a section of Markdown about one recording."""
+    columns = {"policy": ("policy", ""), "smoothness": ("smoothness", ".3f"), "omega": ("omega (rad/s)", ".3f")}
+    frame = pd.DataFrame(
+        {
+            name: {"smoothness": _mean(steering.smoothness), "omega": _mean(np.abs(steering.omega))}
+            for name, steering in result.steering.items()
+        }
+    ).T
+    if len(frame) > 1:
+        distances = disagreement(result)
+        frame = frame.join(distances.mask(np.eye(len(distances), dtype=bool)).add_prefix("from "))
+        columns |= {f"from {name}": (f"from {name}", ".3f") for name in result.steering}
+    rows = frame.rename_axis("policy").reset_index().to_dict("records")
+    simulated = " (simulated)" if result.recording.simulated else ""
+    return f"## {result.recording.path}{simulated}\n\n{extent(result)}.\n\n{markdown_table(rows, columns)}"
+
+
+def extent(result: OpenLoop) -> str:
+    """Return the number of scans, their duration, and the share with both boundaries valid."""
+    scans, seconds = len(result.both_valid), result.recording.seconds[-1]
+    cut = ", all that can be read of a file that is cut off" if result.recording.cut_off else ""
+    return f"{scans} scans in {seconds:.1f} s{cut}; both boundaries valid in {result.both_valid.mean():.0%} of them"
+
+
+def notes(max_steering: float) -> str:
+    """Return the explanation of the table; `max_steering` in radians."""
+    return NOTES.format(max_steering=np.degrees(max_steering)).strip()
+
+
+def disagreement(result: OpenLoop) -> pd.DataFrame:
+    """Return the mean |a - b| of each pair of policies, over the scans with both actions."""
+    actions = pd.DataFrame({name: steering.action for name, steering in result.steering.items()})
+    return pd.DataFrame({name: actions.sub(actions[name], axis=0).abs().mean() for name in actions})
+
+
+def outcome(result: OpenLoop) -> str:
+    """Return the extent of the recording, and which policies disagree most."""
+    text = f"{result.recording.path}: {extent(result)}"
+    distances = disagreement(result)
+    pairs = distances.where(np.triu(np.ones(distances.shape, dtype=bool), 1)).stack().dropna()
+    if pairs.empty:
+        return text
+    first, second = pairs.idxmax()
+    return f"{text}; {first} and {second} disagree most, by {pairs.max():.3f} on average"
+
+
+def over_time(result: OpenLoop) -> list[dict[str, Any]]:
+    """Return a row per scan: time (s), whether both boundaries are valid, actions and omegas (radians/s)."""
+    columns: dict[str, Any] = {"time": result.recording.seconds, "valid": result.both_valid.astype(int)}
+    for policy, steering in result.steering.items():
+        columns |= {f"{policy}/steering": steering.action, f"{policy}/omega": steering.omega}
+    return pd.DataFrame(columns).to_dict("records")
+
+
+def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str | None = None) -> None:
+    """Draw steering and omega of each policy over time; recorded commands are dashed, scans not valid are grey."""
+    seconds, invalid = result.recording.seconds, ~result.both_valid
+    strokes = style.strong_strokes(result.policies)
+    if RECORDED in result.steering:
+        strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHES)
+    handles: list[Artist] = [
+        Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=1.6, label=name) for name, stroke in strokes.items()
+    ]
+    if invalid.any():
+        handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary is only remembered"))
+    with mpl.rc_context(style.LETTERS):
+        figure = Figure(figsize=(style.WIDTH, HEIGHT), dpi=style.RESOLUTION)
+        FigureCanvasAgg(figure)
+        header = style.draw_header(figure, handles, title)
+        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / HEIGHT), w_pad=style.MARGIN / 2, h_pad=0.08)
+        steering_axes, omega_axes = figure.subplots(2, sharex=True)
+        for axes, label in ((steering_axes, "steering (degrees)"), (omega_axes, "omega (radians/s)")):
+            axes.set_ylabel(label)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.axhline(0, color=style.KERB, lw=0.7)
+            axes.margins(x=0.01)
+            background = {"step": "mid", "transform": axes.get_xaxis_transform(), "color": style.ASPHALT, "lw": 0}
+            axes.fill_between(seconds, 0, 1, where=invalid, **background)
+            axes.set_axisbelow(True)
+        for name, stroke in strokes.items():
+            line = {"color": stroke.colour, "ls": stroke.linestyle, "lw": 1.1}
+            steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), **line)
+            omega_axes.plot(seconds, result.steering[name].omega, **line)
+        omega_axes.set_xlabel("time (s)")
+        with whole_file(path) as unfinished:
+            figure.savefig(unfinished, format=Path(path).suffix[1:] or "png")
+
+
+def _mean(values: np.ndarray) -> float:
+    """Return the mean without NaN; NaN without any number."""
+    return float(pd.Series(values).mean())

@@ -1,0 +1,213 @@
+"""Simulation of the paper's robot (section 4.2): a small car with a LiDAR between thin and thick cones.
+
+It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone: cones hide one
+another, are misclassified or missed. The entries have the keys and the scale of the cone world, so guides and policies
+of that world run unchanged. The figures come from data sheets, not from a real robot.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+
+from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.reward import (
+    HISTORY,
+    REWARD_TERMS,
+    Outcome,
+    RewardWeights,
+    check_weights,
+    recent_mean,
+    weighted_terms,
+)
+from coil_rl.envs.robot.course import RobotCourse, robot_track
+from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
+from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs, simulated_cone_classifier
+from coil_rl.envs.track import Track
+
+FINISH_RADIUS = 0.15  # m, covers the width between the cones
+
+
+class SimulatedRobotEnv(SeededEnv):
+    """Simulated robots on tracks between cones, independent of one another.
+
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of `ConeTrackEnv`:
+    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
+    `reward`, `done`, `terminated`, `truncated` [B, 1], and under `info` the same entries in the robot's own metres, and
+    `valid` [B, 2], whether each side is valid in this scan. The reward is that of the cone world without the term for
+    new cones, which the robot cannot tell from known ones. A robot crashes if its outline touches a cone or its centre
+    reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a return.
+
+    Args:
+        tracks: in the robot's own metres; None for `robot_track()`.
+        num_cars: B.
+        assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
+        perception: None for `Perception` with the shipped classifier.
+        lidar: None for an RPLIDAR A1M8; one control step per scan.
+        speed: m/s.
+        car_length: L in m; by default a seventh of the cone world's car.
+        seed: of the LiDAR's noise and the draw of tracks.
+
+    Raises:
+        ValueError: for a value outside its range.
+
+    Example:
+        >>> from coil_rl.envs import SimulatedRobotEnv
+        >>> env = SimulatedRobotEnv(num_cars=2)
+        >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
+        torch.Size([2, 3, 20])
+    """
+
+    track: Tensor
+    pose: Tensor
+    history: Tensor
+    steps: Tensor
+    lap: Tensor
+    lap_start: Tensor
+    in_finish: Tensor
+    scan: Tensor
+
+    def __init__(
+        self,
+        tracks: Sequence[Track] | None = None,
+        num_cars: int = 1,
+        *,
+        assignment: Literal["random", "cyclic"] = "random",
+        perception: Perception | None = None,
+        lidar: SimulatedLidar | None = None,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        reward: dict[str, float] | None = None,
+        laps: int = 3,
+        time_limit: float = 200.0,
+        speed: float = 0.15,
+        car_length: float = 2 / 7,
+        max_steering: float = 80.0,
+        seed: int = 0,
+    ) -> None:
+        positive = {
+            "num_cars": num_cars, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
+            "max_steering": max_steering,
+        }  # fmt: skip
+        for name, number in positive.items():
+            if not 0 < number < math.inf:
+                raise ValueError(f"{name}={number} must be a finite number above 0")
+        if max_steering > 90:
+            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
+        if assignment not in ("random", "cyclic"):
+            raise ValueError(f"assignment={assignment!r} must be one of random, cyclic")
+        if tracks is not None and not tracks:
+            raise ValueError("tracks is empty; give at least one, or None for robot_track()")
+        check_weights("reward", reward or {}, RewardWeights._fields)
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_cars]))
+        self.tracks = [robot_track()] if tracks is None else list(tracks)
+        self.assignment = assignment
+        self.perception = perception or Perception(simulated_cone_classifier())
+        self.lidar = lidar or SimulatedLidar()
+        self.laps, self.max_steps = laps, round(time_limit * self.lidar.rate)
+        self.step_length, self.car_length = speed / self.lidar.rate, car_length
+        self.max_steering = math.radians(max_steering)
+        self.weights = {key: torch.tensor(float(x)) for key, x in RewardWeights(**(reward or {}))._asdict().items()}
+        sight = self.perception.range_max * self.perception.scale
+        self.memory = BoundaryMemory(num_cars, spline, smoothing, sight=sight)
+        self.generator = torch.Generator()
+        self.course = RobotCourse(self.tracks)
+        self.starts = torch.tensor([track.start for track in self.tracks]).t()
+        self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
+        for name, value in {
+            "track": torch.arange(num_cars) % len(self.tracks), "pose": torch.zeros(3, num_cars),
+            "history": torch.zeros(HISTORY, num_cars),
+            "steps": torch.zeros(num_cars, dtype=torch.int64), "lap": torch.zeros(num_cars, dtype=torch.int64),
+            "lap_start": torch.full((num_cars,), -1), "in_finish": torch.zeros(num_cars, dtype=torch.bool),
+            "scan": torch.full((num_cars, self.lidar.beams), torch.inf),
+        }.items():  # fmt: skip
+            self.register_buffer(name, value)
+        declare_specs(self, self._reset())
+        self.set_seed(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
+        # All robots draw and measure, reset or not: the order of random numbers must not depend on the data.
+        if self.assignment == "random":
+            drawn = torch.randint(len(self.tracks), self.batch_size, generator=self.generator)
+            self.track = torch.where(mask, drawn, self.track)
+        self.pose = torch.where(mask, self.starts[:, self.track], self.pose)
+        for name, value in {"history": 0, "steps": 0, "lap": 0, "lap_start": -1, "in_finish": False}.items():
+            setattr(self, name, getattr(self, name).masked_fill(mask, value))
+        standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
+        self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
+        self.memory.reset(mask)
+        # Robots that are not reset perceive their last scan again, which does not change their memory.
+        view = self._perceive()
+        zero = torch.zeros(self.batch_size)
+        terms = dict.fromkeys(REWARD_TERMS, zero)
+        return self._tensordict(view, terms, lap_time=zero, crashed=zero.bool(), clearance=zero, smoothness=zero)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].detach().view(-1).clamp(-1, 1)
+        roughness = (action - recent_mean(self.history)).abs()
+        self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
+        self.steps = self.steps + 1
+        self._drive(action)
+        view = self._perceive()
+
+        lap_time, finished = self._count_laps()
+        clearance, to_boundaries = self.course.clearance(self.track, self.pose)
+        crashed = clearance <= 0
+        no_cone, alive = torch.zeros_like(action), (~crashed).float()
+        outcome = Outcome(action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive)
+        terms = weighted_terms(outcome, self.weights)
+        terminated = crashed | (self.lap >= self.laps)
+        truncated = (self.steps >= self.max_steps) & ~terminated
+        info = {"lap_time": lap_time, "crashed": crashed, "clearance": clearance, "smoothness": roughness}
+        out = self._tensordict(view, terms, **info)
+        out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
+        out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
+        out["done"] = (terminated | truncated).unsqueeze(-1)
+        return out
+
+    def _drive(self, action: Tensor) -> None:
+        """Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way."""
+        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
+        phase = self.lidar.phase
+        poses = move_along_arc(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
+        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
+        self.scan = self._measure(poses)
+
+    def _measure(self, poses: Tensor) -> Tensor:
+        true, _ = cast_beams(poses, self.lidar.angles, self.course.cones[:, self.track], self.course.radius[self.track])
+        return self.lidar.measure(true, self.generator)[0]
+
+    def _perceive(self) -> dict[str, Tensor]:
+        """Return the cones in the last scan, and the observation with the memory updated by them."""
+        cones, count = (torch.from_numpy(x) for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy()))
+        cones = cones.float()
+        observation, valid = self.memory(cones, count)
+        return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
+
+    def _count_laps(self) -> tuple[Tensor, Tensor]:
+        """Count laps; return the lap time in s [B], 0 without a completed lap, and whether one was completed [B]."""
+        inside = (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
+        entered = inside & ~self.in_finish
+        finished = entered & (self.lap_start >= 0)
+        lap_time = (self.steps - self.lap_start) * finished / self.lidar.rate
+        self.in_finish, self.lap = inside, self.lap + finished
+        self.lap_start = torch.where(entered, self.steps, self.lap_start)
+        return lap_time, finished
+
+    def _tensordict(self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor) -> TensorDict:
+        columns = {"track": self.track, "lap": self.lap, **values}
+        reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
+        info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
+        info |= {"pose": self.pose.t(), "valid": view["valid"], "reward": TensorDict(reward, self.batch_size)}
+        entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
+        entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
+        return TensorDict(entries, self.batch_size, device=self.device)

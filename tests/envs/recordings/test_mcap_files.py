@@ -1,0 +1,78 @@
+"""Writing of recordings and encoding of messages."""
+
+import numpy as np
+import pytest
+from drives import drive, scan
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from coil_rl.envs.recordings.mcap_files import RecordingWriter
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, decode, definition, encode, header, pose_of, twist
+
+MARKERS = "visualization_msgs/msg/MarkerArray"
+MARKER = {"ns": "left", "header": header(1_500_000_001, "laser"), "pose": {"orientation": {"w": 1.0}}}
+
+
+def write(path, order):
+    with RecordingWriter(path) as writer:
+        writer.describe("coil", {"input": "1f2e", "config": "3a4b"})
+        writer.attach("config.yaml", "application/yaml", b"seed: 0\n")
+        for time in range(3)[::order]:
+            writer.add("/cmd_vel", TWIST, time, twist(time, 0))
+            writer.add("/coil/cones", MARKERS, time, {"markers": [MARKER]})
+    return path.read_bytes()
+
+
+def test_equal_messages_make_equal_bytes_in_any_order(tmp_path):
+    assert write(tmp_path / "a.mcap", 1) == write(tmp_path / "b" / "c.mcap", -1)
+    assert [file.name for file in (tmp_path / "b").iterdir()] == ["c.mcap"]
+
+
+def test_another_reader_reads_messages_metadata_and_attachments(tmp_path):
+    path = drive(tmp_path / "a.mcap", scans=200, odometry=True, commands=True)
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        assert reader.message_count == 600
+        assert sorted(reader.topics) == ["/cmd_vel", "/odom", "/scan"]
+        channels = [channel for channel in reader.connections if channel.topic == "/scan"]
+        for number, (channel, _, data) in enumerate(reader.messages(channels)):
+            message = reader.deserialize(data, channel.msgtype)
+            np.testing.assert_array_equal(message.ranges, scan(number)["ranges"])
+        assert number == 199
+    write(tmp_path / "b.mcap", 1)
+    with (tmp_path / "b.mcap").open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        [metadata], [attachment] = reader.iter_metadata(), reader.iter_attachments()
+    assert (metadata.name, metadata.metadata) == ("coil", {"input": "1f2e", "config": "3a4b"})
+    assert (attachment.name, attachment.data) == ("config.yaml", b"seed: 0\n")
+
+
+def test_nothing_is_written_if_the_block_raises(tmp_path):
+    def fail():
+        with RecordingWriter(tmp_path / "a.mcap") as writer:
+            writer.add("/scan", SCAN, 0, scan(0))
+            writer.add("/scan", "LaserScan", 0, {})
+
+    with pytest.raises(ValueError, match="'LaserScan' is not a standard ROS 2 message type"):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_fields_are_zero_or_empty():
+    [marker, empty] = decode(encode(MARKERS, {"markers": [MARKER, {}]}), MARKERS).markers
+    assert (marker.ns, marker.header.stamp.sec, marker.header.stamp.nanosec) == ("left", 1, 500_000_001)
+    assert (empty.ns, empty.pose.position.x, empty.frame_locked, len(empty.points)) == ("", 0.0, False, 0)
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.5, -3.1])
+def test_pose_of_odometry(heading):
+    orientation = {"z": np.sin(heading / 2), "w": np.cos(heading / 2)}
+    pose = {"position": {"x": 1.0, "y": -2.0}, "orientation": orientation}
+    assert pose_of(decode(encode(ODOMETRY, {"pose": {"pose": pose}}), ODOMETRY)) == pytest.approx((1, -2, heading))
+
+
+def test_unknown_fields_and_types_are_refused():
+    with pytest.raises(ValueError, match=r"no field \['speed'\]; it has linear, angular"):
+        encode(TWIST, {"speed": 1.0})
+    with pytest.raises(ValueError, match="not a standard ROS 2 message type"):
+        definition("std_msgs/msg/Int")
