@@ -1,22 +1,20 @@
-"""Which guide a trained agent listens to, and where on the track."""
+"""Analysis of how much a trained agent uses the advice of each guide, and where on the track."""
 
-from coil_rl.listening.ablation import Ablation, ablations, drive_ablated
-from coil_rl.listening.measures import agreement, gradient, intervention
-from coil_rl.listening.parts import Intercepted, split
-from coil_rl.listening.places import PLACES, Places
-from coil_rl.listening.survey import Survey, survey
+from coil_rl.listening.measures import InterceptedPolicy, agreement, gradient, intervention, split_policy
+from coil_rl.listening.sections import SECTIONS, TrackSections
+from coil_rl.listening.survey import Ablation, Survey, ablations, drive_ablated, survey
 
 __all__ = [
-    "PLACES",
+    "SECTIONS",
     "Ablation",
-    "Intercepted",
-    "Places",
+    "InterceptedPolicy",
     "Survey",
+    "TrackSections",
     "ablations",
     "agreement",
     "drive_ablated",
     "gradient",
     "intervention",
-    "split",
+    "split_policy",
     "survey",
 ]

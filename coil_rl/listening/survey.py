@@ -1,112 +1,251 @@
-"""Drives an agent over its tracks and measures in every state how much it listens to whom."""
+"""Survey of an agent on its tracks: measures in every visited state, ablations of guides, and their tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.listening.measures import agreement, gradient, intervention
-from coil_rl.listening.parts import ADVICE, Intercepted
-from coil_rl.listening.places import Places
-from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.listening.measures import ADVICE, InterceptedPolicy, agreement, gradient, intervention
+from coil_rl.listening.sections import SECTIONS, TrackSections, curvature
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy, summarise
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace
+
+Array = NDArray[np.float64]
+
+EVERYWHERE = "everywhere"
 
 
 @dataclass(frozen=True)
 class Survey:
-    """What was found in the N states of a drive, all cars of all tracks together.
+    """Measures in the N states of all episodes.
 
     Attributes:
-        guides: their names, one per slot of the advice.
-        drive: how it went.
-        track: [N], the car's track.
-        point: [N], the point of that track's middle line where the car was.
-        advice: [N, n_guides, A], what each guide said.
+        guides: names, one per slot of the advice.
+        result: of the evaluation.
+        track: [N], index of the track.
+        point: [N], nearest point of the middle line of the track.
+        section: [N], index in SECTIONS.
+        advice: [N, n_guides, A].
         measures: `agreement`, `intervention` and `gradient`, [N, n_guides] each.
     """
 
     guides: list[str]
-    drive: EvaluationResult
-    track: Tensor
-    point: Tensor
+    result: EvaluationResult
+    track: NDArray[np.int64]
+    point: NDArray[np.int64]
+    section: NDArray[np.int64]
     advice: Tensor
-    measures: dict[str, Tensor]
-
-
-def guide_names(env: EnvBase, policy: TensorDictModuleBase) -> list[str]:
-    """What the slots of the advice are called: by the policy's own first module, or else by the env's transform.
-
-    Raises:
-        ValueError: if nobody gives advice by names.
-    """
-    advising = Intercepted(policy, lambda seen: seen).advising
-    sources = [advising] if advising is not None else [m for m in env.modules() if isinstance(m, GuideActions)]
-    if not sources:
-        raise ValueError("nobody gives the policy its advice: put GuideActions into the env")
-    return list(sources[0].names)
+    measures: dict[str, Array]
 
 
 def survey(
     env: EnvBase,
     policy: TensorDictModuleBase,
-    places: Places,
+    sections: TrackSections,
     *,
     donors: int = 16,
     seed: int = 0,
     names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> Survey:
-    """Let the deterministic agent drive one episode with every car, and measure in every state it came to.
+    """Evaluate the deterministic agent for one episode per car, and measure in every visited state.
 
     Args:
         env: cars with `info`, [B].
         policy: the agent; reads `guide_action`.
-        places: of the tracks of this env.
+        sections: of the tracks of this env.
         donors: as for `intervention`.
-        seed: of the draws of donors.
+        seed: of the donors.
+        names: of the tracks.
+        tick: called every step.
+    """
+    history: list[TensorDictBase] = []
+
+    def record(state: TensorDictBase) -> TensorDictBase:
+        kept = state.select(*recorder.acting.in_keys)
+        kept["track"] = state["info", "track"].squeeze(-1)
+        kept["point"] = sections.nearest(kept["track"], state["info", "pose"][..., :2])
+        history.append(kept)
+        return state
+
+    recorder = InterceptedPolicy(policy, record)
+    sources = [recorder.advising, *(module for module in env.modules() if isinstance(module, GuideActions))]
+    guides = next((list(source.names) for source in sources if source is not None), None)
+    if guides is None:
+        raise ValueError("nothing writes guide_action: put GuideActions into the env")
+    result = evaluate_policy(env, recorder, names=names, tick=tick)
+    steps = torch.tensor([episode["steps"] for episode in result.episodes], device=env.device)
+    running = torch.arange(len(history), device=env.device).unsqueeze(-1) < steps
+    states: TensorDictBase = torch.stack(history)[running]
+    space = ActionSpace(env.full_action_spec["action"], env.batch_dims)
+
+    def act(state: TensorDictBase) -> Tensor:
+        return space.vectors(recorder.acting(state)["action"])
+
+    generator = torch.Generator().manual_seed(seed)
+    measures = {
+        "agreement": agreement(act, states),
+        "intervention": intervention(act, states, donors, generator),
+        "gradient": gradient(act, states),
+    }
+    return Survey(
+        guides,
+        result,
+        states["track"].cpu().numpy(),
+        states["point"].cpu().numpy(),
+        sections.section_at(states["track"], states["point"]).cpu().numpy(),
+        states[ADVICE],
+        {name: values.cpu().double().numpy() for name, values in measures.items()},
+    )
+
+
+class Ablation(NamedTuple):
+    """A guide, by its slot in the advice, that is removed in one section, by its index, or everywhere (None)."""
+
+    guide: int
+    section: int | None = None
+
+
+def ablations(guides: int) -> list[Ablation]:
+    """Return the removal of each guide everywhere and in each section."""
+    return [Ablation(guide, section) for guide in range(guides) for section in (None, *range(len(SECTIONS)))]
+
+
+def drive_ablated(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    sections: TrackSections,
+    removed: Sequence[Ablation],
+    replacement: Tensor,
+    *,
+    names: Sequence[str] = (),
+    tick: Callable[[], Any] | None = None,
+) -> list[list[dict[str, Any]]]:
+    """Evaluate the deterministic agent with each ablation, all at the same time.
+
+    Removed advice is replaced by a constant, such as its mean: it carries no information and is not misleading, as
+    advice from other states would be.
+
+    Args:
+        env: cars with `info`, a multiple of the number of ablations; each ablation gets an equal share, in order.
+        policy: the agent; reads `guide_action`.
+        sections: of the tracks of this env.
+        removed: the ablations.
+        replacement: [n_guides, A], advice of a removed guide.
         names: of the tracks.
         tick: called every step.
 
-    Raises:
-        ValueError: if the policy does not read advice, or nobody writes it.
+    Returns:
+        The episodes of each ablation, as in `EvaluationResult`.
     """
-    moments: list[TensorDictBase] = []
+    cars = env.batch_size.numel()
+    if not removed or cars % len(removed):
+        raise ValueError(f"{cars} cars cannot be divided among {len(removed)} ablations; give a multiple")
+    share = cars // len(removed)
+    everywhere = -1
+    slot = torch.tensor([one.guide for one in removed], device=env.device).repeat_interleave(share)
+    where = torch.tensor([everywhere if one.section is None else one.section for one in removed], device=env.device)
+    where = where.repeat_interleave(share)
+    is_slot = slot.unsqueeze(-1) == torch.arange(len(replacement), device=env.device)
 
-    def note(seen: TensorDictBase) -> TensorDictBase:
-        moment = seen.select(*listener.acting.in_keys)
-        moment["track"] = seen["info", "track"].squeeze(-1)
-        moment["point"] = places.nearest(moment["track"], seen["info", "pose"][..., :2])
-        moments.append(moment)
-        return seen
+    def remove(state: TensorDictBase) -> TensorDictBase:
+        section = sections.section(state["info", "track"].squeeze(-1), state["info", "pose"][..., :2])
+        replaced = is_slot & ((where == everywhere) | (where == section)).unsqueeze(-1)
+        return state.set(ADVICE, torch.where(replaced.unsqueeze(-1), replacement, state[ADVICE]))
 
-    listener, guides = Intercepted(policy, note), guide_names(env, policy)
-    driven = evaluate_policy(env, listener, names=names, tick=tick)
-    steps = torch.tensor([episode["steps"] for episode in driven.episodes], device=env.device)
-    running = torch.arange(len(moments), device=env.device).unsqueeze(-1) < steps
-    states: TensorDictBase = torch.stack(moments)[running]
-    space = ActionSpace(env.full_action_spec["action"], env.batch_dims)
+    episodes = evaluate_policy(env, InterceptedPolicy(policy, remove), names=names, tick=tick).episodes
+    return [episodes[start : start + share] for start in range(0, cars, share)]
 
-    def act(asked: TensorDictBase) -> Tensor:
-        return space.vectors(listener.acting(asked)["action"])
 
-    generator = torch.Generator().manual_seed(seed)
-    return Survey(
-        guides=guides,
-        drive=driven,
-        track=states["track"],
-        point=states["point"],
-        advice=states[ADVICE],
-        measures={
-            "agreement": agreement(act, states),
-            "intervention": intervention(act, states, donors, generator),
-            "gradient": gradient(act, states),
-        },
-    )
+def table_by_section(found: Survey, ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Return one row per guide everywhere and in each section: means over states, and the effect of its removal.
+
+    Returns:
+        Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`, `gradient`, and, with the
+        guide removed there, `lost` (return) and `completed` (share). Sections without a state are left out.
+    """
+    intact = _means(found.result.episodes)
+    rows = []
+    for (slot, section), episodes in ablated.items():
+        states = np.ones(len(found.section), dtype=bool) if section is None else found.section == section
+        if states.any():
+            without = _means(episodes)
+            rows.append(
+                {"guide": found.guides[slot], "section": EVERYWHERE if section is None else SECTIONS[section]}
+                | {"share": float(states.mean())}
+                | {name: float(values[states, slot].mean()) for name, values in found.measures.items()}
+                | {"lost": intact["reward"] - without["reward"], "completed": without["completed"]}
+            )
+    return rows
+
+
+def table_along_track(found: Survey, sections: TrackSections, bin_length: float = 1.0) -> list[dict[str, Any]]:
+    """Return one row per guide and bin of each track with a visited state.
+
+    Bins are `bin_length` m of the middle line, rounded to a whole number of bins.
+
+    Returns:
+        Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m), `curvature` (1/m) and
+        `section` of the bin's middle, number of `states`, and means of `agreement`, `intervention` and `gradient`.
+    """
+    rows = []
+    for index, track in enumerate(sections.tracks):
+        line, on_track = sections.lines[index], found.track == index
+        bins = _bins(line, bin_length)
+        _, first, lengths = np.unique(bins, return_index=True, return_counts=True)
+        middle = first + lengths // 2
+        step, bend = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1), curvature(line)
+        bin_of_state = bins[found.point[on_track]]
+        states = np.bincount(bin_of_state, minlength=len(first))
+        for slot, guide in enumerate(found.guides):
+            sums = {name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in found.measures.items()}
+            for k in np.flatnonzero(states).tolist():
+                x, y = line[middle[k]].tolist()
+                rows.append({
+                    "track": track.name, "guide": guide, "bin": k, "from": float(step[: first[k]].sum()),
+                    "x": x, "y": y, "curvature": float(bend[middle[k]]),
+                    "section": SECTIONS[sections.sections[index][middle[k]]], "states": int(states[k]),
+                    **{name: float(of_bins[k] / states[k]) for name, of_bins in sums.items()},
+                })  # fmt: skip
+    return rows
+
+
+def measure_on_lines(
+    found: Survey, sections: TrackSections, measure: str, bin_length: float = 1.0
+) -> tuple[list[Array], dict[str, list[Array]]]:
+    """Return the line [T, 2] m of the last car of each track, and by guide the measure [T] at its points, by bins."""
+    table = table_along_track(found, sections, bin_length)
+    means = {(row["track"], row["guide"], row["bin"]): row[measure] for row in table}
+    lines: list[Array] = []
+    values: dict[str, list[Array]] = {guide: [] for guide in found.guides}
+    for middle_line, track in zip(sections.lines, sections.tracks, strict=True):
+        cars = [car for car, episode in enumerate(found.result.episodes) if episode["track"] == track.name]
+        line = found.result.lines[cars[-1]]
+        line = line[: max(1, len(line) - 1)]  # the last point is the position after the last measured state
+        nearest = ((line[:, None] - middle_line) ** 2).sum(-1).argmin(1)
+        bins = _bins(middle_line, bin_length)[nearest].tolist()
+        lines.append(line)
+        for guide in found.guides:
+            values[guide].append(np.array([means.get((track.name, guide, k), np.nan) for k in bins]))
+    return lines, values
+
+
+def _means(episodes: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return summarise([dict(episode) for episode in episodes])[-1]
+
+
+def _bins(line: Array, length: float) -> NDArray[np.int64]:
+    """Return the bin of each point of a closed line [P]: numbers from 0, bins of about equal length."""
+    total = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
+    count = min(len(line), max(1, round(total / length)))
+    return np.arange(len(line)) * count // len(line)

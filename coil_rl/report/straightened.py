@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from coil_rl.envs.track import Track
-from coil_rl.listening.places import kinds, smooth_line
+from coil_rl.listening.sections import classify, smooth_line
 
 Array = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ class Straightened:
     Attributes:
         line: [P, 2] m, the middle line from the first cones on.
         along: [P] m, how far its points are along it.
-        kinds: [P], of its places, as `coil_rl.listening.places.kinds`.
+        kinds: [P], of its places, as `coil_rl.listening.sections.classify`.
         length: m, of a lap of it.
 
     Example:
@@ -42,7 +42,7 @@ class Straightened:
         lengths = np.linalg.norm(edges, axis=1)
         self.along: Array = np.cumsum(lengths) - lengths
         self.length = float(lengths.sum())
-        self.kinds = kinds(smooth_line(track, SPACING))
+        self.kinds = classify(smooth_line(track, SPACING))
         # Across a point the direction is that from the one before to the one after.
         ahead = edges + np.roll(edges, 1, axis=0)
         self._ahead = ahead / np.linalg.norm(ahead, axis=1, keepdims=True)

@@ -35,7 +35,7 @@ def up(points: Array) -> Array:
 def draw_sight(axes: Axes, sight: float, half_field_of_view: float) -> None:
     """Draw the sector that the car sees, `sight` m deep and so many radians to either side."""
     half = math.degrees(half_field_of_view)
-    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc=style.PAPER, ec="none", alpha=0.55, zorder=1.5))
+    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc=style.BACKGROUND, ec="none", alpha=0.55, zorder=1.5))
     axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2))
 
 
@@ -82,7 +82,7 @@ def rows_of_places(places: Mapping[str, Array]) -> Iterator[dict[str, object]]:
 
 def draw_samples(axes: Axes, samples: Array, side: int, fresh: bool) -> None:
     """Draw the samples [5, 2] m of a side, filled if they are of now and hollow if remembered."""
-    fill, edge = (LINES[side], style.PAPER) if fresh else (style.PAPER, LINES[side])
+    fill, edge = (LINES[side], style.BACKGROUND) if fresh else (style.BACKGROUND, LINES[side])
     axes.plot(*up(samples).T, "D", ms=4.4, mfc=fill, mec=edge, mew=0.8, zorder=6)
 
 
@@ -90,7 +90,7 @@ def draw_plan(axes: Axes, plan: Mapping[str, Array]) -> None:
     """Draw what `places_of` found."""
     axes.plot(*up(plan["path"]).T, color=PATH, lw=1.6, zorder=5)
     axes.plot(*up(plan["midpoint"]).T, "x", color=style.INK, ms=3.6, mew=0.9, zorder=6)
-    axes.plot(*up(plan["target"]).T, "o", ms=4.2, mfc=PATH, mec=style.PAPER, mew=0.6, zorder=7)
+    axes.plot(*up(plan["target"]).T, "o", ms=4.2, mfc=PATH, mec=style.BACKGROUND, mew=0.6, zorder=7)
     axes.plot(*up(plan["steered for"]).T, "o", ms=9, mfc="none", mec=ADVICE, mew=1.6, zorder=8)
 
 
@@ -113,7 +113,9 @@ def plan_handles() -> list[Artist]:
     """The handles of `draw_plan` and `draw_advice`."""
     return [
         mark("x", "midpoint of a pair", 4, mec=style.INK),
-        Line2D([], [], color=PATH, lw=1.6, marker="o", ms=4.2, mec=style.PAPER, mew=0.6, label="guide's path, targets"),
+        Line2D(
+            [], [], color=PATH, lw=1.6, marker="o", ms=4.2, mec=style.BACKGROUND, mew=0.6, label="guide's path, targets"
+        ),
         mark("o", "steered for", 8, mfc="none", mec=ADVICE, mew=1.6),
         Line2D([], [], color=ADVICE, lw=1.8, marker=">", ms=4.5, markevery=[1], label="advice"),
     ]

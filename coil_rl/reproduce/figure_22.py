@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import draw_learning_curves, markdown_table, write_csv
-from coil_rl.report.curve import TRAINING, mean_curve
+from coil_rl.report.curves import TRAINING, mean_curve
 from coil_rl.report.runs import GUIDE
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, called
 from coil_rl.reproduce.verdict import with_interval

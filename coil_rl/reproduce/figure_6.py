@@ -9,7 +9,8 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
+from coil_rl.report.style import lighten, picture
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.tabular import policy_iteration, toymaker, value_iteration
 
 PAPER = 80  # "converges after about 80 iterations"

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from coil_rl.envs.track import SIDES, Track
-from coil_rl.listening.places import LEFT, RIGHT
+from coil_rl.listening.sections import LEFT, RIGHT
 from coil_rl.report import style
 from coil_rl.report.straightened import Straightened
-from coil_rl.reproduce.result import lighten, picture
+from coil_rl.report.style import lighten, picture
 from coil_rl.train.evaluation import EvaluationResult
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ def draw_straightened(
                 above.plot(along, aside, color=colour, ls=dash, lw=1.2, zorder=4)
                 below.plot(along, rough, color=colour, ls=dash, lw=1.0)
                 if drive.episodes[index]["crashed"] and len(along):
-                    above.plot(along[-1], aside[-1], "X", ms=7, mfc=colour, mec=style.PAPER, mew=0.8, zorder=5)
+                    above.plot(along[-1], aside[-1], "X", ms=7, mfc=colour, mec=style.BACKGROUND, mew=0.8, zorder=5)
             below.set_ylim(bottom=0)
             below.set_ylabel("smoothness", size=8)
             below.set_xlabel("along the middle (m)" if index == len(tracks) - 1 else "", size=8)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from coil_rl.envs import Perception
 from coil_rl.envs.robot.course import OUTLINE
 from coil_rl.report import style
+from coil_rl.report.style import picture
 from coil_rl.reproduce.facing_up import (
     CONES,
     LINES,
@@ -26,7 +27,6 @@ from coil_rl.reproduce.facing_up import (
     up,
 )
 from coil_rl.reproduce.figure_scan_look import Look
-from coil_rl.reproduce.result import picture
 
 HEIGHT = 6.4  # inches
 SIDEWAYS, BEHIND, AHEAD = 0.95, 0.2, 1.08  # m that are shown
@@ -58,7 +58,9 @@ def draw(look: Look, numbers: NDArray[np.int64], perception: Perception, path: P
             _draw_side(axes, look, side)
         draw_plan(axes, look.plan)
         length, width = OUTLINE
-        axes.add_patch(Rectangle((-width / 2, -length / 2), width, length, fc=style.INK, ec=style.PAPER, zorder=8.2))
+        axes.add_patch(
+            Rectangle((-width / 2, -length / 2), width, length, fc=style.INK, ec=style.BACKGROUND, zorder=8.2)
+        )
         draw_advice(axes, look.advice, ARROW)
 
 

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from coil_rl.report import style
-from coil_rl.reproduce.result import lighten, picture
+from coil_rl.report.style import lighten, picture
 
 if TYPE_CHECKING:
     from coil_rl.reproduce.figure_spline import Fit

@@ -14,6 +14,7 @@ from matplotlib.path import Path as Outline
 
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT
 from coil_rl.report import style
+from coil_rl.report.style import picture
 from coil_rl.reproduce.facing_up import (
     CONES,
     EDGES,
@@ -27,7 +28,6 @@ from coil_rl.reproduce.facing_up import (
     up,
 )
 from coil_rl.reproduce.figure_world_look import Look
-from coil_rl.reproduce.result import picture
 
 COLUMNS = 2
 PANEL, HEADER = 2.75, 0.75  # inches
@@ -66,12 +66,12 @@ def _draw_panel(axes: Axes, look: Look) -> None:
     for side in (0, 1):
         _draw_side(axes, look, side)
     draw_plan(axes, look.plan)
-    axes.add_patch(Polygon(up(CAR), fc=style.INK, ec=style.PAPER, lw=0.6, zorder=9))
+    axes.add_patch(Polygon(up(CAR), fc=style.INK, ec=style.BACKGROUND, lw=0.6, zorder=9))
     draw_advice(axes, look.advice, ARROW)
 
 
 def _draw_side(axes: Axes, look: Look, side: int) -> None:
-    axes.plot(*up(look.cones[side]).T, "o", ms=5, mfc=style.PAPER, mec=CONES[side], mew=1.1, zorder=3)
+    axes.plot(*up(look.cones[side]).T, "o", ms=5, mfc=style.BACKGROUND, mec=CONES[side], mew=1.1, zorder=3)
     axes.plot(*up(look.seen[side]).T, "o", ms=7.5, mfc=CONES[side], zorder=4, **EDGES)
     axes.plot(*up(look.estimate[side]).T, color=LINES[side], lw=1.5, zorder=4.5)
     if not look.known[side]:
@@ -91,10 +91,10 @@ def _handles(moments: Sequence[Look]) -> list[Artist]:
     handles: list[Artist] = [
         mark("o", "left cone in sight", 7, mfc=CONES[0], **EDGES),
         mark("o", "right cone in sight", 7, mfc=CONES[1], **EDGES),
-        mark("o", "cone out of sight", 5, mfc=style.PAPER, mec=CONES[1]),
-        Patch(fc=style.PAPER, ec=style.QUIET, lw=0.8, label="sight"),
+        mark("o", "cone out of sight", 5, mfc=style.BACKGROUND, mec=CONES[1]),
+        Patch(fc=style.BACKGROUND, ec=style.QUIET, lw=0.8, label="sight"),
         Line2D([], [], color=LINES[1], lw=1.5, marker="D", ms=4.2, label="boundary estimate, its samples"),
     ]
     if not all(all(look.fresh) for look in moments):
-        handles.append(mark("D", "remembered", 4.2, mfc=style.PAPER, mec=LINES[0]))
+        handles.append(mark("D", "remembered", 4.2, mfc=style.BACKGROUND, mec=LINES[0]))
     return [*handles, *plan_handles()]

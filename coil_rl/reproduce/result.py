@@ -3,20 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
-import matplotlib as mpl
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
-from coil_rl.report import style
 from coil_rl.report.runs import Run
 
 Runs = Mapping[str, Sequence[Run]]  # of each file of `conf/experiment`, finished
@@ -62,30 +53,3 @@ def called(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
             known = ", ".join(dict.fromkeys(run.label for run in there))
             raise UserError(f"no run of {', '.join(runs)} is called {label}; there are {known or 'none'}")
     return found
-
-
-@contextmanager
-def picture(path: Path, title: str, handles: Sequence[Artist], height: float) -> Iterator[Figure]:
-    """An empty picture in the house's style; it is written when the block ends.
-
-    Args:
-        path: the picture, 8 inches wide.
-        title: above it.
-        handles: of the legend below the title.
-        height: in inches.
-    """
-    with mpl.rc_context(style.LETTERS):
-        figure = Figure(figsize=(style.WIDTH, height), dpi=style.RESOLUTION)
-        FigureCanvasAgg(figure)
-        header = style.draw_header(figure, handles, title)
-        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / height), w_pad=style.MARGIN / 2, h_pad=0.1)
-        yield figure
-        with whole_file(path) as unfinished:
-            figure.savefig(unfinished, format=path.suffix[1:])
-
-
-def lighten(axes: Axes, grid: str = "y") -> None:
-    """Leave out what frames a plot, and draw faint lines across it."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y" if grid == "y" else "x", color=style.ASPHALT, lw=0.7)
-    axes.set_axisbelow(True)

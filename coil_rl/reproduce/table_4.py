@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
-from coil_rl.report.curve import TRAINING, points
+from coil_rl.report.curves import TRAINING, points
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap, wins
 from coil_rl.reproduce.result import NO_RUNS, Runs

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, write_csv
-from coil_rl.report.comparison import Group, compare
-from coil_rl.report.paired import paired
-from coil_rl.report.runs import GUIDE, MEASURES, Run
+from coil_rl.report.comparison import Group, compare, paired
+from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, Run
 from coil_rl.report.statistics import iqm, stratified_bootstrap
 from coil_rl.reproduce.result import NO_RUNS, Runs
 from coil_rl.reproduce.table_5_page import beside_the_paper, drivers, held_up, tracks
@@ -82,13 +81,8 @@ class Table5(OfWorlds):
 
 def _numbers(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Every drive of every run."""
-    return [
-        {"label": run.label, "seed": run.seed, "driver": drive.driver, "advice": drive.advice, "actions": drive.actions,
-         "track": track} | dict(zip(MEASURES, values, strict=False))
-        for run in runs
-        for drive in run.drives
-        for track, values in zip(drive.tracks, drive.values, strict=True)
-    ]  # fmt: skip
+    rows = [(run, run.evaluation[[*DRIVER, *MEASURES]].to_dict("records")) for run in runs]
+    return [{"label": run.label, "seed": run.seed} | row for run, of_run in rows for row in of_run]
 
 
 def _intervals(groups: Sequence[Group], rows: Sequence[Mapping[str, Any]]) -> list[Interval]:

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from coil_rl.report import markdown_table
-from coil_rl.report.comparison import Group
-from coil_rl.report.paired import Paired, paired
+from coil_rl.report.comparison import Group, Paired, paired
 from coil_rl.report.runs import GUIDE
 from coil_rl.reproduce.verdict import FAILED, HEADING, HELD, verdict, with_interval
 

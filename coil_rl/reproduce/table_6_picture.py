@@ -13,7 +13,7 @@ from matplotlib.patches import Circle
 
 from coil_rl.envs.robot.course import THICK, THIN
 from coil_rl.report import style
-from coil_rl.reproduce.result import picture
+from coil_rl.report.style import picture
 from coil_rl.reproduce.table_6_measures import Drive
 
 COLUMNS = 2
@@ -62,7 +62,7 @@ def _draw_panel(axes: Axes, drives: Sequence[Drive], colour: str) -> None:
     for drive in drives:
         axes.plot(*drive.line.T, color=colour, lw=0.8, alpha=0.6, zorder=4)
         if drive.row["crashed"]:
-            axes.plot(*drive.line[-1], "X", ms=7, mfc=colour, mec=style.PAPER, mew=0.8, zorder=5)
+            axes.plot(*drive.line[-1], "X", ms=7, mfc=colour, mec=style.BACKGROUND, mew=0.8, zorder=5)
 
 
 def _dot(colour: str, marker: str, label: str) -> Line2D:

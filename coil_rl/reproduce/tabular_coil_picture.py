@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 
 from coil_rl.report import style
-from coil_rl.reproduce.result import lighten, picture
+from coil_rl.report.style import lighten, picture
 
 HEIGHT = 5.6  # inches
 APART = 1.6  # points between lines that would else lie on each other

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from coil_rl.envs import shipped_tracks
-from coil_rl.listening.places import LEFT, RIGHT
+from coil_rl.listening.sections import LEFT, RIGHT
 from coil_rl.report.straightened import Straightened
 
 

@@ -1,10 +1,10 @@
 import csv
 
+import pandas as pd
 import pytest
 from PIL import Image
 from reproduced_runs import make_runs
 
-from coil_rl.report.runs import Drive
 from coil_rl.reproduce import Table5
 
 
@@ -101,8 +101,8 @@ def test_every_drive_is_kept_and_drawn(made):
 def test_many_tracks_are_left_to_the_file(tmp_path):
     runs = make_runs(tmp_path / "main", {"coil": 30.0, "ppo": 60.0}, seeds=2)
     for run in runs:
-        wide = [Drive(d.driver, d.advice, d.actions, tuple("abcdefghi"), d.values[[0] * 9]) for d in run.drives]
-        object.__setattr__(run, "drives", tuple(wide))
+        first = run.evaluation[run.evaluation["track"] == "a"]
+        object.__setattr__(run, "evaluation", pd.concat([first.assign(track=name) for name in "abcdefghi"]))
     page = Table5(["main"]).make(tmp_path / "t", {"main": runs})
     assert page.count("The numbers of each of the 9 tracks are in t.csv.") == 2
 
