@@ -99,21 +99,7 @@ def split_policy(policy: TensorDictModuleBase) -> tuple[TensorDictModuleBase | N
 
 
 class InterceptedPolicy(TensorDictModuleBase):
-    """A policy whose input is changed between the advice and the action.
-
-    Args:
-        policy: as for `split_policy`.
-        change: maps the input of the policy, with `guide_action` [B, n_guides, A], to its new input.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> from tensordict.nn import TensorDictModule
-        >>> import torch
-        >>> follow = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
-        >>> zeroed = InterceptedPolicy(follow, lambda state: state.set("guide_action", state["guide_action"] * 0))
-        >>> zeroed(TensorDict({"guide_action": torch.ones(3, 2, 1)}, [3]))["action"].flatten().tolist()
-        [0.0, 0.0, 0.0]
-    """
+    """A policy whose input, with `guide_action` [B, n_guides, A], is changed between the advice and the action."""
 
     def __init__(self, policy: TensorDictModuleBase, change: Callable[[TensorDictBase], TensorDictBase]) -> None:
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys

@@ -20,15 +20,10 @@ SMOOTHING = 1.0  # m
 
 
 def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
-    """Return the line half-way between the boundaries, smoothed over single cones.
+    """Return the line half-way between the boundaries, smoothed over single cones: [P, 2] m, closed, from the start.
 
-    Args:
-        track: the track.
-        spacing: distance of the points in m, rounded to a whole number of points.
-        smoothing: standard deviation s of a Gaussian filter in m; a turn of radius R becomes s^2 / 2R smaller.
-
-    Returns:
-        [P, 2] m, a closed line in driving order from the first cones.
+    The points are about `spacing` m apart. `smoothing` is the standard deviation s of a Gaussian filter in m; a turn of
+    radius R becomes s^2 / 2R smaller.
     """
     return np.asarray(gaussian_filter1d(evenly(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"))
 
@@ -63,23 +58,11 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
 class TrackSections:
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
-    Args:
-        tracks: cars refer to them by index.
-        turn_radius: as for `classify`, like `approach`.
-        approach: see above.
-        device: of the cars.
+    Cars refer to tracks by index; `turn_radius` and `approach` are those of `classify`, in m.
 
     Attributes:
         lines: the middle lines, [P, 2] m each.
         sections: of their points, [P] each, indices in SECTIONS.
-
-    Example:
-        >>> import torch
-        >>> from coil_rl.envs import shipped_tracks
-        >>> sections = TrackSections(shipped_tracks("test"))
-        >>> start = torch.tensor([sections.tracks[0].start[:2]])
-        >>> SECTIONS[sections.section(torch.tensor([0]), start)]
-        'exit'
     """
 
     def __init__(

@@ -27,25 +27,15 @@ EVERYWHERE = "everywhere"
 
 @dataclass(frozen=True)
 class Survey:
-    """Measures in the N states of all episodes.
+    """Measures in the N states of all episodes."""
 
-    Attributes:
-        guides: names, one per slot of the advice.
-        result: of the evaluation.
-        track: [N], index of the track.
-        point: [N], nearest point of the middle line of the track.
-        section: [N], index in SECTIONS.
-        advice: [N, n_guides, A].
-        measures: `agreement`, `intervention` and `gradient`, [N, n_guides] each.
-    """
-
-    guides: list[str]
+    guides: list[str]  # names, one per slot of the advice
     result: EvaluationResult
-    track: NDArray[np.int64]
-    point: NDArray[np.int64]
-    section: NDArray[np.int64]
-    advice: Tensor
-    measures: dict[str, Array]
+    track: NDArray[np.int64]  # [N], index of the track
+    point: NDArray[np.int64]  # [N], nearest point of its middle line
+    section: NDArray[np.int64]  # [N], index in SECTIONS
+    advice: Tensor  # [N, n_guides, A]
+    measures: dict[str, Array]  # agreement, intervention and gradient, [N, n_guides] each
 
 
 def survey(
@@ -55,7 +45,6 @@ def survey(
     *,
     donors: int = 16,
     seed: int = 0,
-    names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> Survey:
     """Evaluate the deterministic agent for one episode per car, and measure in every visited state.
@@ -66,7 +55,6 @@ def survey(
         sections: of the tracks of this env.
         donors: as for `intervention`.
         seed: of the donors.
-        names: of the tracks.
         tick: called every step.
     """
     history: list[TensorDictBase] = []
@@ -83,7 +71,7 @@ def survey(
     guides = next((list(source.names) for source in sources if source is not None), None)
     if guides is None:
         raise ValueError("nothing writes guide_action: put GuideActions into the env")
-    result = evaluate_policy(env, recorder, names=names, tick=tick)
+    result = evaluate_policy(env, recorder, names=[track.name for track in sections.tracks], tick=tick)
     steps = torch.tensor([episode["steps"] for episode in result.episodes], device=env.device)
     running = torch.arange(len(history), device=env.device).unsqueeze(-1) < steps
     states: TensorDictBase = torch.stack(history)[running]
@@ -128,7 +116,6 @@ def drive_ablated(
     removed: Sequence[Ablation],
     replacement: Tensor,
     *,
-    names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> list[list[dict[str, Any]]]:
     """Evaluate the deterministic agent with each ablation, all at the same time.
@@ -136,33 +123,24 @@ def drive_ablated(
     Removed advice is replaced by a constant, such as its mean: it carries no information and is not misleading, as
     advice from other states would be.
 
-    Args:
-        env: cars with `info`, a multiple of the number of ablations; each ablation gets an equal share, in order.
-        policy: the agent; reads `guide_action`.
-        sections: of the tracks of this env.
-        removed: the ablations.
-        replacement: [n_guides, A], advice of a removed guide.
-        names: of the tracks.
-        tick: called every step.
-
-    Returns:
-        The episodes of each ablation, as in `EvaluationResult`.
+    The arguments are those of `survey` and the `replacement` [n_guides, A]. Each ablation gets an equal share of the
+    cars of the env, in order. The result is the episodes of each ablation, as in `EvaluationResult`.
     """
     cars = env.batch_size.numel()
     if not removed or cars % len(removed):
         raise ValueError(f"{cars} cars cannot be divided among {len(removed)} ablations; give a multiple")
     share = cars // len(removed)
-    everywhere = -1
-    slot = torch.tensor([one.guide for one in removed], device=env.device).repeat_interleave(share)
-    where = torch.tensor([everywhere if one.section is None else one.section for one in removed], device=env.device)
-    where = where.repeat_interleave(share)
-    is_slot = slot.unsqueeze(-1) == torch.arange(len(replacement), device=env.device)
+    replaced = torch.zeros(len(removed), len(SECTIONS), len(replacement), dtype=torch.bool, device=env.device)
+    for index, (guide, where) in enumerate(removed):
+        replaced[index, slice(None) if where is None else where, guide] = True
+    replaced = replaced.repeat_interleave(share, 0)
 
     def remove(state: TensorDictBase) -> TensorDictBase:
         section = sections.section(state["info", "track"].squeeze(-1), state["info", "pose"][..., :2])
-        replaced = is_slot & ((where == everywhere) | (where == section)).unsqueeze(-1)
-        return state.set(ADVICE, torch.where(replaced.unsqueeze(-1), replacement, state[ADVICE]))
+        mask = replaced[torch.arange(cars, device=env.device), section].unsqueeze(-1)
+        return state.set(ADVICE, torch.where(mask, replacement, state[ADVICE]))
 
+    names = [track.name for track in sections.tracks]
     episodes = evaluate_policy(env, InterceptedPolicy(policy, remove), names=names, tick=tick).episodes
     return [episodes[start : start + share] for start in range(0, cars, share)]
 

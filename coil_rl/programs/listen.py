@@ -41,8 +41,9 @@ def listen(config: DictConfig) -> None:
     from tqdm import tqdm
 
     from coil_rl.files import write_text
-    from coil_rl.listening import TrackSections, ablations, drive_ablated, split_policy, survey
-    from coil_rl.listening.survey import measure_on_lines, table_along_track, table_by_section
+    from coil_rl.listening import survey as surveys
+    from coil_rl.listening.measures import split_policy
+    from coil_rl.listening.sections import TrackSections
     from coil_rl.programs.evaluate import restore
     from coil_rl.report import draw_listening_map, markdown_table, write_csv
     from coil_rl.train.build import build, build_env
@@ -57,7 +58,6 @@ def listen(config: DictConfig) -> None:
     except ValueError as error:
         raise UserError(f"the agent of run={config.run} does not use advice: {error}") from error
     tracks = build(run.track.test, "track.test")
-    names = [track.name for track in tracks]
     sections = TrackSections(tracks, turn_radius=config.turn_radius, approach=config.approach, device=config.device)
     cars = len(tracks) * run.evaluation.repeats
     folder.mkdir(parents=True, exist_ok=True)
@@ -65,13 +65,13 @@ def listen(config: DictConfig) -> None:
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
         env = build_env(run, {**run.evaluation.env, "num_cars": cars})
-        found = survey(env, agent, sections, donors=config.donors, seed=config.seed, names=names, tick=bar.update)
-        removed = ablations(len(found.guides))
+        found = surveys.survey(env, agent, sections, donors=config.donors, seed=config.seed, tick=bar.update)
+        removed = surveys.ablations(len(found.guides))
         bar.set_postfix_str("one guide removed")
         env = build_env(run, {**run.evaluation.env, "num_cars": cars * len(removed)})
         mean_advice = found.advice.mean(0)
-        episodes = drive_ablated(env, agent, sections, removed, mean_advice, names=names, tick=bar.update)
-    table = table_by_section(found, dict(zip(removed, episodes, strict=True)))
+        episodes = surveys.drive_ablated(env, agent, sections, removed, mean_advice, tick=bar.update)
+    table = surveys.table_by_section(found, dict(zip(removed, episodes, strict=True)))
     columns, notes = dict(COLUMNS), NOTES + CONTINUOUS_NOTE
     if np.isnan(found.measures["gradient"]).all():
         del columns["gradient"]
@@ -81,18 +81,17 @@ def listen(config: DictConfig) -> None:
     write_csv(table, folder / "listening_sections.csv")
     for measure, (name, title, label) in MAPS.items():
         if measure in columns:
-            lines, values = measure_on_lines(found, sections, measure, config.bin)
+            lines, values = surveys.measure_on_lines(found, sections, measure, config.bin)
             draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
-    write_csv(table_along_track(found, sections, config.bin), folder / "listening.csv")
-    print(f"{page}\n{_summary(run.label, table)}; see {folder}")
+    write_csv(surveys.table_along_track(found, sections, config.bin), folder / "listening.csv")
+    print(f"{page}\n\n{_summary(run.label, table)}; see {folder}")
 
 
 def _summary(label: str, table: list[dict[str, Any]]) -> str:
     """Return a sentence on the guide with the largest effect."""
-    everywhere, *_ = table
-    means = {row["guide"]: row["intervention"] for row in table if row["section"] == everywhere["section"]}
+    means = {row["guide"]: row["intervention"] for row in table if row["section"] == "everywhere"}
     best = max(means, key=lambda guide: means[guide])
-    rows = [row for row in table if row["guide"] == best and row["section"] != everywhere["section"]]
+    rows = [row for row in table if row["guide"] == best and row["section"] != "everywhere"]
     where = max(rows, key=lambda row: row["intervention"])
     others = ", ".join(f"{guide} moves it by {change:.4f}" for guide, change in means.items() if guide != best)
     return (

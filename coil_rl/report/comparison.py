@@ -95,10 +95,7 @@ class Comparison:
     def table(self, against: str | None = None, resamples: int = 2000, seed: int = 0) -> list[dict[str, Any]]:
         """Return one row per driver, guides first.
 
-        Args:
-            against: label of the agent for the column `improvement`, or "guide" for the guide of each agent.
-            resamples: of the bootstrap.
-            seed: of the bootstrap.
+        `improvement` is over the agent with the label `against`, or over the guide of each agent if it is "guide".
         """
         rows = []
         for group in (*self.guides, *self.agents):
@@ -214,24 +211,17 @@ def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
 
 @dataclass(frozen=True)
 class Paired:
-    """Difference between two drivers with the same seeds.
+    """Difference between two drivers with the same seeds: values with the ends of their 95 % intervals."""
 
-    Attributes:
-        seeds: number of common seeds.
-        difference: mean difference of a measure and its 95 % interval.
-        better: share of seeds and tracks with a higher value, ties counting half, and its 95 % interval.
-    """
-
-    seeds: int
-    difference: tuple[float, float, float]
-    better: tuple[float, float, float]
+    seeds: int  # number of common seeds
+    difference: tuple[float, float, float]  # mean difference of a measure
+    better: tuple[float, float, float]  # share of seeds and tracks with a higher value, ties counting half
 
 
 def paired(group: Group, other: Group, measure: str = "reward", resamples: int = 2000, seed: int = 0) -> Paired | None:
     """Compare two drivers seed by seed by one of MEASURES; a guide without random actions has one value for all seeds.
 
-    Returns:
-        None without common tracks and seeds, or if the measure has NaN.
+    The result is None without common tracks and seeds, or if the measure has NaN.
     """
     if group.tracks != other.tracks or (other.is_guide and other.seeds is not None):
         return None

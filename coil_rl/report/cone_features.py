@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -14,6 +13,7 @@ from coil_rl.report import style
 
 Array = NDArray[np.float64]
 
+FEATURES = ("width", "depth", "girth")
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
 
@@ -39,25 +39,20 @@ def draw_cone_features(
     path: str | os.PathLike[str],
     *,
     wrong: ArrayLike | None = None,
-    names: Sequence[str] = ("width", "depth", "girth"),
     title: str | None = None,
 ) -> None:
     """Draw clusters of LiDAR points by the two principal components of their features.
 
     Args:
-        features: [N, F], see `coil_rl.envs.robot.clusters`.
+        features: [N, 3], see `coil_rl.envs.robot.clusters`; an arrow shows the direction in which each grows.
         thick: [N], whether the cluster is a thick cone.
         path: output file.
         wrong: [N], whether the cluster is misclassified; it gets a ring.
-        names: of the F features; an arrow shows the direction in which each grows.
         title: above the plot; it should contain "simulated" for simulated scans.
     """
     xy, directions, share = principal_components(features)
     is_thick = np.asarray(thick, dtype=bool)
     is_wrong = np.zeros(len(xy), dtype=bool) if wrong is None else np.asarray(wrong, dtype=bool)
-    if is_thick.shape != xy.shape[:1] or is_wrong.shape != xy.shape[:1] or len(names) != len(directions):
-        given = f"{list(is_thick.shape)}, {list(is_wrong.shape)} and {len(names)} names"
-        raise ValueError(f"thick, wrong and names are {given} for {len(xy)} clusters of {len(directions)} features")
     kinds = (("thin (left)", ~is_thick, style.LEFT_CONE, "o"), ("thick (right)", is_thick, style.RIGHT_CONE, "s"))
     handles: list[Artist] = [
         Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"{name}, {int(rows.sum())} clusters")
@@ -76,7 +71,7 @@ def draw_cone_features(
         low, high = xy.min(axis=0), xy.max(axis=0)
         # The upper right corner has few clusters.
         start = (high[0] - ARROW_LENGTH, high[1] - ARROW_LENGTH / 2)
-        for name, direction in zip(names, directions, strict=True):
+        for name, direction in zip(FEATURES, directions, strict=True):
             tip = start + ARROW_LENGTH / 2 * direction
             axes.annotate("", tip, start, arrowprops={"arrowstyle": "->", "color": style.QUIET, "lw": 1.2})
             axes.annotate(name, tip, 3 * np.sign(direction), textcoords="offset points", color=style.QUIET, size=8)

@@ -47,10 +47,6 @@ def draw_learning_curves(
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
-
-    Example:
-        >>> rows = [{"frames": 1e5 * n, "train/return": 3.0 * n} for n in range(10)]
-        >>> draw_learning_curves({"COIL": [rows]}, "curve.png", guides={"guide": 20.0})  # doctest: +SKIP
     """
     if not any(len(seeds) for seeds in runs.values()):
         raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
@@ -86,7 +82,6 @@ def draw_curve_grid(
     path: str | os.PathLike[str],
     *,
     guides: Mapping[str, float] | None = None,
-    title: str | None = None,
 ) -> None:
     """Draw one small learning curve per label, at least one, with the other labels faint behind it.
 
@@ -106,7 +101,7 @@ def draw_curve_grid(
     if guides:
         handles.append(Line2D([], [], color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.0, label="its guide"))
     height = 0.35 + GRID_ROW_HEIGHT * rows
-    with style.picture(path, title, handles, height, add_header=True, h_pad=0.08) as figure:
+    with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
             for other, (other_frames, other_mean, _, _) in curves.items():
@@ -160,7 +155,7 @@ def draw_phases(
             measured_at = np.where(np.arange(len(frames)) == 0, 0.0, frames)
             top.plot(measured_at[measured], returns[measured], color=colour, **alone)
             middle.plot(frames, _column(rows, f"learner/moved_{name}"), color=colour, lw=1.4)
-        _draw_learning_rates(bottom, frames, rows, list(colours.values()))
+        _draw_rates(bottom, frames, rows, list(colours.values()))
         for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
             axes.set_ylabel(label)
             style.lighten(axes)
@@ -213,9 +208,7 @@ def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:
     return np.array([row.get(key, np.nan) for row in rows], dtype=np.float64)
 
 
-def _draw_learning_rates(
-    axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]
-) -> None:
+def _draw_rates(axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]) -> None:
     learner = _column(rows, "learner/guide")  # index of the guide that learns; len(colours) for all of them
     guide_rate = _column(rows, "learner/guide_learning_rate")
     rates = {AGENT: _column(rows, "learner/learning_rate")}

@@ -24,25 +24,15 @@ GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": (0, style.DASHES), "lw"
 
 @dataclass(frozen=True)
 class Interval:
-    """One row of the plot.
-
-    Attributes:
-        label: of the row.
-        value: position of the dot.
-        low: lower end of the bar; NaN for no bar.
-        high: upper end of the bar.
-        points: values of the single seeds.
-        guide: value of the guide of this driver, drawn as a dashed line.
-        hollow: draw a hollow dot, for a variant of the driver above.
-    """
+    """One row of the plot."""
 
     label: str
-    value: float
-    low: float = math.nan
+    value: float  # the dot
+    low: float = math.nan  # ends of the bar; NaN for no bar
     high: float = math.nan
-    points: Sequence[float] = ()
-    guide: float | None = None
-    hollow: bool = False
+    points: Sequence[float] = ()  # single seeds
+    guide: float | None = None  # value of the driver's guide, a dashed line
+    hollow: bool = False  # hollow dot, for a variant of the driver above
 
 
 def draw_intervals(

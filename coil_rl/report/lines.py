@@ -48,7 +48,6 @@ def draw_lines(
     path: str | os.PathLike[str],
     *,
     crashed: Mapping[str, Sequence[bool]] | None = None,
-    title: str | None = None,
 ) -> None:
     """Draw the lines of several drivers on several tracks, all at one scale.
 
@@ -58,12 +57,11 @@ def draw_lines(
             Drivers whose name starts with "guide" are drawn in grey dashes; the last driver is on top.
         path: output file, 8 inches wide.
         crashed: per driver, whether each of the N lines ended in a crash; a cross marks it.
-        title: above the map.
     """
     driven, ended = _check_lines(tracks, lines, crashed)
     strokes = style.strokes(driven)
     handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label) for label, s in strokes.items()]
-    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)], title=title)
+    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)])
     for z, (label, stroke) in enumerate(strokes.items()):
         for index, (track, line) in enumerate(zip(tracks, driven[label], strict=True)):
             offset = track_map.offsets[index]
@@ -86,13 +84,8 @@ def animate_lines(
 ) -> None:
     """Write a GIF, 800 px wide, in which all drivers drive on all tracks at the same time; it repeats.
 
-    Args:
-        tracks: as in `draw_lines`.
-        lines: as in `draw_lines`, one row per step.
-        path: output file.
-        rate: steps per second of the lines.
-        crashed: as in `draw_lines`.
-        seconds: maximum duration; lines are never shown slower than they were driven.
+    The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the maximum duration in
+    `seconds`; lines are never shown slower than they were driven.
     """
     driven, ended = _check_lines(tracks, lines, crashed)
     colours = {label: stroke.colour for label, stroke in style.strokes(driven).items()}

@@ -87,15 +87,10 @@ def picture(
     add_header: bool = False,
     h_pad: float = 0.1,
 ) -> Iterator[Figure]:
-    """Yield an empty figure, 8 inches wide, with title and legend; write it when the block ends.
+    """Yield an empty figure with title and legend; write it when the block ends.
 
-    Args:
-        path: output file; its suffix decides the format.
-        title: above the legend.
-        handles: of the legend.
-        height: in inches.
-        add_header: add the height of title and legend to `height`.
-        h_pad: vertical padding of the layout in inches.
+    It is 8 inches wide and `height` inches high, with `add_header` without title and legend. The suffix of the path
+    decides the format. `h_pad` is the vertical padding of the layout in inches.
     """
     with mpl.rc_context(LETTERS):
         figure = Figure(figsize=(WIDTH, height), dpi=RESOLUTION)
@@ -123,11 +118,7 @@ def lighten(axes: Axes, grid: str = "y") -> None:
 
 
 def draw_header(figure: Figure, handles: Sequence[Artist], title: str | None) -> float:
-    """Draw title and legend in the upper left corner; the legend takes as few lines as fit the width.
-
-    Returns:
-        Height of the header in inches; it does not depend on the height of the figure.
-    """
+    """Draw title and legend, in as few lines as fit, in the upper left corner; return their height in inches."""
     corner = figure.dpi_scale_trans + ScaledTranslation(0, 1, BboxTransformTo(figure.bbox))
     height = 0.11
     if title:

@@ -43,7 +43,7 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, t
     specs = [spec for _, spec in columns.values()]
     return tabulate.tabulate(
         [[_format(value, spec) for value, spec in zip(row, specs, strict=True)] for row in values],
-        headers=[heading for heading, _ in columns.values()],
+        headers=[_format(heading, "") for heading, _ in columns.values()],
         tablefmt="pipe",
         colalign=["right" if right else "left" for right in numeric] or None,
         disable_numparse=True,

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones
 
 from coil_rl.learners import PPO
-from coil_rl.listening import InterceptedPolicy, agreement, gradient, intervention, split_policy
+from coil_rl.listening.measures import InterceptedPolicy, agreement, gradient, intervention, split_policy
 
 
 def random_states(count=500, guides=2, size=1):

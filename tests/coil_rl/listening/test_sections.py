@@ -6,8 +6,7 @@ import torch
 from ovals import circle, oval_line
 
 from coil_rl.envs import Track, shipped_tracks
-from coil_rl.listening import SECTIONS, TrackSections
-from coil_rl.listening.sections import classify, curvature, smooth_line
+from coil_rl.listening.sections import SECTIONS, TrackSections, classify, curvature, smooth_line
 
 
 def names(line, **lengths):

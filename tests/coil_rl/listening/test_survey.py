@@ -6,12 +6,19 @@ from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide, SplineGuide
-from coil_rl.listening import SECTIONS, Ablation, TrackSections, ablations, drive_ablated, survey
-from coil_rl.listening.survey import measure_on_lines, table_along_track, table_by_section
+from coil_rl.listening.sections import SECTIONS, TrackSections
+from coil_rl.listening.survey import (
+    Ablation,
+    ablations,
+    drive_ablated,
+    measure_on_lines,
+    survey,
+    table_along_track,
+    table_by_section,
+)
 from coil_rl.transforms import GuideActions
 
 TRACKS = [oval_track("to the left"), oval_track("to the right", clockwise=True)]
-NAMES = [track.name for track in TRACKS]
 TRACK_SECTIONS = TrackSections(TRACKS)
 FOLLOW = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
 
@@ -23,14 +30,14 @@ def make_env(cars, seconds=60):
 
 @pytest.fixture(scope="module")
 def found():
-    return survey(make_env(4), FOLLOW, TRACK_SECTIONS, donors=4, names=NAMES)
+    return survey(make_env(4), FOLLOW, TRACK_SECTIONS, donors=4)
 
 
 @pytest.fixture(scope="module")
 def rows(found):
     removed = ablations(2)
     env = make_env(2 * len(removed))
-    episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, removed, found.advice.mean(0), names=NAMES)
+    episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, removed, found.advice.mean(0))
     return table_by_section(found, dict(zip(removed, episodes, strict=True)))
 
 
@@ -83,7 +90,7 @@ def test_advice_is_replaced_in_its_section_only():
     env = ConeTrackEnv(TRACKS, 4, rate=6, laps=1, time_limit=15, assignment="cyclic")
     env = TransformedEnv(env, GuideActions({"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()}))
     left, replacement = SECTIONS.index("left"), torch.tensor([[0.25], [0.0]])
-    drive_ablated(env, agent, TRACK_SECTIONS, [Ablation(0, left), Ablation(0)], replacement, names=NAMES)
+    drive_ablated(env, agent, TRACK_SECTIONS, [Ablation(0, left), Ablation(0)], replacement)
     section, advice = (torch.stack(column) for column in zip(*history, strict=True))
     assert ((advice[:, :2] == 0.25) == (section[:, :2] == left)).all()
     assert (section[:, :2] == left).any()

@@ -1,5 +1,4 @@
 import numpy as np
-import pytest
 from PIL import Image
 
 from coil_rl.report import style
@@ -41,9 +40,3 @@ def test_both_kinds_have_the_colours_of_their_cones_and_errors_a_ring(tmp_path):
     assert min(count(both, style.LEFT_CONE), count(both, style.RIGHT_CONE)) > 2000
     assert count(thin, style.RIGHT_CONE) < 1000  # of the legend
     assert count(ringed, style.INK) > count(both, style.INK) + 1000
-
-
-def test_numbers_of_clusters_must_match(tmp_path):
-    features, thick = clusters()
-    with pytest.raises(ValueError, match="for 300 clusters of 3 features"):
-        draw_cone_features(features, thick[1:], tmp_path / "x.png")

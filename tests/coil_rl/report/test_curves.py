@@ -51,7 +51,7 @@ def test_learning_curves_are_drawn_for_any_number_of_runs_and_values(runs, tmp_p
 @pytest.mark.parametrize(("labels", "rows"), [(1, 1), (6, 2), (7, 3)])
 def test_grid_has_one_plot_per_label(labels, rows, tmp_path):
     runs = {f"label {k}": [run(k), run(k + 10)] for k in range(labels)} | {"label 0": [[]]}
-    draw_curve_grid(runs, tmp_path / "grid.png", guides={"label 0": 3.0}, title="Learning")
+    draw_curve_grid(runs, tmp_path / "grid.png", guides={"label 0": 3.0})
     with Image.open(tmp_path / "grid.png") as image:
         assert image.width == 1600
         assert 1.5 * rows < image.height / 200 < 1.6 * rows + 1.2

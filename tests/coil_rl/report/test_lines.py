@@ -33,7 +33,7 @@ def count(image, colour):
 
 
 def test_figure_shows_tracks_cones_and_drivers(tmp_path):
-    draw_lines(TRACKS, LINES, tmp_path / "lines.png", title="Two laps")
+    draw_lines(TRACKS, LINES, tmp_path / "lines.png")
     image = pixels(tmp_path / "lines.png")
     assert image.shape[1] == style.WIDTH * style.RESOLUTION
     for colour in (style.ASPHALT, style.LEFT_CONE, style.RIGHT_CONE, style.GUIDES[0], style.AGENTS[0]):
@@ -106,7 +106,7 @@ def test_short_animation_has_the_speed_of_the_drive(tmp_path):
 
 def test_driver_outside_of_the_map_is_no_error(tmp_path):
     away = np.array([8.0, 0.0]) + np.outer(np.arange(100), [1e4, -1e4])
-    draw_lines(TRACKS[:1], {"agent $\\frac$": [away]}, tmp_path / "away.png", title="100 $ and $x_")
+    draw_lines(TRACKS[:1], {"agent $\\frac$": [away]}, tmp_path / "away.png")
     animate_lines(TRACKS[:1], {"agent": [away]}, tmp_path / "away.gif", rate=24, seconds=1)
     assert pixels(tmp_path / "away.gif").shape[1] == 800
 
