@@ -60,10 +60,10 @@ def survey(
     history: list[TensorDictBase] = []
 
     def record(state: TensorDictBase) -> TensorDictBase:
-        kept = state.select(*recorder.acting.in_keys)
-        kept["track"] = state["info", "track"].squeeze(-1)
-        kept["point"] = sections.nearest(kept["track"], state["info", "pose"][..., :2])
-        history.append(kept)
+        recorded = state.select(*recorder.acting.in_keys)
+        recorded["track"] = state["info", "track"].squeeze(-1)
+        recorded["point"] = sections.nearest(recorded["track"], state["info", "pose"][..., :2])
+        history.append(recorded)
         return state
 
     recorder = InterceptedPolicy(policy, record)
@@ -145,29 +145,29 @@ def drive_ablated(
     return [episodes[start : start + share] for start in range(0, cars, share)]
 
 
-def table_by_section(found: Survey, ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+def table_by_section(data: Survey, ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
     """Return one row per guide everywhere and in each section: means over states, and the effect of its removal.
 
     Returns:
         Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`, `gradient`, and, with the
         guide removed there, `lost` (return) and `completed` (share). Sections without a state are left out.
     """
-    intact = _means(found.result.episodes)
+    intact = _means(data.result.episodes)
     rows = []
     for (slot, section), episodes in ablated.items():
-        states = np.ones(len(found.section), dtype=bool) if section is None else found.section == section
+        states = np.ones(len(data.section), dtype=bool) if section is None else data.section == section
         if states.any():
             without = _means(episodes)
             rows.append(
-                {"guide": found.guides[slot], "section": EVERYWHERE if section is None else SECTIONS[section]}
+                {"guide": data.guides[slot], "section": EVERYWHERE if section is None else SECTIONS[section]}
                 | {"share": float(states.mean())}
-                | {name: float(values[states, slot].mean()) for name, values in found.measures.items()}
+                | {name: float(values[states, slot].mean()) for name, values in data.measures.items()}
                 | {"lost": intact["reward"] - without["reward"], "completed": without["completed"]}
             )
     return rows
 
 
-def table_along_track(found: Survey, sections: TrackSections, bin_length: float = 1.0) -> list[dict[str, Any]]:
+def table_along_track(data: Survey, sections: TrackSections, bin_length: float = 1.0) -> list[dict[str, Any]]:
     """Return one row per guide and bin of each track with a visited state.
 
     Bins are `bin_length` m of the middle line, rounded to a whole number of bins.
@@ -178,15 +178,15 @@ def table_along_track(found: Survey, sections: TrackSections, bin_length: float 
     """
     rows = []
     for index, track in enumerate(sections.tracks):
-        line, on_track = sections.lines[index], found.track == index
+        line, on_track = sections.lines[index], data.track == index
         bins = _bins(line, bin_length)
         _, first, lengths = np.unique(bins, return_index=True, return_counts=True)
         middle = first + lengths // 2
         step, bend = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1), curvature(line)
-        bin_of_state = bins[found.point[on_track]]
+        bin_of_state = bins[data.point[on_track]]
         states = np.bincount(bin_of_state, minlength=len(first))
-        for slot, guide in enumerate(found.guides):
-            sums = {name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in found.measures.items()}
+        for slot, guide in enumerate(data.guides):
+            sums = {name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in data.measures.items()}
             for k in np.flatnonzero(states).tolist():
                 x, y = line[middle[k]].tolist()
                 rows.append({
@@ -199,21 +199,21 @@ def table_along_track(found: Survey, sections: TrackSections, bin_length: float 
 
 
 def measure_on_lines(
-    found: Survey, sections: TrackSections, measure: str, bin_length: float = 1.0
+    data: Survey, sections: TrackSections, measure: str, bin_length: float = 1.0
 ) -> tuple[list[Array], dict[str, list[Array]]]:
     """Return the line [T, 2] m of the last car of each track, and by guide the measure [T] at its points, by bins."""
-    table = table_along_track(found, sections, bin_length)
+    table = table_along_track(data, sections, bin_length)
     means = {(row["track"], row["guide"], row["bin"]): row[measure] for row in table}
     lines: list[Array] = []
-    values: dict[str, list[Array]] = {guide: [] for guide in found.guides}
+    values: dict[str, list[Array]] = {guide: [] for guide in data.guides}
     for middle_line, track in zip(sections.lines, sections.tracks, strict=True):
-        cars = [car for car, episode in enumerate(found.result.episodes) if episode["track"] == track.name]
-        line = found.result.lines[cars[-1]]
+        cars = [car for car, episode in enumerate(data.result.episodes) if episode["track"] == track.name]
+        line = data.result.lines[cars[-1]]
         line = line[: max(1, len(line) - 1)]  # the last point is the position after the last measured state
         nearest = ((line[:, None] - middle_line) ** 2).sum(-1).argmin(1)
         bins = _bins(middle_line, bin_length)[nearest].tolist()
         lines.append(line)
-        for guide in found.guides:
+        for guide in data.guides:
             values[guide].append(np.array([means.get((track.name, guide, k), np.nan) for k in bins]))
     return lines, values
 

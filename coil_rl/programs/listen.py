@@ -65,15 +65,15 @@ def listen(config: DictConfig) -> None:
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
         env = build_env(run, {**run.evaluation.env, "num_cars": cars})
-        found = surveys.survey(env, agent, sections, donors=config.donors, seed=config.seed, tick=bar.update)
-        removed = surveys.ablations(len(found.guides))
+        data = surveys.survey(env, agent, sections, donors=config.donors, seed=config.seed, tick=bar.update)
+        removed = surveys.ablations(len(data.guides))
         bar.set_postfix_str("one guide removed")
         env = build_env(run, {**run.evaluation.env, "num_cars": cars * len(removed)})
-        mean_advice = found.advice.mean(0)
+        mean_advice = data.advice.mean(0)
         episodes = surveys.drive_ablated(env, agent, sections, removed, mean_advice, tick=bar.update)
-    table = surveys.table_by_section(found, dict(zip(removed, episodes, strict=True)))
+    table = surveys.table_by_section(data, dict(zip(removed, episodes, strict=True)))
     columns, notes = dict(COLUMNS), NOTES + CONTINUOUS_NOTE
-    if np.isnan(found.measures["gradient"]).all():
+    if np.isnan(data.measures["gradient"]).all():
         del columns["gradient"]
         notes = NOTES + DISCRETE_NOTE
     page = f"{markdown_table(table, columns)}\n{notes}"
@@ -81,9 +81,9 @@ def listen(config: DictConfig) -> None:
     write_csv(table, folder / "listening_sections.csv")
     for measure, (name, title, label) in MAPS.items():
         if measure in columns:
-            lines, values = surveys.measure_on_lines(found, sections, measure, config.bin)
+            lines, values = surveys.measure_on_lines(data, sections, measure, config.bin)
             draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
-    write_csv(surveys.table_along_track(found, sections, config.bin), folder / "listening.csv")
+    write_csv(surveys.table_along_track(data, sections, config.bin), folder / "listening.csv")
     print(f"{page}\n\n{_summary(run.label, table)}; see {folder}")
 
 

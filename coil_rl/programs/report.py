@@ -40,14 +40,14 @@ def report(config: DictConfig) -> None:
         )
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
-    tables = {actions: found.table(against, config.resamples, config.seed) for actions, found in compared.items()}
+    tables = {kind: compared[kind].table(against, config.resamples, config.seed) for kind in compared}
     parts = [page.section(f"{kind.capitalize()} actions", compared[kind], tables[kind], against) for kind in compared]
     parts += [*page.training(finished), *page.guide_training(finished)]
     text = "\n\n".join([*parts, page.notes(config.resamples, against), page.progress(len(finished), len(runs))])
 
     folder = folders[0]
     write_text(folder / "report.md", text)
-    tracks = {actions: found.track_table() for actions, found in compared.items()}
+    tracks = {actions: comparison.track_table() for actions, comparison in compared.items()}
     for name, by_actions in {"report.csv": tables, "report_tracks.csv": tracks}.items():
         rows = [{"actions": actions} | row for actions, table in by_actions.items() for row in table]
         write_csv(rows, folder / name)

@@ -105,7 +105,7 @@ def animate_lines(
     # Drawing the tracks in every frame would take three times as long.
     background = canvas.copy_from_bbox(figure.bbox)
     palette = _palette(list(colours.values()))
-    duration = max((len(line) - 1 for line, *_ in cars), default=0) / rate
+    duration = (max([1, *(len(line) for line, *_ in cars)]) - 1) / rate
     speed = max(1.0, duration / seconds)
     times = np.linspace(0, duration, 1 + math.ceil(duration / speed * FPS)).tolist()
 
