@@ -1,8 +1,18 @@
-"""Oval tracks of two straights and two half turns with known geometry."""
+"""Circular and oval tracks of known geometry."""
 
 import numpy as np
 
 from coil_rl.envs import Track
+
+
+def circle(radius, points=60, clockwise=False):
+    angle = np.linspace(0, 2 * np.pi, points, endpoint=False) * (-1 if clockwise else 1)
+    return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def ring_track(name, radius):
+    """A circular track, 2 m wide, anticlockwise."""
+    return Track(name, left=circle(radius - 1, 24), right=circle(radius + 1, 28))
 
 
 def oval_line(length=40.0, radius=6.0, spacing=0.1):

@@ -1,7 +1,8 @@
-"""How much an agent listens to each of its guides, in given states.
+"""Measures of how much an agent uses the advice of each guide, and policies with changed advice.
 
-Agreement alone cannot tell listening from coincidence: an agent that sees the road and one that copies a guide who sees
-it do the same. So the advice is changed and the agent asked again. All actions are the deterministic ones.
+Agreement alone cannot separate use of advice from coincidence: an agent that sees the road and an agent that copies a
+guide who sees the road act alike. `intervention` and `gradient` therefore change the advice. All actions are
+deterministic.
 """
 
 from __future__ import annotations
@@ -10,78 +11,63 @@ from collections.abc import Callable
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.listening.parts import ADVICE
+ADVICE = "guide_action"
 
 Act = Callable[[TensorDictBase], Tensor]
-"""From states [N] with `guide_action` to actions [N, A]; what it writes into the states is thrown away."""
+"""Maps states [N] with `guide_action` to actions [N, A]; it may write to the states, which are copies."""
 
 
 @torch.no_grad()
 def agreement(act: Act, states: TensorDictBase) -> Tensor:
-    """How far the action is from each guide's, |a - g_k|.
+    """Return the distance between the action and the advice of each guide, |a - g_k|: [N, n_guides] in action units.
 
-    Args:
-        act: the agent.
-        states: [N], with `guide_action` [N, n_guides, A].
-
-    Returns:
-        [N, n_guides] in action units; 0 is full agreement.
+    `states` are [N], with `guide_action` [N, n_guides, A].
     """
-    return (_asked(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
+    return (_act(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
 
 
 @torch.no_grad()
 def intervention(
     act: Act, states: TensorDictBase, donors: int = 16, generator: torch.Generator | None = None
 ) -> Tensor:
-    """How far the action moves when one guide's advice is replaced by what it said elsewhere.
+    """Return the mean change of the action when one guide's advice is replaced by its advice in another state.
 
-    The replacement is drawn from what the same guide said in all the states: likely advice that says nothing about this
-    one, all other advice staying as it is (permutation importance, Breiman 2001, of the action instead of a loss).
-    Deterministic cars on one track are at the same place at the same moment, so another car of that moment would not
-    do; another state of the same drives has the distribution that it would have if they were spread out.
+    Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a likely advice without
+    information on this state; the advice of other guides stays. Donors come from all states, not from other cars at
+    the same time, because deterministic cars on one track are in the same state at the same time.
 
     Args:
         act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
-        donors: replacements of each piece of advice, over which the mean is taken.
-        generator: of the draws, on the CPU.
+        donors: number of replacements per state and guide, at least 1.
+        generator: of the donors, on the CPU.
 
     Returns:
-        [N, n_guides] in action units; 0 where a guide is not listened to.
-
-    Raises:
-        ValueError: if there are no donors.
+        [N, n_guides] in action units; 0 if the advice has no influence.
     """
-    if donors < 1:
-        raise ValueError(f"donors={donors} must be at least 1")
     advice = states[ADVICE]
-    before, moved = _asked(act, states, advice), torch.zeros_like(advice[..., 0])
+    action, change = _act(act, states, advice), torch.zeros_like(advice[..., 0])
     for _ in range(donors):
         other = advice[torch.randint(len(advice), (len(advice),), generator=generator).to(advice.device)]
         for guide in range(advice.shape[-2]):
             replaced = advice.clone()
             replaced[:, guide] = other[:, guide]
-            moved[:, guide] += (_asked(act, states, replaced) - before).norm(dim=-1)
-    return moved / donors
+            change[:, guide] += (_act(act, states, replaced) - action).norm(dim=-1)
+    return change / donors
 
 
 def gradient(act: Act, states: TensorDictBase) -> Tensor:
-    """How the action follows small changes of each guide's advice: the Frobenius norm of da/dg_k.
+    """Return the Frobenius norm of da/dg_k, [N, n_guides]: the effect of small changes of each guide's advice.
 
-    Args:
-        act: the agent.
-        states: [N], with `guide_action` [N, n_guides, A].
-
-    Returns:
-        [N, n_guides]; 1 where the action is the guide's, NaN if nothing can be differentiated, as in a choice.
+    It is 1 if the action is the advice, and NaN without a derivative, as for discrete actions.
     """
     with torch.enable_grad():
         advice = states[ADVICE].detach().clone().requires_grad_()
-        action = _asked(act, states, advice)
+        action = _act(act, states, advice)
         squares = torch.zeros_like(advice[..., 0])
         if not action.requires_grad:
             return squares.fill_(torch.nan)
@@ -92,6 +78,38 @@ def gradient(act: Act, states: TensorDictBase) -> Tensor:
     return squares.detach().sqrt()
 
 
-def _asked(act: Act, states: TensorDictBase, advice: Tensor) -> Tensor:
+def _act(act: Act, states: TensorDictBase, advice: Tensor) -> Tensor:
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         return act(states.copy().set(ADVICE, advice))
+
+
+def split_policy(policy: TensorDictModuleBase) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
+    """Split a policy into its first module if that writes `guide_action`, else None, and modules that read it.
+
+    Raises:
+        ValueError: if the policy does not read advice.
+    """
+    advising, acting = None, policy
+    if isinstance(policy, TensorDictSequential) and ADVICE in policy.module[0].out_keys:
+        sequential = ProbabilisticTensorDictSequential if hasattr(policy, "get_dist") else TensorDictSequential
+        advising, acting = policy.module[0], sequential(*policy.module[1:])
+    if ADVICE not in acting.in_keys:
+        raise ValueError(f"the policy does not read {ADVICE}; it reads {', '.join(map(str, acting.in_keys))}")
+    return advising, acting
+
+
+class InterceptedPolicy(TensorDictModuleBase):
+    """A policy whose input, with `guide_action` [B, n_guides, A], is changed between the advice and the action."""
+
+    def __init__(self, policy: TensorDictModuleBase, change: Callable[[TensorDictBase], TensorDictBase]) -> None:
+        self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
+        super().__init__()
+        self.advising, self.acting = split_policy(policy)
+        self.change = change
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action; the changed input is not written."""
+        if self.advising is not None:
+            tensordict = self.advising(tensordict)
+        acted = self.acting(self.change(tensordict.copy()))
+        return tensordict.update(acted.select(*self.acting.out_keys))

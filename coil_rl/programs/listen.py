@@ -1,27 +1,18 @@
-"""`coil-listen`: which guide a trained agent listens to, and where on the track."""
+"""`coil-listen`: how much a trained agent uses the advice of each guide, and where on the track."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-import torch
 from omegaconf import DictConfig
-from tqdm import tqdm
 
 from coil_rl.errors import UserError
-from coil_rl.files import write_text
-from coil_rl.listening import Places, ablations, drive_ablated, split, survey
-from coil_rl.listening.tables import EVERYWHERE, along, along_lines, by_place
 from coil_rl.programs import app
-from coil_rl.programs.evaluate import restore
-from coil_rl.report import draw_listening_map, markdown_table, write_csv
-from coil_rl.train.build import build, build_env
-from coil_rl.train.check import check as check_common
 
 COLUMNS = {
     "guide": ("guide", ""),
-    "place": ("place", ""),
+    "section": ("section", ""),
     "share": ("of the way", ".0%"),
     "agreement": ("|a - g|", ".3f"),
     "intervention": ("intervention", ".4f"),
@@ -30,11 +21,11 @@ COLUMNS = {
     "completed": ("completed", ".0%"),
 }
 NOTES = """
-Means over the states of deterministic drives on the test tracks, in action units. intervention: how far the action
-moves when the guide's advice is replaced by what it said elsewhere. return lost and completed: with this guide silent
-there, saying always its mean. """
-OF_NUMBERS = "gradient: |da/dg|."
-OF_CHOICES = "The agent chooses: |a - g| and intervention are 0\nfor the same choice and 1.414 for any other."
+Means over the states of deterministic episodes on the test tracks, in action units. intervention: change of the action
+when the guide's advice is replaced by its advice in another state. return lost and completed: with the guide's advice
+replaced by its mean in that section. """
+CONTINUOUS_NOTE = "gradient: |da/dg|."
+DISCRETE_NOTE = "Actions are discrete: |a - g| and intervention are 0\nfor the same action and 1.414 for any other."
 MAPS = {
     "intervention": ("listening.png", "Where the agent listens", "action moved by other advice"),
     "agreement": ("listening_agreement.png", "Where the agent does otherwise", "|action - advice|"),
@@ -44,68 +35,75 @@ LIMITS = {"donors": (1, 10_000), "turn_radius": (0.5, 1000.0), "approach": (0.1,
 
 
 def listen(config: DictConfig) -> None:
-    """Drive the run's agent, measure, and write the table, the numbers and the maps; `listening.csv` comes last."""
+    """Evaluate the agent of a run, measure, and write tables and maps; `listening.csv` is the last file."""
+    import numpy as np
+    import torch
+    from tqdm import tqdm
+
+    from coil_rl.files import write_text
+    from coil_rl.listening import survey as surveys
+    from coil_rl.listening.measures import split_policy
+    from coil_rl.listening.sections import TrackSections
+    from coil_rl.programs.evaluate import restore
+    from coil_rl.report import draw_listening_map, markdown_table, write_csv
+    from coil_rl.train.build import build, build_env
+
     torch.set_num_threads(config.threads)
-    folder, asked = Path(config.run_dir), config
-    config, agent = restore(Path(asked.run), asked)
+    folder = Path(config.run_dir)
+    run, agent = restore(Path(config.run), config)
     if agent is None:
-        raise UserError(f"run={asked.run} has no agent: its guide drives alone; give a run that sees advice")
+        raise UserError(f"run={config.run} has no agent, only a guide; give a run of an agent that observes advice")
     try:
-        split(agent)
+        split_policy(agent)
     except ValueError as error:
-        raise UserError(f"the agent of run={asked.run} has nobody to listen to: {error}") from error
-    tracks = build(config.track.test, "track.test")
-    places = Places(tracks, turn_radius=asked.turn_radius, approach=asked.approach, device=config.device)
-    names = [track.name for track in tracks]
-    cars = len(tracks) * config.evaluation.repeats
+        raise UserError(f"the agent of run={config.run} does not use advice: {error}") from error
+    tracks = build(run.track.test, "track.test")
+    sections = TrackSections(tracks, turn_radius=config.turn_radius, approach=config.approach, device=config.device)
+    cars = len(tracks) * run.evaluation.repeats
     folder.mkdir(parents=True, exist_ok=True)
-    # Guides that draw from the global generator draw the same again.
-    torch.manual_seed(asked.seed)
+    torch.manual_seed(config.seed)  # for guides with random actions
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
-        env = build_env(config, {**config.evaluation.env, "num_cars": cars})
-        found = survey(env, agent, places, donors=asked.donors, seed=asked.seed, names=names, tick=bar.update)
-        removed = ablations(len(found.guides))
-        bar.set_postfix_str("one guide less")
-        env = build_env(config, {**config.evaluation.env, "num_cars": cars * len(removed)})
-        silence = found.advice.mean(0)
-        episodes = drive_ablated(env, agent, places, removed, silence, names=names, tick=bar.update)
-    ablated = dict(zip(removed, episodes, strict=True))
-    table = by_place(found, places, ablated)
-    chooses = bool(found.measures["gradient"].isnan().all())
-    columns = {key: column for key, column in COLUMNS.items() if not (chooses and key == "gradient")}
-    notes = NOTES + (OF_CHOICES if chooses else OF_NUMBERS)
-    write_text(folder / "listening.md", f"{markdown_table(table, columns)}\n{notes}")
-    write_csv(table, folder / "listening_places.csv")
+        env = build_env(run, {**run.evaluation.env, "num_cars": cars})
+        data = surveys.survey(env, agent, sections, donors=config.donors, seed=config.seed, tick=bar.update)
+        removed = surveys.ablations(len(data.guides))
+        bar.set_postfix_str("one guide removed")
+        env = build_env(run, {**run.evaluation.env, "num_cars": cars * len(removed)})
+        mean_advice = data.advice.mean(0)
+        episodes = surveys.drive_ablated(env, agent, sections, removed, mean_advice, tick=bar.update)
+    table = surveys.table_by_section(data, dict(zip(removed, episodes, strict=True)))
+    columns, notes = dict(COLUMNS), NOTES + CONTINUOUS_NOTE
+    if np.isnan(data.measures["gradient"]).all():
+        del columns["gradient"]
+        notes = NOTES + DISCRETE_NOTE
+    page = f"{markdown_table(table, columns)}\n{notes}"
+    write_text(folder / "listening.md", page)
+    write_csv(table, folder / "listening_sections.csv")
     for measure, (name, title, label) in MAPS.items():
-        if measure not in columns:
-            continue
-        lines, values = along_lines(found, places, measure, asked.bin)
-        draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
-    write_csv(along(found, places, asked.bin), folder / "listening.csv")
-    print((folder / "listening.md").read_text(encoding="utf-8"))
-    print(f"{_outcome(config.label, table)}; see {folder}")
+        if measure in columns:
+            lines, values = surveys.measure_on_lines(data, sections, measure, config.bin)
+            draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
+    write_csv(surveys.table_along_track(data, sections, config.bin), folder / "listening.csv")
+    print(f"{page}\n\n{_summary(run.label, table)}; see {folder}")
 
 
-def _outcome(label: str, table: list[dict[str, Any]]) -> str:
-    """Whom the agent listens to most, and where."""
-    everywhere = {row["guide"]: row["intervention"] for row in table if row["place"] == EVERYWHERE}
-    most = max(everywhere, key=lambda guide: everywhere[guide])
-    somewhere = [row for row in table if row["guide"] == most and row["place"] != EVERYWHERE]
-    where = max(somewhere, key=lambda row: row["intervention"])
-    others = ", ".join(f"{guide} moves it by {moved:.4f}" for guide, moved in everywhere.items() if guide != most)
+def _summary(label: str, table: list[dict[str, Any]]) -> str:
+    """Return a sentence on the guide with the largest effect."""
+    means = {row["guide"]: row["intervention"] for row in table if row["section"] == "everywhere"}
+    best = max(means, key=lambda guide: means[guide])
+    rows = [row for row in table if row["guide"] == best and row["section"] != "everywhere"]
+    where = max(rows, key=lambda row: row["intervention"])
+    others = ", ".join(f"{guide} moves it by {change:.4f}" for guide, change in means.items() if guide != best)
     return (
-        f"{label} listens most to {most}, which moves its action by {everywhere[most]:.4f}, "
-        f"most of all at {where['place']} ({where['intervention']:.4f}){f'; {others}' if others else ''}"
+        f"{label} listens most to {best}, which moves its action by {means[best]:.4f}, "
+        f"most of all at {where['section']} ({where['intervention']:.4f}){f'; {others}' if others else ''}"
     )
 
 
 def check(config: DictConfig) -> None:
-    """Refuse a configuration with which nothing can be measured.
+    """Raise UserError, one sentence, for an invalid configuration."""
+    from coil_rl.train.check import check as check_common
 
-    Raises:
-        UserError: in one sentence, what is wrong.
-    """
     for key, (low, high) in LIMITS.items():
         if not low <= config[key] <= high:
             raise UserError(f"{key}={config[key]} must be between {low} and {high}")
@@ -115,7 +113,7 @@ def check(config: DictConfig) -> None:
 
 
 def main() -> None:
-    """Entry point."""
+    """Run the program."""
     app.run(listen, "listen", check)
 
 

@@ -1,11 +1,8 @@
-"""Tables and pictures from finished runs."""
+"""Tables and figures of finished runs."""
 
-from coil_rl.report.curve import draw_learning_curves
-from coil_rl.report.curve_grid import draw_curve_grid
+from coil_rl.report.curves import draw_curve_grid, draw_learning_curves, draw_phases
 from coil_rl.report.intervals import Interval, draw_intervals
-from coil_rl.report.lines import animate_lines, draw_lines
-from coil_rl.report.listening_map import draw_listening_map
-from coil_rl.report.phases import draw_phases
+from coil_rl.report.lines import animate_lines, draw_lines, draw_listening_map
 from coil_rl.report.table import markdown_table, write_csv
 
 __all__ = [

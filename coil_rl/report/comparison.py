@@ -1,4 +1,4 @@
-"""Compares drivers over their seeds: agents by the label of their runs, and the guides beside them."""
+"""Comparison of drivers over seeds: agents grouped by label, and their guides."""
 
 from __future__ import annotations
 
@@ -8,101 +8,94 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
-from coil_rl.report.runs import GUIDE, MEASURES, PER_STEP, Drive, Run
-from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap
+from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, PER_STEP, Run
+from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap, wins
 
 Array = NDArray[np.float64]
 
-NAMED = 2  # labels in the name of a guide that several of them have
+LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Group:
-    """All drives of one driver.
+    """Evaluations of one driver over seeds.
 
     Attributes:
-        name: the label, or what the guide is called and, where several are called so, whose.
-        advice: what was done to the advice; empty if nothing was.
-        tracks: their names.
-        values: [seeds, tracks, MEASURES and tasks].
-        tasks: their names; none where the env has none.
-        is_guide: whether this is a guide.
-        guide: the drives of the best guide beside which an agent drove, if one did.
-        needs_guide: whether it needs the guide when it drives; None where that is no question.
-        seed_numbers: of the seeds, in their order; none for a guide.
+        name: display name: the label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if
+            several guides share it.
+        advice: modification of the advice; empty for none.
+        table: indexed by (seed, track); for a guide the seeds number its different evaluations.
+        is_guide: whether the driver is a guide.
+        guide: the best guide of an agent.
+        needs_guide: whether the agent needs the guide during evaluation; None if that does not apply.
     """
 
     name: str
     advice: str
-    tracks: tuple[str, ...]
-    values: Array
-    tasks: tuple[str, ...] = ()
+    table: pd.DataFrame
     is_guide: bool = False
     guide: Group | None = None
     needs_guide: bool | None = None
-    seed_numbers: tuple[int, ...] = ()
 
     @property
     def title(self) -> str:
-        """Name and, if it was altered, what was done to the advice."""
+        """Name and modification of the advice."""
         return f"{self.name}, {self.advice}" if self.advice else self.name
 
     @property
+    def tracks(self) -> tuple[str, ...]:
+        """Names of the tracks."""
+        return tuple(self.table.index.unique("track"))
+
+    @property
     def seeds(self) -> int | None:
-        """How many; None for a guide that drives alike with each."""
-        return None if self.is_guide and len(self.values) == 1 else len(self.values)
+        """Number of seeds; None for a guide without random actions."""
+        count = len(self.table.index.unique("seed"))
+        return None if self.is_guide and count == 1 else count
 
     @property
     def scores(self) -> Array:
-        """The rewards, [seeds, tracks]."""
-        return self.values[..., MEASURES.index("reward")]
+        """Rewards, [seeds, tracks]."""
+        return self.by_seed("reward").to_numpy()
+
+    def by_seed(self, measure: str) -> pd.DataFrame:
+        """Return one measure with seeds as rows and tracks as columns."""
+        index = self.table.index.unique("seed")
+        return pd.DataFrame(self.table[measure].to_numpy().reshape(len(index), -1), index, self.tracks)
 
     @cached_property
     def iqm(self) -> float:
-        """The interquartile mean of all rewards."""
+        """Interquartile mean of all rewards."""
         return float(iqm(self.scores))
 
     def means(self, track: int | None = None) -> dict[str, float]:
-        """The mean of each measure, over all tracks or on one; of `clearance` the smallest, of `lap_time` where any."""
-        values = self.values if track is None else self.values[:, [track]]
-        columns = {measure: values[..., place] for place, measure in enumerate(MEASURES)}
-        laps = columns["lap_time"][np.isfinite(columns["lap_time"])]
-        means = {measure: float(column.mean()) for measure, column in columns.items()}
-        return means | {
-            "lap_time": float(laps.mean()) if laps.size else float("nan"),
-            "clearance": float(columns["clearance"].min()),
-        }
+        """Return the mean of each measure over seeds and tracks, or one track; the smallest for `clearance`."""
+        rows = self.table if track is None else self.table.xs(self.tracks[track], level="track")
+        means = {measure: float(rows[measure].mean()) for measure in MEASURES}
+        return means | {"clearance": float(rows["clearance"].min())}
 
     @property
     def per_step(self) -> dict[str, float]:
-        """The mean reward of a step in each task, over the seeds and tracks on which the task came up."""
-        columns = {task: self.values[..., len(MEASURES) + place] for place, task in enumerate(self.tasks)}
-        known = {task: column[np.isfinite(column)] for task, column in columns.items()}
-        return {task: float(column.mean()) if column.size else float("nan") for task, column in known.items()}
+        """Mean reward per step of each task, over the seeds and tracks with such a step; empty without tasks."""
+        columns = [column for column in self.table if column.startswith(PER_STEP)]
+        return {column.removeprefix(PER_STEP): float(self.table[column].mean()) for column in columns}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What finished runs say under one kind of actions.
-
-    Attributes:
-        guides: the best first.
-        agents: the best first, each followed by what it does when its advice is altered.
-    """
+    """Guides, best first, and agents, best first, each followed by its variants with altered advice."""
 
     guides: tuple[Group, ...]
     agents: tuple[Group, ...]
 
     def table(self, against: str | None = None, resamples: int = 2000, seed: int = 0) -> list[dict[str, Any]]:
-        """One row a driver, guides first.
+        """Return one row per driver, guides first.
 
-        Args:
-            against: label of the agent over which improvement is reported, or "guide" for each agent's own.
-            resamples: of the bootstrap.
-            seed: of the bootstrap.
+        `improvement` is over the agent with the label `against`, or over the guide of each agent if it is "guide".
         """
         rows = []
         for group in (*self.guides, *self.agents):
@@ -117,114 +110,130 @@ class Comparison:
         return rows
 
     def track_table(self) -> list[dict[str, Any]]:
-        """One row a driver and track."""
+        """Return one row per driver and track."""
         return [
-            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "track": track} | group.means(place)
+            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "track": track} | group.means(index)
             for group in (*self.guides, *self.agents)
-            for place, track in enumerate(group.tracks)
+            for index, track in enumerate(group.tracks)
         ]
 
     def _improvement(self, group: Group, against: str | None) -> float | None:
-        others = {other.name: other for other in self.agents if not other.advice}
-        other = group.guide if against == GUIDE else others.get(against or "")
+        agents = {agent.name: agent for agent in self.agents if not agent.advice}
+        other = group.guide if against == GUIDE else agents.get(against or "")
         if other is None or other is group or other.tracks != group.tracks:
             return None
         return probability_of_improvement(group.scores, other.scores)
 
 
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
-    """Group the finished runs among some.
-
-    Args:
-        runs: at least one of them finished.
-        actions: "deterministic" or "sampled", of the agents; a guide drives in one way only.
+    """Group the finished runs, at least one, by label; `actions` of the agents are "deterministic" or "sampled".
 
     Raises:
-        UserError: if two runs are the same seed of one label, or runs of one label drove different tracks.
+        UserError: if two runs have the same label and seed, or runs of one label differ in tracks.
     """
-    labels = dict.fromkeys(run.label for run in runs if run.finished)
-    of_label = {label: [run for run in runs if run.finished and run.label == label] for label in labels}
-    for label, alike in of_label.items():
-        _check_seeds(label, alike)
-    guides = _guides(of_label)
+    finished = [run for run in runs if run.finished]
+    names = dict.fromkeys(run.label for run in finished)
+    labels = {label: _join_runs([run for run in finished if run.label == label]) for label in names}
+    is_guide = {label: frame["driver"].str.split().str[0] == GUIDE for label, frame in labels.items()}
+    guides = _group_guides({label: frame[is_guide[label]] for label, frame in labels.items()})
+    needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
-    for label, alike in of_label.items():
-        drives = [(run.seed, drive) for run in alike for drive in run.drives]
-        agent = [(seed, drive) for seed, drive in drives if not drive.is_guide and drive.actions == actions]
-        variants = []
-        for advice in dict.fromkeys(drive.advice for _, drive in agent):
-            seeds, of_advice = zip(*[(seed, drive) for seed, drive in agent if drive.advice == advice], strict=True)
-            variants.append(
-                Group(
-                    label, advice, *_stack(label, of_advice), guide=next(iter(guides.get(label, ())), None),
-                    needs_guide=None if advice else alike[0].needs_guide, seed_numbers=seeds,
-                )
-            )  # fmt: skip
+    for label, frame in labels.items():
+        rows = frame[~is_guide[label] & (frame["actions"] == actions)]
+        guide = next(iter(guides.get(label, ())), None)
+        variants = [
+            Group(label, advice, _index(label, variant), False, guide, None if advice else needs_guide[label])
+            for advice, variant in rows.groupby("advice", sort=False)
+        ]
         agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
-    own = {group.name: group.iqm for group in reversed(agents)}  # the first of each label: its advice is not altered
-    agents.sort(key=lambda group: (-own[group.name], group.name))
-    different = {id(group): group for of_label in guides.values() for group in of_label}
-    return Comparison(tuple(sorted(different.values(), key=lambda group: -group.iqm)), tuple(agents))
+    best = {group.name: group.iqm for group in reversed(agents)}  # the first group of a label: unaltered advice
+    agents.sort(key=lambda group: (-best[group.name], group.name))
+    unique = dict.fromkeys(group for groups in guides.values() for group in groups)
+    return Comparison(tuple(sorted(unique, key=lambda group: -group.iqm)), tuple(agents))
 
 
-def _check_seeds(label: str, runs: Sequence[Run]) -> None:
+def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
+    """Join the evaluations of the runs of one label."""
     first: dict[int, Run] = {}
     for run in runs:
         if run.seed in first:
             raise UserError(
-                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {label}; "
-                "take one out of the folder, or give runs that differ labels of their own (coil-train label=TEXT)"
+                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {run.label}; "
+                "remove one from the folder, or give different runs their own labels (coil-train label=TEXT)"
             )
         first[run.seed] = run
+    return pd.concat([run.evaluation.assign(seed=run.seed) for run in runs])
 
 
-def _stack(name: str, drives: Sequence[Drive]) -> tuple[tuple[str, ...], Array, tuple[str, ...]]:
-    tracks, tasks = drives[0].tracks, drives[0].tasks
-    for drive in drives:
-        if drive.tracks != tracks:
-            raise UserError(
-                f"runs of {name} drove different tracks ({', '.join(tracks)}, and {', '.join(drive.tracks)}); "
-                "judge them on the same ones, or give them labels of their own (coil-train label=TEXT)"
-            )
-        if drive.tasks != tasks:
-            raise UserError(
-                f"runs of {name} had different tasks ({', '.join(tasks) or 'none'}, and "
-                f"{', '.join(drive.tasks) or 'none'}); give them labels of their own (coil-train label=TEXT)"
-            )
-    return tracks, np.stack([drive.values for drive in drives]), tasks
+def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
+    """Index the evaluations of one driver by seed and track."""
+    tracks = rows.groupby("seed")["track"].agg(tuple).unique()
+    if len(tracks) > 1:
+        raise UserError(
+            f"runs of {name} drove different tracks ({', '.join(tracks[0])}, and {', '.join(tracks[1])}); "
+            "evaluate them on the same ones, or give them their own labels (coil-train label=TEXT)"
+        )
+    return rows.set_index(["seed", "track"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-def _guides(of_label: dict[str, list[Run]]) -> dict[str, list[Group]]:
-    """From label to its guides, the best first.
+def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
+    """Return the guides of each label, best first.
 
-    Labels whose guides drove alike share one, and each different drive of it counts once. A guide that draws at random
-    drives otherwise with every seed. Then labels share it whose seeds all drove alike, as far as both have them.
+    Every run evaluates its guides: equal results of one guide count once, and labels share a guide if the results of
+    one contain those of the other. A guide with random actions has one result per seed.
     """
-    families: dict[str, list[tuple[list[str], dict[Any, Drive]]]] = {}
-    for label, runs in of_label.items():
-        driven = [drive for run in runs for drive in run.drives if drive.is_guide]
-        for driver in dict.fromkeys(drive.driver for drive in driven):
-            drives = {
-                (drive.tracks, *np.round(drive.values[:, 0], 3)): drive for drive in driven if drive.driver == driver
-            }
-            alike = families.setdefault(driver, [])
-            family = next((f for f in alike if f[1].keys() <= drives.keys() or drives.keys() <= f[1].keys()), None)
-            if family is None:
-                alike.append(([label], drives))
+    guides: list[tuple[str, list[str], dict[Any, pd.DataFrame]]] = []  # name, labels and different results
+    for label, frame in labels.items():
+        for name, rows in frame.groupby("driver", sort=False):
+            seeds = [seed_rows for _, seed_rows in rows.groupby("seed", sort=False)]
+            results = {(*seed_rows["track"], *seed_rows["reward"].round(3)): seed_rows for seed_rows in seeds}
+            for other, other_labels, other_results in guides:
+                fewer, more = sorted((results.keys(), other_results.keys()), key=len)
+                if other == name and fewer <= more:
+                    other_labels.append(label)
+                    other_results.update(results)
+                    break
             else:
-                family[0].append(label)
-                family[1].update(drives)
+                guides.append((name, [label], results))
+    names = [name for name, _, _ in guides]
     groups: dict[str, list[Group]] = {}
-    for driver, alike in families.items():
-        for labels, drives in alike:
-            name = driver if len(alike) == 1 else f"{driver} ({_listed(labels)})"
-            group = Group(name, "", *_stack(f"the guide of {labels[0]}", list(drives.values())), is_guide=True)
-            for label in labels:
-                groups.setdefault(label, []).append(group)
+    for name, shared_by, results in guides:
+        listed = ", ".join(shared_by)
+        if len(shared_by) > LABELS_IN_NAME + 1:
+            listed = f"{', '.join(shared_by[:LABELS_IN_NAME])} and {len(shared_by) - LABELS_IN_NAME} more"
+        table = pd.concat([rows.assign(seed=number) for number, rows in enumerate(results.values())])
+        table = _index(f"the guide of {shared_by[0]}", table)
+        group = Group(name if names.count(name) == 1 else f"{name} ({listed})", "", table, is_guide=True)
+        for label in shared_by:
+            groups.setdefault(label, []).append(group)
     return {label: sorted(of_label, key=lambda group: -group.iqm) for label, of_label in groups.items()}
 
 
-def _listed(labels: Sequence[str]) -> str:
-    if len(labels) <= NAMED + 1:
-        return ", ".join(labels)
-    return f"{', '.join(labels[:NAMED])} and {len(labels) - NAMED} more"
+@dataclass(frozen=True)
+class Paired:
+    """Difference between two drivers with the same seeds: values with the ends of their 95 % intervals."""
+
+    seeds: int  # number of common seeds
+    difference: tuple[float, float, float]  # mean difference of a measure
+    better: tuple[float, float, float]  # share of seeds and tracks with a higher value, ties counting half
+
+
+def paired(group: Group, other: Group, measure: str = "reward", resamples: int = 2000, seed: int = 0) -> Paired | None:
+    """Compare two drivers seed by seed by one of MEASURES; a guide without random actions has one value for all seeds.
+
+    The result is None without common tracks and seeds, or if the measure has NaN.
+    """
+    if group.tracks != other.tracks or (other.is_guide and other.seeds is not None):
+        return None
+    ours, theirs = group.by_seed(measure), other.by_seed(measure)
+    if not other.is_guide:
+        common = [number for number in ours.index if number in theirs.index]
+        ours, theirs = ours.loc[common], theirs.loc[common]
+    x, y = ours.to_numpy(), theirs.to_numpy()
+    if not x.size or not np.isfinite(x).all() or not np.isfinite(y).all():
+        return None
+
+    def with_interval(table: Array) -> tuple[float, float, float]:
+        return float(table.mean()), *stratified_bootstrap(table, np.mean, resamples=resamples, seed=seed)
+
+    return Paired(len(x), with_interval(x - y), with_interval(wins(x, y)))

@@ -1,4 +1,4 @@
-"""Pictures of driven lines: where each driver went between the cones, still and moving."""
+"""Driven lines on a map of the tracks: still, animated, or coloured by a measure."""
 
 from __future__ import annotations
 
@@ -6,28 +6,40 @@ import itertools
 import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+import matplotlib as mpl
 import numpy as np
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, Normalize, to_rgb
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal
+from matplotlib.patheffects import Stroke as StrokeEffect
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 from tqdm import tqdm
 
 from coil_rl.files import whole_file
 from coil_rl.report import style
-from coil_rl.report.scene import Scene
-from coil_rl.report.sprites import Car, draw_clock, rgb, shared_palette
+from coil_rl.report.track_map import TrackMap
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track
 
 Array = NDArray[np.float64]
 
+GIF_RESOLUTION = 100  # dpi
 TAIL = 0.6  # seconds of the animation
-LAST_FRAME = 1.2  # seconds
-CAR = 2.0  # m
-CAR_PIXELS = (11.0, 24.0)  # still seen on long tracks, out of the way on short ones
+FPS = 20  # GIFs count in hundredths of a second: 20, 25 and 50 are exact
+PAUSE = 1.2  # seconds at the end of the animation
+CAR: dict[str, Any] = {"marker": "o", "ms": 6.5, "mec": style.BACKGROUND, "mew": 1.0, "ls": ""}
+CRASH: dict[str, Any] = {"marker": "X", "ms": 8, "mec": style.BACKGROUND, "mew": 0.8, "ls": ""}
+
+# Readable without colours, and different from those of the cones.
+MEASURE_COLOURS = ListedColormap(mpl.colormaps["magma_r"](np.linspace(0.02, 0.88, 256)))
 
 
 def draw_lines(
@@ -36,34 +48,29 @@ def draw_lines(
     path: str | os.PathLike[str],
     *,
     crashed: Mapping[str, Sequence[bool]] | None = None,
-    title: str | None = None,
 ) -> None:
     """Draw the lines of several drivers on several tracks, all at one scale.
 
     Args:
-        tracks: at least one, N of them.
-        lines: from driver to its N lines, each [T, 2] m, x right and y up; T may be 0, rows that are not finite are
-            left out. A driver whose name starts with "guide" is drawn in grey dashes; the last one lies on top.
-        path: the picture, in the format of its ending (.png, .svg, .pdf), 8 inches wide.
-        crashed: from driver to N truth values; a line that ended in a crash ends in a cross.
-        title: above the picture.
-
-    Raises:
-        ValueError: if there is no track, or if the lines or the truth values do not match the tracks.
+        tracks: N of them, at least one.
+        lines: N lines per driver, each [T, 2] m, x right and y up; T may be 0, rows that are not finite are left out.
+            Drivers whose name starts with "guide" are drawn in grey dashes; the last driver is on top.
+        path: output file, 8 inches wide.
+        crashed: per driver, whether each of the N lines ended in a crash; a cross marks it.
     """
-    driven, ended = _checked(tracks, lines, crashed)
+    driven, ended = _check_lines(tracks, lines, crashed)
     strokes = style.strokes(driven)
     handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label) for label, s in strokes.items()]
-    scene = Scene(tracks, legend=[*handles, *_crash_handle(ended)], title=title, dpi=style.RESOLUTION)
+    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)])
     for z, (label, stroke) in enumerate(strokes.items()):
         for index, (track, line) in enumerate(zip(tracks, driven[label], strict=True)):
-            for lap in _laps(line, track):
-                at = lap + scene.offsets[index]
-                scene.axes.plot(*at.T, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
+            offset = track_map.offsets[index]
+            for lap in _split_laps(line, track):
+                xy = (lap + offset).T
+                track_map.axes.plot(*xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
             if ended[label][index] and len(line):
-                at = line[-1] + scene.offsets[index]
-                scene.axes.plot(*at, marker="X", ms=8, mfc=stroke.colour, mec=style.PAPER, mew=0.8, zorder=5 + z / 100)
-    scene.save(path)
+                track_map.axes.plot(*(line[-1] + offset), mfc=stroke.colour, zorder=5 + z / 100, **CRASH)
+    style.save(track_map.figure, path)
 
 
 def animate_lines(
@@ -73,108 +80,161 @@ def animate_lines(
     *,
     rate: float,
     crashed: Mapping[str, Sequence[bool]] | None = None,
-    title: str | None = None,
     seconds: float = 12.0,
-    fps: int = 20,
 ) -> None:
-    """Let the drivers race each other on every track, as a GIF that starts over at the end.
+    """Write a GIF, 800 px wide, in which all drivers drive on all tracks at the same time; it repeats.
 
-    All of them start together; who has finished stands still at the end of its line.
-
-    Args:
-        tracks: as in `draw_lines`.
-        lines: as in `draw_lines`, one row a step.
-        path: the GIF, 800 px wide.
-        rate: steps per second of the lines.
-        crashed: as in `draw_lines`.
-        title: above the picture.
-        seconds: how long the longest line takes to watch, at most: no line is shown slower than it was driven.
-        fps: frames per second; a GIF counts in hundredths of a second, so 20, 25 or 50 are exact.
-
-    Raises:
-        ValueError: as `draw_lines`, or if rate, seconds or fps is not above 0.
+    The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the maximum duration in
+    `seconds`; lines are never shown slower than they were driven.
     """
-    for name, value in {"rate": rate, "seconds": seconds, "fps": fps}.items():
-        if not value > 0:
-            raise ValueError(f"{name} must be above 0, got {value}.")
-    driven, ended = _checked(tracks, lines, crashed)
-    strokes = style.strokes(driven)
-    handles = [Line2D([], [], ls="", marker=">", ms=8, mfc=s.colour, mec=s.colour, label=k) for k, s in strokes.items()]
-    scene = Scene(tracks, legend=[*handles, *_crash_handle(ended)], title=title, dpi=style.SCREEN_RESOLUTION)
-    background = Image.fromarray(scene.image())
-    length = float(np.clip(CAR * scene.scale * style.SCREEN_RESOLUTION, *CAR_PIXELS))
-    cars = [
-        Car(scene.pixels(index, line), rgb(strokes[label].colour), length, ended[label][index])
-        for label, of_label in driven.items()
-        for index, line in enumerate(of_label)
-        if len(line)
-    ]
-    duration = max((len(car.line) - 1 for car in cars), default=0) / rate
-    faster = max(1.0, duration / seconds)
-    times = np.linspace(0, duration, 1 + math.ceil(duration / faster * fps))
-    palette = shared_palette(background, [rgb(stroke.colour) for stroke in strokes.values()])
+    driven, ended = _check_lines(tracks, lines, crashed)
+    colours = {label: stroke.colour for label, stroke in style.strokes(driven).items()}
+    handles = [Line2D([], [], mfc=colour, label=label, **CAR) for label, colour in colours.items()]
+    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
+    figure, axes, canvas = track_map.figure, track_map.axes, track_map.canvas
+    with mpl.rc_context(style.LETTERS):
+        clock = figure.text(
+            1 - style.MARGIN / style.WIDTH, 14 / figure.bbox.height, "", size=8, ha="right", va="center"
+        )
+        cars = []
+        for label, index in itertools.product(driven, range(len(tracks))):
+            (tail,) = axes.plot([], [], color=colours[label], lw=2.4, alpha=0.6)
+            (head,) = axes.plot([], [], mfc=colours[label], **CAR)
+            cars.append((driven[label][index] + track_map.offsets[index], ended[label][index], tail, head))
+        canvas.draw()
+    # Drawing the tracks in every frame would take three times as long.
+    background = canvas.copy_from_bbox(figure.bbox)
+    palette = _palette(list(colours.values()))
+    duration = (max([1, *(len(line) for line, *_ in cars)]) - 1) / rate
+    speed = max(1.0, duration / seconds)
+    times = np.linspace(0, duration, 1 + math.ceil(duration / speed * FPS)).tolist()
 
     def frames() -> Iterator[Image.Image]:
         for time in tqdm(times, desc="animation", unit="frame", leave=False, disable=None):
-            frame = background.copy()
-            for car in cars:
-                car.draw(frame, float(time) * rate, TAIL * faster * rate)
-            draw_clock(frame, f"{time:.1f} s ({faster:.0f}× speed)" if faster >= 1.5 else f"{time:.1f} s")
-            yield frame.quantize(palette=palette, dither=Image.Dither.NONE)
+            canvas.restore_region(background)
+            for line, crashes, tail, head in cars:
+                now, start = min(round(time * rate), len(line) - 1), round((time - TAIL * speed) * rate)
+                tail.set_data(*line[max(0, start) : now + 1].T)
+                head.set_data(*line[max(0, now) : now + 1].T)
+                if crashes and now == len(line) - 1:
+                    head.set(marker=CRASH["marker"], markersize=CRASH["ms"])
+                axes.draw_artist(tail)
+                axes.draw_artist(head)
+            clock.set_text(f"{time:.1f} s ({speed:.0f}× speed)" if speed >= 1.5 else f"{time:.1f} s")
+            figure.draw_artist(clock)
+            image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+            yield image.quantize(palette=palette, dither=Image.Dither.NONE)
 
-    moving = frames()
-    pause = [round(1000 / fps)] * (len(times) - 1) + [round(1000 * LAST_FRAME)]
+    images = frames()
+    durations = [round(1000 / FPS)] * (len(times) - 1) + [round(1000 * PAUSE)]
     with whole_file(path) as unfinished:
-        next(moving).save(unfinished, format="GIF", save_all=True, append_images=moving, duration=pause, loop=0)
+        next(images).save(unfinished, format="GIF", save_all=True, append_images=images, duration=durations, loop=0)
+
+
+def _palette(drivers: Sequence[str]) -> Image.Image:
+    """Return one palette for all frames: shades of all colours on the background and on the track."""
+    grounds = np.array([to_rgb(style.BACKGROUND), to_rgb(style.ASPHALT)])
+    fixed = (style.INK, style.LEFT_CONE, style.RIGHT_CONE)
+    colours = np.array([to_rgb(colour) for colour in (*fixed, *dict.fromkeys(drivers))])
+    weights = np.linspace(0, 1, 255 // (2 * len(colours)))[:, None, None, None]
+    shades = (1 - weights) * grounds[:, None] + weights * colours
+    image = Image.new("P", (1, 1))
+    image.putpalette((255 * shades).round().astype(int).flatten().tolist())
+    return image
+
+
+def draw_listening_map(
+    tracks: Sequence[Track],
+    lines: Sequence[ArrayLike],
+    values: Mapping[str, Sequence[ArrayLike]],
+    path: str | os.PathLike[str],
+    *,
+    label: str,
+    title: str | None = None,
+) -> None:
+    """Draw the driven lines once per guide, coloured by a measure on one colour scale.
+
+    Args:
+        tracks: N of them, at least one.
+        lines: N driven lines, [T, 2] m each, T at least 1.
+        values: by guide, at least one, the values at the points of each line, N times [T]; NaN is left out.
+        path: output file.
+        label: of the colour bar, measure and unit.
+        title: above the map.
+    """
+    driven = [np.asarray(line, dtype=np.float64) for line in lines]
+    measured = {guide: [np.asarray(row, dtype=np.float64) for row in rows] for guide, rows in values.items()}
+    for guide, rows in measured.items():
+        if [row.shape for row in rows] != [line.shape[:1] for line in driven] or len(driven) != len(tracks):
+            shapes = f"{[row.shape for row in rows]} for lines of {[line.shape for line in driven]}"
+            raise ValueError(
+                f"the values of {guide!r} have the shapes {shapes}; give one per point, one line per track"
+            )
+    highest = float(np.nanmax([0.0, *np.concatenate([row for rows in measured.values() for row in rows])])) or 1.0
+    colours = ScalarMappable(Normalize(0, highest), MEASURE_COLOURS)
+    panels = [(guide, index) for guide in measured for index in range(len(tracks))]
+    titled = [replace(tracks[index], name=f"{guide}: {tracks[index].name}") for guide, index in panels]
+    track_map = TrackMap(titled, title=title, groups=len(measured))
+    rim = [StrokeEffect(linewidth=5.2, foreground=style.BACKGROUND), Normal()]
+    for panel, (guide, index) in enumerate(panels):
+        xy = driven[index] + track_map.offsets[panel]
+        segments = np.stack([xy[:-1], xy[1:]], axis=1)
+        segment_values = measured[guide][index][:-1]
+        finite = np.isfinite(segment_values)
+        track_map.axes.add_collection(
+            LineCollection(
+                list(segments[finite]), array=segment_values[finite], cmap=MEASURE_COLOURS, norm=colours.norm,
+                lw=4.0, capstyle="round", zorder=4, path_effects=rim,
+            )
+        )  # fmt: skip
+    _draw_colour_bar(track_map.figure, colours, label)
+    style.save(track_map.figure, path)
+
+
+def _draw_colour_bar(figure: Figure, colours: ScalarMappable, label: str) -> None:
+    """Draw a horizontal colour bar in the lower right corner."""
+    with mpl.rc_context(style.LETTERS):
+        width, height = figure.get_size_inches()
+        left, bottom, bar_width, bar_height = width - style.MARGIN - 0.34 - 2.2, 0.13, 2.2, 0.11
+        axes = figure.add_axes((left / width, bottom / height, bar_width / width, bar_height / height))
+        bar = figure.colorbar(colours, cax=axes, orientation="horizontal")
+        bar.outline.set_visible(False)
+        bar.set_ticks([])
+        middle = (bottom + bar_height / 2) / height
+        figure.text((left - 0.07) / width, middle, f"{label}  0", size=8, ha="right", va="center")
+        axes.text(1.03, 0.5, f"{colours.norm.vmax:.2g}", size=8, va="center", transform=axes.transAxes)
 
 
 def _crash_handle(ended: Mapping[str, Sequence[bool]]) -> list[Line2D]:
-    cross = Line2D([], [], ls="", marker="X", ms=7, mfc=style.INK, mec=style.PAPER, label="crash")
-    return [cross] if any(any(marks) for marks in ended.values()) else []
+    handle = Line2D([], [], ls="", marker="X", ms=7, mfc=style.INK, mec=style.BACKGROUND, label="crash")
+    return [handle] if any(any(crashes) for crashes in ended.values()) else []
 
 
-def _laps(line: Array, track: Track) -> list[Array]:
-    """A line cut where it crosses the finish line forwards.
-
-    Dashes that start anew with each lap lie on those of the lap before instead of filling its gaps.
-    """
+def _split_laps(line: Array, track: Track) -> list[Array]:
+    """Split a line where it crosses the finish line forwards, so that the dashes of all laps coincide."""
     across = track.right[0] - track.left[0]
-    ahead = (line - track.left[0]) @ np.array([-across[1], across[0]])
-    aside = (line - track.left[0]) @ across / (across @ across)
-    crosses = (ahead[:-1] < 0) & (ahead[1:] >= 0) & (aside[1:] > 0) & (aside[1:] < 1)
+    forward = (line - track.left[0]) @ np.array([-across[1], across[0]])
+    sideways = (line - track.left[0]) @ across / (across @ across)
+    crosses = (forward[:-1] < 0) & (forward[1:] >= 0) & (sideways[1:] > 0) & (sideways[1:] < 1)
     cuts = [0, *(np.flatnonzero(crosses) + 1).tolist(), len(line)]
     return [line[start : stop + 1] for start, stop in itertools.pairwise(cuts)]
 
 
-def _checked(
+def _check_lines(
     tracks: Sequence[Track],
     lines: Mapping[str, Sequence[ArrayLike]],
     crashed: Mapping[str, Sequence[bool]] | None,
 ) -> tuple[dict[str, list[Array]], dict[str, list[bool]]]:
-    """The finite rows of all lines, and for all drivers whether they crashed."""
-    names = ", ".join(track.name for track in tracks)
-    for what, given in {"lines": lines, "crash marks": crashed or {}}.items():
-        for label, values in given.items():
-            if len(values) != len(tracks):
-                raise ValueError(
-                    f"{label!r} has {len(values)} {what} for {len(tracks)} tracks ({names}); give one for each."
-                )
-    strangers = [label for label in crashed or {} if label not in lines]
-    if strangers:
-        raise ValueError(
-            f"There are crash marks of {strangers[0]!r} but no lines; lines are given of: {', '.join(lines)}."
-        )
+    """Return the finite rows [T, 2] of all lines, and whether each ended in a crash."""
+    ended = {label: list((crashed or {}).get(label, [False] * len(tracks))) for label in lines}
     driven: dict[str, list[Array]] = {}
-    for label, of_label in lines.items():
-        driven[label] = []
-        for track, line in zip(tracks, of_label, strict=True):
-            points = np.asarray(line, dtype=np.float64)
-            if points.size == 0:
-                points = points.reshape(0, 2)
-            if points.ndim != 2 or points.shape[1] != 2:
-                raise ValueError(
-                    f"The line of {label!r} on {track.name!r} has the shape {list(points.shape)}; it takes [T, 2]."
-                )
-            driven[label].append(points[np.isfinite(points).all(axis=1)])
-    ended = {label: [bool(mark) for mark in (crashed or {}).get(label, [False] * len(tracks))] for label in lines}
+    for label, driver_lines in lines.items():
+        if not len(driver_lines) == len(ended[label]) == len(tracks):
+            given = f"{len(driver_lines)} lines and {len(ended[label])} crash marks"
+            raise ValueError(f"{label!r} has {given} for {len(tracks)} tracks; give one for each")
+        arrays = [np.asarray(line, dtype=np.float64) for line in driver_lines]
+        arrays = [array if array.size else array.reshape(0, 2) for array in arrays]
+        if wrong := [list(array.shape) for array in arrays if array.ndim != 2 or array.shape[1] != 2]:
+            raise ValueError(f"a line of {label!r} has the shape {wrong[0]}; it takes [T, 2]")
+        driven[label] = [array[np.isfinite(array).all(axis=1)] for array in arrays]
     return driven, ended

@@ -23,7 +23,7 @@ from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_lin
 from coil_rl.envs.robot.drives import track_of
 from coil_rl.envs.track import Track
 from coil_rl.report import style
-from coil_rl.reproduce.result import picture
+from coil_rl.report.style import picture
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -142,7 +142,7 @@ def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], colour: str) -> Non
     for drive in drives:
         axes.plot(*drive.line.T, color=colour, lw=0.8, alpha=0.6, zorder=4)
         if drive.row["crashed"]:
-            axes.plot(*drive.line[-1], "X", ms=7, mfc=colour, mec=style.PAPER, mew=0.8, zorder=5)
+            axes.plot(*drive.line[-1], "X", ms=7, mfc=colour, mec=style.BACKGROUND, mew=0.8, zorder=5)
 
 
 def _dot(marker: str, colour: str, label: str) -> Line2D:

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
-from coil_rl.files import whole_file
-from coil_rl.report import style
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import stratified_bootstrap
 from coil_rl.reproduce.pages import with_interval
@@ -104,30 +96,3 @@ def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
             existing = ", ".join(dict.fromkeys(run.label for run in available)) or "none"
             raise UserError(f"no run of {', '.join(runs)} has the label {label}; available: {existing}")
     return selected
-
-
-@contextmanager
-def picture(path: Path, title: str, handles: Sequence[Artist], height: float) -> Iterator[Figure]:
-    """An empty picture in the house's style; it is written when the block ends.
-
-    Args:
-        path: the picture, 8 inches wide.
-        title: above it.
-        handles: of the legend below the title.
-        height: in inches.
-    """
-    with mpl.rc_context(style.LETTERS):
-        figure = Figure(figsize=(style.WIDTH, height), dpi=style.RESOLUTION)
-        FigureCanvasAgg(figure)
-        header = style.draw_header(figure, handles, title)
-        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / height), w_pad=style.MARGIN / 2, h_pad=0.1)
-        yield figure
-        with whole_file(path) as unfinished:
-            figure.savefig(unfinished, format=path.suffix[1:])
-
-
-def lighten(axes: Axes, grid: str = "y") -> None:
-    """Leave out what frames a plot, and draw faint lines across it."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y" if grid == "y" else "x", color=style.ASPHALT, lw=0.7)
-    axes.set_axisbelow(True)

@@ -20,8 +20,9 @@ from scipy.stats import binomtest
 from tqdm import tqdm
 
 from coil_rl.report import markdown_table, style, write_csv
+from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.tabular import (
     MDP,
     garnet,

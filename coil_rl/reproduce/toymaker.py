@@ -11,8 +11,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from coil_rl.report import markdown_table, style, write_csv
+from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, lighten, picture
+from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.tabular import policy_iteration, toymaker, value_iteration
 from coil_rl.tabular.mdp import Array
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
-from coil_rl.report.curve import TRAINING, mean_curve, points
+from coil_rl.report.curves import TRAINING, mean_curve, points
 from coil_rl.report.runs import GUIDE, Run
 from coil_rl.report.statistics import iqm, wins
 from coil_rl.reproduce import pages

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
-from coil_rl.report.comparison import Group, compare
-from coil_rl.report.paired import Paired, paired
-from coil_rl.report.runs import GUIDE, MEASURES, Run
+from coil_rl.report.comparison import Group, Paired, compare, paired
+from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, Run
 from coil_rl.report.statistics import iqm
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
@@ -180,12 +179,8 @@ def _paper_difference(measure: str, driver: str, other: str) -> str | None:
 
 def _episodes(run: Run) -> list[dict[str, Any]]:
     """Return the CSV rows of a run, one per driver and track."""
-    return [
-        {"label": run.label, "seed": run.seed, "driver": drive.driver, "advice": drive.advice, "actions": drive.actions,
-         "track": track} | dict(zip(MEASURES, values, strict=False))
-        for drive in run.drives
-        for track, values in zip(drive.tracks, drive.values, strict=True)
-    ]  # fmt: skip
+    rows = run.evaluation[[*DRIVER, *MEASURES]].to_dict("records")
+    return [{"label": run.label, "seed": run.seed} | row for row in rows]
 
 
 def _intervals(groups: Sequence[Group], rows: Sequence[Row]) -> list[Interval]:

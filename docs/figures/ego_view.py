@@ -56,7 +56,7 @@ def make_panel(axes: Axes, sideways: float, behind: float, ahead: float) -> None
 def draw_field_of_view(axes: Axes, sight: float, half_angle: float) -> None:
     """Draw the visible sector, `sight` m deep and `half_angle` radians to either side."""
     half = math.degrees(half_angle)
-    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc=style.PAPER, ec="none", alpha=0.55, zorder=1.5))
+    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc=style.BACKGROUND, ec="none", alpha=0.55, zorder=1.5))
     axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2))
 
 
@@ -66,7 +66,7 @@ def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples:
     if valid:
         curve = boundary.equidistant(CURVE_POINTS)[:, :, side, 0]
         axes.plot(*facing_up(rows(curve / scale)).T, color=colour, lw=1.4, zorder=4.5)
-    face, edge = (colour, style.PAPER) if valid else (style.PAPER, colour)
+    face, edge = (colour, style.BACKGROUND) if valid else (style.BACKGROUND, colour)
     axes.plot(*facing_up(samples).T, "D", ms=4.4, mfc=face, mec=edge, mew=0.8, zorder=6)
 
 
@@ -82,7 +82,7 @@ def draw_plan(axes: Axes, plan: Plan, scale: float = 1.0) -> None:
     axes.plot(*points(plan.path.equidistant(CURVE_POINTS)[:, :in_use, 0]), color=PATH_COLOUR, lw=1.6, zorder=5)
     axes.plot(*points(plan.midpoints[:, :pairs, 0]), "x", color=style.INK, ms=3.6, mew=0.9, zorder=6)
     targets = points(plan.targets[:, :in_use, 0])
-    axes.plot(*targets, "o", ms=4.2, mfc=PATH_COLOUR, mec=style.PAPER, mew=0.6, zorder=7)
+    axes.plot(*targets, "o", ms=4.2, mfc=PATH_COLOUR, mec=style.BACKGROUND, mew=0.6, zorder=7)
     axes.plot(*points(selected), "o", ms=9, mfc="none", mec=ADVICE_COLOUR, mew=1.6, zorder=8)
 
 
@@ -103,7 +103,7 @@ def marker(symbol: str, label: str, size: float = 5.5, **options: Any) -> Line2D
 
 def common_handles() -> list[Artist]:
     """Return the legend handles of boundaries, plan and advice."""
-    path: Any = {"color": PATH_COLOUR, "lw": 1.6, "marker": "o", "ms": 4.2, "mec": style.PAPER, "mew": 0.6}
+    path: Any = {"color": PATH_COLOUR, "lw": 1.6, "marker": "o", "ms": 4.2, "mec": style.BACKGROUND, "mew": 0.6}
     return [
         Line2D([], [], color=LINE_COLOURS[1], lw=1.5, marker="D", ms=4.2, label="boundary estimate, its samples"),
         marker("x", "midpoint of a pair", 4, mec=style.INK),

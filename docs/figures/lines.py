@@ -21,9 +21,9 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from coil_rl.envs.track import SIDES, Track
-from coil_rl.listening.places import LEFT, RIGHT, kinds, smooth_line
+from coil_rl.listening.sections import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import markdown_table, style
-from coil_rl.reproduce.result import lighten, picture
+from coil_rl.report.style import lighten, picture
 from coil_rl.train import load
 from coil_rl.train.build import build, build_env
 from coil_rl.train.evaluate_run import drive_guides
@@ -45,7 +45,7 @@ class StraightTrack:
         edges = np.roll(self.line, -1, axis=0) - self.line
         lengths = np.linalg.norm(edges, axis=1)
         self.along, self.length = np.cumsum(lengths) - lengths, float(lengths.sum())
-        self.kinds = kinds(smooth_line(track, SPACING))
+        self.kinds = classify(smooth_line(track, SPACING))
         headings = edges + np.roll(edges, 1, axis=0)
         self._headings = headings / np.linalg.norm(headings, axis=1, keepdims=True)
         self._tree = cKDTree(self.line)
@@ -132,7 +132,7 @@ def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, Evalu
                 above.plot(along, left, lw=1.2, zorder=4, **line)
                 below.plot(along, rough, lw=1.0, **line)
                 if result.episodes[index]["crashed"]:
-                    above.plot(along[-1], left[-1], "X", ms=7, mfc=line["color"], mec=style.PAPER, zorder=5)
+                    above.plot(along[-1], left[-1], "X", ms=7, mfc=line["color"], mec=style.BACKGROUND, zorder=5)
             for axes in (above, below):
                 lighten(axes)
                 axes.tick_params(length=0, labelsize=7, labelbottom=axes is below)

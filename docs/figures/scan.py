@@ -25,7 +25,7 @@ from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.envs.sight import Frame
 from coil_rl.guides import SplineGuide
 from coil_rl.report import style
-from coil_rl.reproduce.result import picture
+from coil_rl.report.style import picture
 from coil_rl.robot.classifier import majority
 
 SEED = 100  # of a drive that is not in the classifier's training set
@@ -106,7 +106,9 @@ def main() -> None:
         draw_scan(axes, drive, perception)
         draw_guidance(axes, drive, perception)
         length, width = OUTLINE
-        axes.add_patch(Rectangle((-width / 2, -length / 2), width, length, fc=style.INK, ec=style.PAPER, zorder=8.2))
+        axes.add_patch(
+            Rectangle((-width / 2, -length / 2), width, length, fc=style.INK, ec=style.BACKGROUND, zorder=8.2)
+        )
     print(path)
 
 

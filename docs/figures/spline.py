@@ -18,7 +18,7 @@ from scipy.interpolate import make_smoothing_spline
 from coil_rl.envs.level_files import shipped_track
 from coil_rl.envs.splines import smoothing_spline
 from coil_rl.report import markdown_table, style
-from coil_rl.reproduce.result import lighten, picture
+from coil_rl.report.style import lighten, picture
 
 SMOOTHINGS = (0.0, 0.1, 1.0, 10.0, 100.0)  # lambda, m^3
 CONES = 16  # of the left side of test_3

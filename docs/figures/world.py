@@ -26,7 +26,7 @@ from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame
 from coil_rl.envs.track import SIDES
 from coil_rl.guides import SplineGuide
 from coil_rl.report import style
-from coil_rl.reproduce.result import picture
+from coil_rl.report.style import picture
 
 TRACK = "test_3"
 MOMENTS = {"straight": 10.5, "right bend": 17.5, "left bend": 4.75, "left boundary lost": 5.33}  # s
@@ -68,13 +68,15 @@ def draw_moment(axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide,
     samples = frame.to_car(env.samples)[..., 0].permute(2, 1, 0).double().numpy()
     for side, name in enumerate(SIDES):
         visible = facing_up(rows(cones[0, side, : count[0, side]].t()))
-        axes.plot(*local(getattr(track, name)).T, "o", ms=5, mfc=style.PAPER, mec=CONE_COLOURS[side], mew=1.1, zorder=3)
+        axes.plot(
+            *local(getattr(track, name)).T, "o", ms=5, mfc=style.BACKGROUND, mec=CONE_COLOURS[side], mew=1.1, zorder=3
+        )
         axes.plot(*visible.T, "o", ms=7.5, mfc=CONE_COLOURS[side], zorder=4, **EDGE)
         if env.sampled[side, 0] > 0:
             ego_view.draw_boundary(axes, boundary, side, len(visible) > 1, samples[side])
             number_samples(axes, facing_up(samples[side]), side)
     ego_view.draw_plan(axes, guide.plan(cones, count))
-    axes.add_patch(Polygon(facing_up(CAR), fc=style.INK, ec=style.PAPER, lw=0.6, zorder=9))
+    axes.add_patch(Polygon(facing_up(CAR), fc=style.INK, ec=style.BACKGROUND, lw=0.6, zorder=9))
     ego_view.draw_advice(axes, float(state["action"]) * guide.max_steering, length=2.0)
 
 
@@ -95,9 +97,9 @@ def main() -> None:
     handles = [
         marker("o", "left cone in sight", 7, mfc=CONE_COLOURS[0], **EDGE),
         marker("o", "right cone in sight", 7, mfc=CONE_COLOURS[1], **EDGE),
-        marker("o", "cone out of sight", 5, mfc=style.PAPER, mec=CONE_COLOURS[1]),
-        Patch(fc=style.PAPER, ec=style.QUIET, lw=0.8, label="field of view"),
-        marker("D", "remembered sample", 4.2, mfc=style.PAPER, mec=LINE_COLOURS[0]),
+        marker("o", "cone out of sight", 5, mfc=style.BACKGROUND, mec=CONE_COLOURS[1]),
+        Patch(fc=style.BACKGROUND, ec=style.QUIET, lw=0.8, label="field of view"),
+        marker("D", "remembered sample", 4.2, mfc=style.BACKGROUND, mec=LINE_COLOURS[0]),
         *ego_view.common_handles(),
     ]
     with picture(path, f"A car's view and its guide's advice ({TRACK})", handles, height=6.25) as figure:

@@ -1,86 +1,133 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, TensorDictSequential
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from worlds import cones
 
-from coil_rl.listening import agreement, gradient, intervention
+from coil_rl.learners import PPO
+from coil_rl.listening.measures import InterceptedPolicy, agreement, gradient, intervention, split_policy
 
 
-def states(count=500, guides=2, size=1):
+def random_states(count=500, guides=2, size=1):
     torch.manual_seed(0)
     return TensorDict(
         {"observation": torch.randn(count, 3), "guide_action": torch.rand(count, guides, size) * 2 - 1}, [count]
     )
 
 
-def first(seen):
-    return seen["guide_action"][:, 0]
+def follow_first(states):
+    return states["guide_action"][:, 0]
 
 
-def test_an_agent_that_does_what_the_first_guide_says_listens_to_that_one_only():
-    seen = states()
-    gap = (seen["guide_action"][:, 0] - seen["guide_action"][:, 1]).abs().squeeze(-1)
-    assert (agreement(first, seen)[:, 0] == 0).all()
-    assert (agreement(first, seen)[:, 1] == gap).all()
-    moved = intervention(first, seen, donors=64, generator=torch.Generator().manual_seed(0))
-    assert (moved[:, 1] == 0).all()
-    # Two independent draws from [-1, 1] are 2/3 apart in the mean.
-    assert moved[:, 0].mean() == pytest.approx(2 / 3, abs=0.04)
-    assert gradient(first, seen).unique(dim=0).tolist() == [[1.0, 0.0]]
+def test_follower_of_the_first_guide_uses_only_that_one():
+    states = random_states()
+    distance = (states["guide_action"][:, 0] - states["guide_action"][:, 1]).abs().squeeze(-1)
+    assert (agreement(follow_first, states) == torch.stack([torch.zeros_like(distance), distance], 1)).all()
+    change = intervention(follow_first, states, donors=64, generator=torch.Generator().manual_seed(0))
+    assert (change[:, 1] == 0).all()
+    # The mean distance of two independent draws from [-1, 1] is 2/3.
+    assert change[:, 0].mean() == pytest.approx(2 / 3, abs=0.04)
+    assert gradient(follow_first, states).unique(dim=0).tolist() == [[1.0, 0.0]]
 
 
-def test_an_agent_that_agrees_by_coincidence_is_not_said_to_listen():
-    seen = states()
-    seen["guide_action"][:, 0] = seen["observation"][:, :1]
-    learned = nn.Linear(3, 1)
-    with torch.no_grad():
-        learned.weight.copy_(torch.tensor([[1.0, 0.0, 0.0]]))
-        learned.bias.zero_()
-    assert (agreement(lambda s: learned(s["observation"]), seen)[:, 0] == 0).all()
-    assert (intervention(lambda s: learned(s["observation"]), seen) == 0).all()
-    assert (gradient(lambda s: learned(s["observation"]), seen) == 0).all()
+def test_agreement_by_coincidence_is_no_use_of_advice():
+    states = random_states()
+    states["guide_action"][:, 0] = states["observation"][:, :1]
+    network = nn.Linear(3, 1)
+    nn.init.zeros_(network.bias)
+    network.weight.data = torch.tensor([[1.0, 0.0, 0.0]])
+
+    def act(states):
+        return network(states["observation"])
+
+    assert (agreement(act, states)[:, 0] == 0).all()
+    assert (intervention(act, states) == 0).all()
+    assert (gradient(act, states) == 0).all()
 
 
-def test_gradient_is_that_of_finite_differences():
-    seen = states(50, guides=3, size=2).double()
+def test_gradient_equals_finite_differences():
+    states = random_states(50, guides=3, size=2).double()
     network = nn.Sequential(nn.Linear(9, 16), nn.Tanh(), nn.Linear(16, 2)).double()
 
-    def act(s):
-        return network(torch.cat([s["observation"], s["guide_action"].flatten(1)], -1))
+    def act(states):
+        return network(torch.cat([states["observation"], states["guide_action"].flatten(1)], -1))
 
-    found, step = gradient(act, seen), 1e-6
+    found, step = gradient(act, states), 1e-6
     for guide in range(3):
         squares = torch.zeros(50, dtype=torch.float64)
         for axis in range(2):
-            there, back = seen.clone(), seen.clone()
-            there["guide_action"][:, guide, axis] += step
-            back["guide_action"][:, guide, axis] -= step
-            squares += ((act(there) - act(back)).detach() / (2 * step)).square().sum(-1)
+            above, below = states.clone(), states.clone()
+            above["guide_action"][:, guide, axis] += step
+            below["guide_action"][:, guide, axis] -= step
+            squares += ((act(above) - act(below)).detach() / (2 * step)).square().sum(-1)
         torch.testing.assert_close(found[:, guide], squares.sqrt(), rtol=1e-6, atol=1e-8)
 
 
-def test_a_choice_has_no_gradient():
-    assert gradient(lambda s: (s["guide_action"][:, 0] > 0).float(), states()).isnan().all()
+def test_discrete_action_has_no_gradient():
+    assert gradient(lambda states: (states["guide_action"][:, 0] > 0).float(), random_states()).isnan().all()
 
 
-def test_an_advice_that_never_changes_moves_nothing():
-    seen = states()
-    seen["guide_action"][:, 1] = 0.3
-    moved = intervention(lambda s: s["guide_action"].sum(1), seen)
-    assert (moved[:, 1] == 0).all()
-    assert (moved[:, 0] > 0).all()
+def test_constant_advice_has_no_effect():
+    states = random_states()
+    states["guide_action"][:, 1] = 0.3
+    change = intervention(lambda states: states["guide_action"].sum(1), states)
+    assert (change[:, 1] == 0).all()
+    assert (change[:, 0] > 0).all()
 
 
-def test_interventions_are_seeded_and_leave_the_states_as_they_are():
-    seen, before = states(), states()
-    runs = [intervention(first, seen, 4, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+def test_interventions_are_seeded_and_do_not_change_the_states():
+    states, before = random_states(), random_states()
+    runs = [intervention(follow_first, states, 4, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
     assert (runs[0] == runs[1]).all()
     assert (runs[0] != runs[2]).any()
-    gradient(lambda s: s.set("more", s["guide_action"])["guide_action"][:, 0], seen)
-    assert set(seen.keys()) == set(before.keys())
-    assert (seen == before).all()
+    gradient(lambda states: states.set("more", states["guide_action"])["guide_action"][:, 0], states)
+    assert set(states.keys()) == set(before.keys())
+    assert (states == before).all()
 
 
-def test_donors_are_at_least_one():
-    with pytest.raises(ValueError, match="donors=0 must be at least 1"):
-        intervention(first, states(), donors=0)
+def double(state):
+    return state.set("guide_action", state["guide_action"] * 2)
+
+
+def test_intercepted_policy_acts_on_changed_advice_and_leaves_that_of_the_env():
+    follow = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
+    state = cones().reset()
+    advice = state["guide_action"].clone()
+    acted = InterceptedPolicy(follow, double)(state)
+    assert (acted["action"] == 2 * advice[:, 0]).all()
+    assert (acted["guide_action"] == advice).all()
+
+
+def test_policy_without_a_change_acts_as_before():
+    env = cones()
+    policy, state = PPO(env, ["observation", "guide_action"], action_gain=1.0).policy, env.reset()
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert (policy(state.clone()) == InterceptedPolicy(policy, lambda state: state)(state.clone())).all()
+
+
+@pytest.mark.parametrize("mode", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+def test_advice_of_the_first_module_of_a_policy_is_intercepted(mode):
+    env = cones()
+    actor = PPO(env, ["observation", "guide_action"], action_gain=1.0).policy
+    advise = TensorDictModule(lambda seen: seen[:, None, :1], in_keys=["observation"], out_keys=["guide_action"])
+    dynamic = ProbabilisticTensorDictSequential(advise, *actor.module)
+    state = env.reset().exclude("guide_action")
+    actions = []
+    for act in (
+        InterceptedPolicy(dynamic, double),
+        InterceptedPolicy(TensorDictSequential(advise, actor), double),
+        lambda state: actor(double(advise(state))),
+    ):
+        torch.manual_seed(1)
+        with set_exploration_type(mode):
+            actions.append(act(state.clone())["action"])
+    assert (actions[0] == actions[2]).all()
+    assert (actions[1] == actions[2]).all()
+    assert split_policy(dynamic)[0] is advise
+
+
+def test_policy_without_advice_is_an_error():
+    with pytest.raises(ValueError, match="does not read guide_action; it reads observation"):
+        split_policy(PPO(cones(), ["observation"]).policy)

@@ -8,81 +8,76 @@ from coil_rl.report.runs import read_runs
 
 
 def section(folder, against=None):
-    found = compare(read_runs([folder]))
-    return page.section("Results", found, found.table(against), against)
+    comparison = compare(read_runs([folder]))
+    return page.section("Results", comparison, comparison.table(against), against)
 
 
-def test_a_section_is_a_table_of_drivers_and_one_of_tracks(tmp_path):
+def cells(table):
+    lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()]
+    return [lines[0], *lines[2:]]
+
+
+def test_section_has_a_table_of_drivers_and_one_of_tracks(tmp_path):
     heading, drivers, tracks = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
     assert heading == "## Results"
-    titles, _, guide, ppo, coil, zeroed = [
-        [cell.strip() for cell in line.split("|")[1:-1]] for line in drivers.splitlines()
-    ]
+    titles, guide, ppo, coil, zeroed = cells(drivers)
     assert titles[:6] == ["driver", "advice", "seeds", "reward (IQM)", "95 % interval", "mean"]
     assert titles[-2:] == ["better than ppo", "guide at test time"]
     assert guide[:6] == ["guide", "", "-", "550.0", "-", "550.0"]
     assert coil[:4] == ["coil", "", "3", "571.0"]
     assert coil[6:] == ["100%", "0%", "50.00", "0.200", "0.30", "0%", "yes"]
-    assert ppo[-2:] == ["-", "no"]
-    assert zeroed[:2] == ["coil", "zeroed"]
-    assert zeroed[-1] == "-"
+    assert (ppo[-2:], zeroed[:2], zeroed[-1]) == (["-", "no"], ["coil", "zeroed"], "-")
     low, high = map(float, coil[4].split(" to "))
     assert 570 <= low < high <= 572
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tracks.splitlines()]
-    assert rows[0] == ["mean reward", "a", "b"]
-    assert rows[-1] == ["coil, zeroed", "-100.0", "-201.0"]
+    assert cells(tracks)[0] == ["mean reward", "a", "b"]
+    assert cells(tracks)[-1] == ["coil, zeroed", "-100.0", "-201.0"]
 
 
-def test_columns_that_say_nothing_are_left_out(tmp_path):
-    make_run(tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}) + driven("coil", {"a": 2.0}))
-    drivers = section(tmp_path)
-    assert "advice" not in drivers
-    assert "better than" not in drivers
-
-
-def test_many_tracks_are_left_to_the_file(tmp_path):
+def test_empty_columns_and_many_tracks_are_omitted(tmp_path):
     tracks = {f"track_{k}": 1.0 * k for k in range(9)}
     make_run(tmp_path / "run", "coil", 0, driven("guide", tracks) + driven("coil", tracks))
-    assert section(tmp_path).endswith("The rewards on each of the 9 tracks are in report_tracks.csv.")
+    text = section(tmp_path)
+    assert "advice" not in text
+    assert "better than" not in text
+    assert text.endswith("The rewards on each of the 9 tracks are in report_tracks.csv.")
 
 
-def test_notes_say_what_was_done():
-    assert "1234 resamples of whole seeds" in page.notes(1234, None)
-    assert "Better than" not in page.notes(10, None)
-    assert "Better than its guide: the probability" in page.notes(10, "guide")
-    assert page.progress(3, 3) == "All 3 runs that have begun are finished."
-    assert page.progress(2, 3).endswith("goes on with the rest.")
-
-
-def test_tasks_have_a_table_of_their_own(tmp_path):
+def test_tasks_have_their_own_table(tmp_path):
     for seed, left in enumerate((0.5, 1.0)):
         rows = driven("guide", {"a": 1.0}, per_step_left=0.25, per_step_right=float("nan"))
         rows += driven("coil", {"a": 2.0}, per_step_left=left, per_step_right=-0.125)
         make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
-    tasks = section(tmp_path).split("\n\n")[2]
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in tasks.splitlines()]
-    assert rows[0] == ["reward of a step", "left", "right"]
-    assert rows[2:] == [["guide", "0.250", "-"], ["coil", "0.750", "-0.125"]]
+    tasks = cells(section(tmp_path).split("\n\n")[2])
+    assert tasks == [["reward of a step", "left", "right"], ["guide", "0.250", "-"], ["coil", "0.750", "-0.125"]]
 
 
-def test_guides_that_learned_have_what_they_earned_before_and_after(tmp_path):
+def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
     for seed, label in enumerate(["dynamic", "dynamic", "coil"]):
         run = make_run(tmp_path / str(seed), label, seed, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
         if label == "dynamic":
-            own = [10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed]
-            write_csv([{"frames": n, "guide/spline": value} for n, value in enumerate(own)], run / "metrics.csv")
-    (table,) = page.guides_that_learned(read_runs([tmp_path]))
-    assert [cell.strip() for cell in table.splitlines()[-1].split("|")[1:-1]] == ["dynamic", "2", "10.5 to 40.5"]
-    assert page.guides_that_learned(read_runs([tmp_path / "2"])) == []
+            returns = [10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed]
+            write_csv([{"frames": n, "guide/spline": value} for n, value in enumerate(returns)], run / "metrics.csv")
+    (table,) = page.guide_training(read_runs([tmp_path]))
+    assert cells(table)[1:] == [["dynamic", "2", "10.5 to 40.5"]]
+    assert page.guide_training(read_runs([tmp_path / "2"])) == []
 
 
-def test_learning_is_told_by_the_area_under_the_curve_its_end_and_its_height(tmp_path):
+def test_training_is_summarised_by_area_final_and_highest_return(tmp_path):
     rows = driven("any", {"a": 500.0})
     for label, returns in {"late": ["nan", 100.0, 300.0], "early": [200.0, 400.0, 300.0]}.items():
         folder = make_run(tmp_path / label, label, 0, rows)
         write_csv([{"frames": 1000 * n, page.TRAINING: x} for n, x in enumerate(returns, 1)], folder / "metrics.csv")
     (tmp_path / "late" / "training_time.json").write_text('{"seconds": 12.4}')
-    (table,) = page.learning(read_runs([tmp_path]))
-    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in table.splitlines()[2:]]
-    assert cells == [["early", "1", "3,000", "300.0", "300.0", "400.0", "-"],
-                     ["late", "1", "3,000", "200.0", "300.0", "300.0", "12"]]  # fmt: skip
+    (table,) = page.training(read_runs([tmp_path]))
+    assert cells(table)[1:] == [
+        ["early", "1", "3,000", "300.0", "300.0", "400.0", "-"],
+        ["late", "1", "3,000", "200.0", "300.0", "300.0", "12"],
+    ]
+
+
+def test_notes_depend_on_the_options():
+    assert "1234 resamples of whole seeds" in page.notes(1234, None)
+    assert "Better than" not in page.notes(10, None)
+    assert "Better than its guide: the probability" in page.notes(10, "guide")
+    assert page.progress(3, 3) == "All 3 runs that were started are finished."
+    assert page.progress(2, 3).startswith("2 of 3 runs")

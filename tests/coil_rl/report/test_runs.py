@@ -2,7 +2,7 @@ import pytest
 from run_folders import driven, make_run, make_sweep
 
 from coil_rl.errors import UserError
-from coil_rl.report.runs import MEASURES, read_runs
+from coil_rl.report.runs import read_runs
 
 
 @pytest.fixture
@@ -12,28 +12,35 @@ def sweep(tmp_path):
 
 def test_every_run_of_a_folder_is_read(sweep):
     runs = read_runs([sweep])
-    assert [(run.folder.name, run.label, run.seed) for run in runs[:2]] == [
-        ("0_coil", "coil", 0),
-        ("1_coil", "coil", 1),
-    ]
+    names = [(run.folder.name, run.label, run.seed) for run in runs[:2]]
+    assert names == [("0_coil", "coil", 0), ("1_coil", "coil", 1)]
     assert [run.finished for run in runs] == [True] * 6 + [False] * 2
     assert [run.needs_guide for run in runs[2:4]] == [True, False]
-    guide, agent, sampled, zeroed = runs[1].drives
-    assert (guide.driver, guide.advice, guide.actions, guide.tracks) == ("guide", "", "deterministic", ("a", "b"))
-    assert (agent.driver, sampled.actions, zeroed.advice) == ("coil", "sampled", "zeroed")
-    assert agent.values[:, MEASURES.index("reward")].tolist() == [521, 621], "without the row of the mean"
-    assert agent.values[:, MEASURES.index("smoothness")].tolist() == [0.2, 0.2]
+    drives = runs[1].evaluation.groupby(["driver", "advice", "actions"], sort=False)
+    assert list(drives.groups) == [
+        ("guide", "", "deterministic"), ("coil", "", "deterministic"), ("coil", "", "sampled"),
+        ("coil", "zeroed", "deterministic"),
+    ]  # fmt: skip
+    agent = drives.get_group(("coil", "", "deterministic"))
+    assert agent[["track", "reward", "smoothness"]].to_numpy().tolist() == [["a", 521, 0.2], ["b", 621, 0.2]]
     assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == ({"guide": 300}, 1000, 20)
 
 
-def test_runs_are_found_at_any_depth_and_once(sweep):
+def test_numbers_keep_every_digit(tmp_path):
+    make_run(tmp_path / "run", "coil", 0, driven("coil", {"a": 0.1 + 0.2, "b": 1 / 3}))
+    (run,) = read_runs([tmp_path])
+    assert run.evaluation["reward"].tolist() == [0.1 + 0.2, 1 / 3]
+
+
+def test_runs_are_found_once_at_any_depth(sweep):
     (sweep / "0_coil" / ".hydra").mkdir()
     (sweep / "0_coil" / ".hydra" / "config.yaml").write_text("seed: 0")
+    make_run(sweep / "0_coil" / "proxies" / "spline", "proxy", 0, None)
     assert len(read_runs([sweep.parent])) == len(read_runs([sweep, sweep / "0_coil", sweep.parent])) == 8
     assert [run.label for run in read_runs([sweep / "3_ppo", sweep / "0_coil"])] == ["ppo", "coil"]
 
 
-def test_a_guide_alone_learns_nothing(tmp_path):
+def test_guide_without_agent_has_no_curve(tmp_path):
     run = make_run(tmp_path / "run", "guide", 0, driven("guide", {"a": 1.0}), needs_guide=None)
     (run / "metrics.csv").unlink()
     (run / "guide_return.json").unlink()
@@ -42,44 +49,42 @@ def test_a_guide_alone_learns_nothing(tmp_path):
     assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
+ROW = "driver,advice,actions,track,reward,lap_time,smoothness,completed,crashed,clearance\nguide,,sampled,a,"
+
+
 @pytest.mark.parametrize(
-    ("file", "text", "words"),
+    ("file", "text", "message"),
     [
-        ("evaluation.csv", "", r"is damaged \(no rows\); remove the file and write it again by coil-train resume="),
-        ("evaluation.csv", "driver,actions\nguide,sampled\n", r"no column 'advice'"),
         (
             "evaluation.csv",
-            "driver,advice,actions,track,reward\nguide,,sampled,a,much\n",
-            "could not convert .* 'much'",
+            "",
+            r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
         ),
-        ("evaluation.csv", "driver,advice,actions,track,reward\nguide,,sampled,a,1.0\n", "no column 'lap_time'"),
-        ("evaluation.csv", 'driver,advice\n"guide', "unexpected end of data"),
+        ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
+        ("evaluation.csv", "driver,actions\nguide,sampled\n", r"\['advice', .*not in index"),
+        ("evaluation.csv", ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
+        ("evaluation.csv", ROW + "1,1,1", "could not convert .* ''"),
+        ("evaluation.csv", ROW + "1,1,1,1,1,1,1", "more values than columns"),
+        ("evaluation.csv", 'driver,advice\n"guide', "EOF inside string"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
-        ("metrics.csv", "frames,train/return\n1,2\n3,\n", r"metrics.csv is damaged .*; put the whole file back"),
+        ("metrics.csv", "frames,train/return\n1,2\n3,\n", r"metrics.csv is damaged .*; restore the file"),
         ("metrics.csv", "frames,train/return\n1,2\n3\n", "metrics.csv is damaged"),
         ("guide_return.json", "[1", "guide_return.json is damaged"),
-        ("config.yaml", "seed: 0\n", r"no label, seed and method.needs_guide to read \(Missing key label\)"),
-        ("config.yaml", "- 1\n", r"to read \(a list\); put back the file"),
-        ("config.yaml", "seed: [\n", "take the run out of the folder"),
+        ("config.yaml", "seed: 0\n", r"no valid label, seed and method.needs_guide \(Missing key label\)"),
+        ("config.yaml", "- 1\n", r"\(a list\); restore the file"),
+        ("config.yaml", "seed: [\n", "remove the run from the folder"),
         ("config.yaml", "seed: x\nlabel: a\nmethod: {needs_guide: true}\n", "invalid literal for int"),
     ],
 )
-def test_a_damaged_file_is_named(sweep, file, text, words):
+def test_error_names_the_damaged_file(sweep, file, text, message):
     (sweep / "1_coil" / file).write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(UserError, match=words) as found:
+    with pytest.raises(UserError, match=message) as error:
         read_runs([sweep])
-    assert str(found.value).startswith(str(sweep / "1_coil" / file))
-    assert "\n" not in str(found.value)
+    assert str(error.value).startswith(str(sweep / "1_coil" / file))
+    assert "\n" not in str(error.value)
 
 
-def test_folders_without_runs_are_refused(tmp_path):
-    with pytest.raises(UserError, match="holds no run of coil-train"):
-        read_runs([tmp_path])
-    with pytest.raises(UserError, match="is not there; give a folder in which coil-train"):
-        read_runs([tmp_path / "nowhere"])
-
-
-def test_what_a_run_keeps_for_itself_is_no_run(tmp_path):
-    run = make_run(tmp_path / "run", "coil", 0, driven("guide", {"a": 1.0}))
-    make_run(run / "proxies" / "spline", "proxy", 0, None)
-    assert [found.folder for found in read_runs([tmp_path])] == [run]
+@pytest.mark.parametrize(("name", "message"), [("", "holds no run of coil-train"), ("nowhere", "does not exist")])
+def test_folder_without_runs_is_an_error(name, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        read_runs([tmp_path / name])

@@ -1,0 +1,230 @@
+"""Training curves: learning curves in one plot or in a grid, and the training phases of one run."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from coil_rl.report import style
+
+Array = NDArray[np.float64]
+Rows = Sequence[Mapping[str, object]]
+
+TRAINING = "train/return"
+RESAMPLES = 2000
+UNITS = {1e6: "frames (millions)", 1e3: "frames (thousands)"}
+RETURN = "return (sum of rewards of an episode)"
+GRID_COLUMNS = 3
+GRID_ROW_HEIGHT = 1.55  # inches
+AGENT = "#1a1a1a"  # the agent in `draw_phases`
+
+
+def draw_learning_curves(
+    runs: Mapping[str, Sequence[Rows]],
+    path: str | os.PathLike[str],
+    *,
+    guides: Mapping[str, float] | None = None,
+    title: str | None = None,
+) -> None:
+    """Draw the return in training against frames, one curve per label.
+
+    Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 %
+    bootstrap interval of that mean as a band.
+
+    Args:
+        runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with "frames" (env frames
+            so far) and "train/return", which may be missing, None or NaN.
+        path: output file.
+        guides: mean return of each guide by name, drawn as a dashed line.
+        title: above the plot.
+    """
+    if not any(len(seeds) for seeds in runs.values()):
+        raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
+    curves = {label: mean_curve(seeds, TRAINING) for label, seeds in runs.items()}
+    unit, unit_name = _frame_unit(curves)
+    strokes = style.strong_strokes(runs)
+    handles: list[Artist] = []
+    for label, stroke in strokes.items():
+        seeds = f" ({len(runs[label])} runs)" if len(runs[label]) > 1 else ""
+        handles.append(Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=2, label=label + seeds))
+    handles.append(Line2D([], [], color=style.QUIET, lw=0.9, label="training"))
+    if any(len(seeds) > 1 for seeds in runs.values()):
+        handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
+    with style.picture(path, title, handles, 4.2) as figure:
+        axes = figure.add_subplot(xlabel=unit_name, ylabel=RETURN)
+        style.lighten(axes)
+        for label, stroke in strokes.items():
+            frames, mean, low, high = curves[label]
+            axes.plot(frames / unit, mean, color=stroke.colour, ls=stroke.linestyle, alpha=0.45, lw=0.9)
+            axes.fill_between(frames / unit, low, high, color=stroke.colour, alpha=0.16, lw=0)
+        axes.margins(x=0.02)
+        axes.set_xlim(left=0)
+        for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
+            axes.axhline(value, color=colour, ls=(0, style.DASHES), lw=1.3, zorder=1.5)
+            axes.annotate(
+                f"{name}\n{value:.1f}", (1, value), (4, 0), xycoords=("axes fraction", "data"),
+                textcoords="offset points", va="center", color=colour,
+            )  # fmt: skip
+
+
+def draw_curve_grid(
+    runs: Mapping[str, Sequence[Rows]],
+    path: str | os.PathLike[str],
+    *,
+    guides: Mapping[str, float] | None = None,
+) -> None:
+    """Draw one small learning curve per label, at least one, with the other labels faint behind it.
+
+    `runs` are as in `draw_learning_curves`; `guides` are the mean returns of the guides by label.
+    """
+    if not runs:
+        raise ValueError("A grid of learning curves needs at least one label; got none.")
+    curves = {label: mean_curve(seeds, TRAINING) for label, seeds in runs.items()}
+    unit, unit_name = _frame_unit(curves)
+    columns = min(GRID_COLUMNS, len(runs))
+    rows = -(-len(runs) // columns)
+    handles: list[Artist] = [
+        Line2D([], [], color=style.AGENTS[0], lw=1.5, label="training, mean of the runs"),
+        Patch(color=style.AGENTS[0], alpha=0.25, lw=0, label="95 % interval of the mean"),
+        Line2D([], [], color=style.KERB, lw=0.6, label="the others"),
+    ]
+    if guides:
+        handles.append(Line2D([], [], color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.0, label="its guide"))
+    height = 0.35 + GRID_ROW_HEIGHT * rows
+    with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
+        grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
+        for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
+            for other, (other_frames, other_mean, _, _) in curves.items():
+                if other != label:
+                    axes.plot(other_frames / unit, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
+            axes.fill_between(frames / unit, low, high, color=style.AGENTS[0], alpha=0.25, lw=0, zorder=2.1)
+            axes.plot(frames / unit, mean, color=style.AGENTS[0], lw=1.5, zorder=2.2)
+            if guides and label in guides:
+                axes.axhline(guides[label], color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.0)
+            axes.set_title(f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label, size=9, loc="left")
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.set_xlim(left=0)
+            axes.tick_params(labelbottom=True)
+        for axes in figure.axes[len(runs) :]:
+            axes.remove()
+        for axes in figure.axes[:-columns]:
+            axes.tick_params(labelbottom=False)
+        figure.supxlabel(unit_name, size=9)
+        figure.supylabel(RETURN, size=9)
+
+
+def draw_phases(
+    rows: Sequence[Mapping[str, float]],
+    guides: Sequence[str],
+    path: str | os.PathLike[str],
+    *,
+    title: str | None = None,
+) -> None:
+    """Draw one run of Dynamic COIL: returns, change of each guide's action, and learning rates.
+
+    The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`, at least one, and
+    `guides` the names in the order of the run.
+    """
+    if not rows:
+        raise ValueError("A plot of phases needs at least one row; got none.")
+    colours = {name: style.AGENTS[index % len(style.AGENTS)] for index, name in enumerate(guides)}
+    frames = _column(rows, "frames")
+    unit, unit_name = _unit(float(frames[-1]))
+    frames = frames / unit
+    handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent, in training")]
+    alone: dict[str, Any] = {"ls": (0, style.DASHES), "lw": 1.1, "marker": "o", "ms": 4}
+    handles += [Line2D([], [], color=colour, label=f"{name} alone", **alone) for name, colour in colours.items()]
+    handles.append(Patch(color=style.QUIET, alpha=0.25, lw=0, label="a guide learns (its colour)"))
+    with style.picture(path, title, handles, 6.8, h_pad=0.08) as figure:
+        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1, 1))
+        top.plot(frames, _column(rows, TRAINING), color=AGENT, lw=1.6)
+        for name, colour in colours.items():
+            returns = _column(rows, f"guide/{name}")
+            measured = np.isfinite(returns)
+            # The guides of the first row were measured before the first update.
+            measured_at = np.where(np.arange(len(frames)) == 0, 0.0, frames)
+            top.plot(measured_at[measured], returns[measured], color=colour, **alone)
+            middle.plot(frames, _column(rows, f"learner/moved_{name}"), color=colour, lw=1.4)
+        _draw_rates(bottom, frames, rows, list(colours.values()))
+        for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
+            axes.set_ylabel(label)
+            style.lighten(axes)
+            axes.margins(x=0)
+            axes.set_xlim(left=0)
+            _shade_phases(axes, frames, rows, list(colours.values()))
+        middle.set_ylim(bottom=0)
+        bottom.set_xlabel(unit_name)
+
+
+def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
+    """Return frames, mean over the runs and the 95 % interval (low, high) of the mean, each [P]; P = 0 without data."""
+    curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
+    if not curves:
+        return np.empty(0), np.empty(0), np.empty(0), np.empty(0)
+    start, end = max(curve[0, 0] for curve in curves), min(curve[-1, 0] for curve in curves)
+    frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
+    frames = frames[(frames >= start) & (frames <= end)]
+    values = np.stack([np.interp(frames, *curve.T) for curve in curves])
+    mean = values.mean(axis=0)
+    if len(curves) == 1:
+        return frames, mean, mean, mean
+    # The same resamples at every point: the band is as smooth as the curves.
+    resamples = np.random.default_rng(0).integers(len(curves), size=(RESAMPLES, len(curves)))
+    weights = (resamples[..., None] == np.arange(len(curves))).mean(axis=1)
+    low, high = np.percentile(weights @ values, [2.5, 97.5], axis=0)
+    return frames, mean, low, high
+
+
+def points(run: Rows, key: str) -> Array:
+    """Return frames and values [P, 2] of the rows with a finite value, sorted by frames."""
+    for row in run:
+        if "frames" not in row:
+            raise ValueError(f"A row of a learning curve has no 'frames'; it has: {', '.join(row) or 'nothing'}.")
+    table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
+    curve: Array = table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
+    return curve
+
+
+def _frame_unit(curves: Mapping[str, tuple[Array, Array, Array, Array]]) -> tuple[float, str]:
+    return _unit(max((frames[-1] for frames, *_ in curves.values() if len(frames)), default=0.0))
+
+
+def _unit(last: float) -> tuple[float, str]:
+    """Return the unit of an axis of frames that ends at `last`, and its name."""
+    return next(((unit, name) for unit, name in UNITS.items() if last >= unit), (1.0, "frames"))
+
+
+def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:
+    return np.array([row.get(key, np.nan) for row in rows], dtype=np.float64)
+
+
+def _draw_rates(axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]) -> None:
+    learner = _column(rows, "learner/guide")  # index of the guide that learns; len(colours) for all of them
+    guide_rate = _column(rows, "learner/guide_learning_rate")
+    rates = {AGENT: _column(rows, "learner/learning_rate")}
+    for index, colour in enumerate(colours):
+        rates[colour] = np.where((learner == index) | (learner == len(colours)), guide_rate, np.nan)
+    edges = np.concatenate([[0.0], frames])
+    for colour, values in rates.items():
+        axes.stairs(np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
+
+
+def _shade_phases(axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]) -> None:
+    start = 0.0
+    for frame, row in zip(frames, rows, strict=True):
+        index = int(row["learner/guide"])
+        if 0 <= index < len(colours):
+            axes.axvspan(start, float(frame), color=colours[index], alpha=0.12, lw=0)
+        start = float(frame)

@@ -1,0 +1,69 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from ovals import circle, oval_line
+
+from coil_rl.envs import Track, shipped_tracks
+from coil_rl.listening.sections import SECTIONS, TrackSections, classify, curvature, smooth_line
+
+
+def names(line, **lengths):
+    return {SECTIONS[section] for section in classify(line, **lengths)}
+
+
+def test_circle_is_one_turn():
+    assert names(circle(8)) == {"left"}
+    assert names(circle(8, clockwise=True)) == {"right"}
+    assert names(circle(12)) == {"straight"}, "wider than a turn"
+    assert names(circle(12), turn_radius=13) == {"left"}
+    np.testing.assert_allclose(curvature(circle(8, 1000)), 1 / 8, rtol=1e-4)
+    np.testing.assert_allclose(curvature(circle(5, 1000, clockwise=True)), -1 / 5, rtol=1e-4)
+
+
+def test_entries_are_before_turns_and_exits_after_them():
+    sections = [SECTIONS[section] for section in classify(oval_line(), approach=4.0)]
+    pieces = [sections[0], *(b for a, b in itertools.pairwise(sections) if a != b)]
+    assert pieces == ["exit", "straight", "entry", "left"] * 2
+    metres = {name: 0.1 * sections.count(name) / 2 for name in SECTIONS}
+    assert metres == pytest.approx({"straight": 32, "left": 6 * np.pi, "right": 0, "entry": 4, "exit": 4}, abs=0.3)
+
+
+def test_exit_ends_half_way_between_close_turns():
+    sections = [SECTIONS[section] for section in classify(oval_line(length=5.0), approach=4.0)]
+    assert set(sections) == {"left", "entry", "exit"}
+    assert sections.count("entry") == pytest.approx(sections.count("exit"), abs=2)
+
+
+def test_sections_do_not_depend_on_the_start_of_the_lap():
+    line = oval_line()
+    assert (np.roll(classify(line), 137) == classify(np.roll(line, 137, axis=0))).all()
+
+
+@pytest.mark.parametrize("clockwise", [False, True])
+def test_smooth_line_is_half_way_between_the_boundaries(clockwise):
+    inner, outer = circle(7, 40, clockwise), circle(9, 50, clockwise)
+    line = smooth_line(Track("ring", *((outer, inner) if clockwise else (inner, outer))))
+    np.testing.assert_allclose(np.linalg.norm(line, axis=1), 8, atol=0.1)
+    assert names(line) == {"right" if clockwise else "left"}
+
+
+def test_shipped_tracks_turn_once_and_have_all_kinds_of_turns():
+    for track in shipped_tracks("test"):
+        line = smooth_line(track)
+        step = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1)
+        assert step.sum() == pytest.approx(track.length, rel=0.03)
+        assert abs((curvature(line) * step).sum()) == pytest.approx(2 * np.pi, rel=0.01)
+        assert names(line) >= {"left", "right", "entry", "exit"}
+
+
+def test_cars_are_located_on_their_own_track():
+    sections = TrackSections(shipped_tracks("test"))
+    for index, line in enumerate(sections.lines):
+        noise = np.random.default_rng(0).uniform(-0.05, 0.05, line.shape)
+        track = torch.full((len(line),), index)
+        nearest = sections.nearest(track, torch.as_tensor(line + noise, dtype=torch.float32))
+        assert (nearest - torch.arange(len(line))).abs().max() <= 1
+        exact = torch.as_tensor(line, dtype=torch.float32)
+        assert sections.section(track, exact).tolist() == sections.sections[index].tolist()

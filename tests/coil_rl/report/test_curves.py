@@ -1,0 +1,108 @@
+import math
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from coil_rl.report import draw_curve_grid, draw_learning_curves, draw_phases
+from coil_rl.report.curves import TRAINING, mean_curve
+
+
+def run(seed, rows=40):
+    rng = np.random.default_rng(seed)
+    values = [300 * (1 - math.exp(-index / 10)) + float(rng.normal()) for index in range(rows)]
+    return [{"frames": 50_000 * (n + 1), TRAINING: value if n else math.nan} for n, value in enumerate(values)]
+
+
+def phase_rows(updates=24):
+    """Two guides take turns in every second phase."""
+    rows = []
+    for update in range(updates):
+        phase = update // 4
+        guide = -1 if phase % 2 == 0 else phase // 2 % 2
+        rows.append({
+            "frames": 1000.0 * (update + 1), "train/return": math.nan if update < 5 else 10.0 * update,
+            "learner/guide": guide, "learner/learning_rate": 1e-3 * 0.9**phase if guide < 0 else 0.0,
+            "learner/guide_learning_rate": 0.0 if guide < 0 else 1e-4,
+            "learner/moved_a": 0.01 * phase, "learner/moved_b": 0.005 * phase,
+            "guide/a": 200.0 if update in (0, 23) else math.nan, "guide/b": 100.0 if update == 0 else math.nan,
+        })  # fmt: skip
+    return rows
+
+
+@pytest.mark.parametrize(
+    "runs",
+    [
+        {"COIL": [run(0), run(1), run(2)], "PPO": [run(3, rows=20)]},
+        {"COIL": [run(0)], "PPO": []},
+        {str(index): [run(index)] for index in range(8)},
+        {"empty": [[]]},
+        {"no values": [[{"frames": 0, TRAINING: None}, {"frames": 100}, {"frames": 200, TRAINING: math.nan}]]},
+        {"no common frames": [run(0, rows=3), [{**row, "frames": 1e9} for row in run(1, rows=3)]]},
+    ],
+)
+def test_learning_curves_are_drawn_for_any_number_of_runs_and_values(runs, tmp_path):
+    draw_learning_curves(runs, tmp_path / "curve.png", guides={"guide": 243.2}, title="Learning")
+    with Image.open(tmp_path / "curve.png") as image:
+        assert image.size == (1600, 840)
+    assert list(tmp_path.iterdir()) == [tmp_path / "curve.png"]
+
+
+@pytest.mark.parametrize(("labels", "rows"), [(1, 1), (6, 2), (7, 3)])
+def test_grid_has_one_plot_per_label(labels, rows, tmp_path):
+    runs = {f"label {k}": [run(k), run(k + 10)] for k in range(labels)} | {"label 0": [[]]}
+    draw_curve_grid(runs, tmp_path / "grid.png", guides={"label 0": 3.0})
+    with Image.open(tmp_path / "grid.png") as image:
+        assert image.width == 1600
+        assert 1.5 * rows < image.height / 200 < 1.6 * rows + 1.2
+
+
+def test_phases_of_each_guide_have_its_colour(tmp_path):
+    draw_phases(phase_rows(), ["a", "b"], tmp_path / "phases.png", title="Phases")
+    with Image.open(tmp_path / "phases.png") as image:
+        assert image.width == 1600
+        colours = image.convert("RGB").getcolors(image.width * image.height)
+    assert len([colour for count, colour in colours if count > 8000 and colour != (255, 255, 255)]) >= 2
+    joint = phase_rows()[0] | {"learner/guide": 2, "learner/guide_learning_rate": 1e-4}
+    draw_phases([joint], ["a", "b"], tmp_path / "joint.png")
+    assert (tmp_path / "joint.png").stat().st_size > 10_000
+
+
+def test_single_run_is_its_own_mean_and_interval():
+    rows = [{"frames": f, TRAINING: v} for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))]
+    frames, *curves = mean_curve([rows], TRAINING)
+    np.testing.assert_array_equal(frames, [10, 20, 40])
+    for curve in curves:
+        np.testing.assert_array_equal(curve, [1, 2, 4])
+
+
+def test_runs_are_averaged_over_their_common_frames():
+    first = [{"frames": f, TRAINING: 1.0 * f} for f in (0, 10, 20, 30)]
+    second = [{"frames": f, TRAINING: 3.0 * f} for f in (5, 15, 25)]
+    frames, mean, low, high = mean_curve([first, second, []], TRAINING)
+    np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
+    np.testing.assert_allclose([mean, low, high], [2 * frames, 1 * frames, 3 * frames])
+
+
+def test_interval_of_the_mean_has_its_coverage():
+    hits = 0
+    for values in np.random.default_rng(0).normal(size=(300, 20)):
+        _, _, low, high = mean_curve([[{"frames": 1, TRAINING: float(value)}] for value in values], TRAINING)
+        hits += bool(low[0] <= 0 <= high[0])
+    assert 0.88 < hits / 300 < 0.97
+
+
+@pytest.mark.parametrize(
+    ("draw", "data", "message"),
+    [
+        (draw_learning_curves, [{"COIL": [], "PPO": []}], "at least one run; got none for: COIL, PPO"),
+        (draw_learning_curves, [{}], "at least one run; got none for: no label"),
+        (draw_learning_curves, [{"COIL": [[{"step": 1, TRAINING: 2.0}]]}], "no 'frames'; it has: step, train/return"),
+        (draw_curve_grid, [{}], "at least one label"),
+        (draw_phases, [[], ["a"]], "at least one row"),
+    ],
+)
+def test_missing_data_is_an_error_and_leaves_no_file(draw, data, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        draw(*data, tmp_path / "plot.png")
+    assert not list(tmp_path.iterdir())
