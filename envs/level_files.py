@@ -81,7 +81,9 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
     lines += [f"{k},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}" for k, (side, x, y) in enumerate(cones)]
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="")
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text("\n".join(lines) + "\n", encoding="utf-8", newline="")
+    unfinished.replace(path)
 
 
 def shipped_tracks(split: Split) -> list[Track]:

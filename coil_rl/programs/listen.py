@@ -31,7 +31,6 @@ MAPS = {
     "agreement": ("listening_agreement.png", "Where the agent does otherwise", "|action - advice|"),
     "gradient": ("listening_gradient.png", "How the agent follows small changes of advice", "|da / dg|"),
 }
-LIMITS = {"donors": (1, 10_000), "turn_radius": (0.5, 1000.0), "approach": (0.1, 100.0), "bin": (0.1, 100.0)}
 
 
 def listen(config: DictConfig) -> None:
@@ -104,9 +103,6 @@ def check(config: DictConfig) -> None:
     """Raise UserError, one sentence, for an invalid configuration."""
     from coil_rl.train.check import check as check_common
 
-    for key, (low, high) in LIMITS.items():
-        if not low <= config[key] <= high:
-            raise UserError(f"{key}={config[key]} must be between {low} and {high}")
     if not config.run:
         raise UserError("run must be the folder of a run: write run=FOLDER")
     check_common(config)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from coil_rl.envs.splines import Spline
-from coil_rl.guides.spline import Plan, pick
+from coil_rl.guides.spline import PathPlan
 from coil_rl.report import style
 
 Array = NDArray[np.float64]
@@ -70,11 +70,11 @@ def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples:
     axes.plot(*facing_up(samples).T, "D", ms=4.4, mfc=face, mec=edge, mew=0.8, zorder=6)
 
 
-def draw_plan(axes: Axes, plan: Plan, scale: float = 1.0) -> None:
+def draw_plan(axes: Axes, plan: PathPlan, scale: float = 1.0) -> None:
     """Draw the midpoints, path and targets of a guide's plan whose unit is `scale` of the picture's."""
-    pairs = int(plan.pairs)
+    pairs = int(plan.midpoint_count)
     in_use = None if pairs > 1 else 0
-    selected = pick(plan.targets, plan.square, plan.barred)[:, : int(not plan.barred.all())]
+    selected = plan.nearest_target()[:, : int(not plan.excluded.all())]
 
     def points(places: Tensor) -> Array:
         return facing_up(rows(places / scale)).T

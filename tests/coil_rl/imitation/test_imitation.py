@@ -206,7 +206,7 @@ def test_missing_damaged_and_unfitting_data_sets_are_refused(env, batches, tmp_p
     with pytest.raises(UserError, match=r"of another env: observation is \[3\], but must be \[20\]"):
         Imitation(env, **linear(dataset=file))
     file.write_bytes(file.read_bytes()[:-1])
-    with pytest.raises(UserError, match=r"dataset\.pt is not a whole"):
+    with pytest.raises(UserError, match=r"dataset\.pt is damaged"):
         Imitation(env, **linear(dataset=file))
 
 

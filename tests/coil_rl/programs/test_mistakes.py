@@ -85,7 +85,7 @@ def refusal(name, *arguments):
         ("existing=maybe", "existing='maybe' must be 'refuse' or 'resume'"),
         ("learner.minibatches=129", "learner.minibatches=129 leaves less than 2 frames to each minibatch"),
         ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
-        ("track.train.count=0", "track.train: random_tracks was asked for 0 tracks"),
+        ("track.train.count=0", "track.train: count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[]", "method.observes=[]: the agent has no observations"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
