@@ -68,12 +68,12 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
     (sentence,) = second.stderr.splitlines()
     assert sentence == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
     first.terminate()
-    _, said = first.communicate(timeout=60)
+    _, stderr = first.communicate(timeout=60)
     assert first.returncode == 130
-    assert said.splitlines()[-1] == f"train: interrupted; continue with: coil-train resume={tmp_path / 'run'}"
-    assert "guide=" in said
-    assert "Warning" not in said
-    assert "Traceback" not in said
+    assert stderr.splitlines()[-1] == f"train: interrupted; continue with: coil-train resume={tmp_path / 'run'}"
+    assert "guide=" in stderr
+    assert "Warning" not in stderr
+    assert "Traceback" not in stderr
     assert not (tmp_path / "run" / "evaluation.csv").exists()
 
     (tmp_path / "run").rename(tmp_path / "moved")

@@ -46,10 +46,10 @@ def test_help_begins_with_examples_and_imports_nothing_heavy(name, tmp_path):
 )
 def test_wrong_override_is_refused_without_heavy_imports(arguments, code, message, tmp_path):
     done = start(tmp_path, *arguments)
-    *said, heavy = done.stderr.splitlines()
+    *lines, heavy = done.stderr.splitlines()
     assert heavy == "HEAVY"
     assert done.returncode == code
-    assert len(said) == (code == 2)
+    assert len(lines) == (code == 2)
     assert all(part in done.stderr for part in message.split(".*"))
     assert not list(tmp_path.iterdir())
 
