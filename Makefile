@@ -12,7 +12,7 @@ help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## /  \1@/p' $(MAKEFILE_LIST) | while IFS=@ read -r target text; do \
 		printf '  %-10s %s\n' $$target "$$text"; done
 
-venv: $(INSTALLED) ## make .venv with the tested versions (PYTHON=... picks the Python)
+venv: $(INSTALLED) ## make .venv with the tested versions (PYTHON=... selects the interpreter)
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { \
@@ -25,15 +25,15 @@ $(INSTALLED): pyproject.toml constraints.txt
 train: $(INSTALLED) ## train an agent with a guide's advice, e.g. ARGS='seed=1'
 	$(BIN)/coil-train method=coil $(ARGS)
 
-evaluate: $(INSTALLED) ## evaluate a trained agent, what and how in ARGS
+evaluate: $(INSTALLED) ## evaluate a trained agent, e.g. ARGS='run=outputs/train/THE_RUN'
 	$(BIN)/coil-evaluate $(ARGS)
 
-# Stable-Baselines3 is only a yardstick, so .venv has it from here on and not before.
+# Stable-Baselines3 is needed for this comparison only.
 bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='--device cuda'
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	$(BIN)/python -m benchmarks $(ARGS)
 
-reproduce: $(INSTALLED) ## make every result of the paper again, as small as can be; in earnest with BUDGET=paper
+reproduce: $(INSTALLED) ## make every result of the paper at the smallest budget (BUDGET=paper for the real one)
 	$(BIN)/coil-reproduce all=true budget=$(BUDGET) $(ARGS)
 
 test: $(INSTALLED) ## run the fast tests
@@ -51,7 +51,7 @@ check: $(INSTALLED) ## lint, formatting, types and import directions
 	$(BIN)/mypy -p coil_rl -p benchmarks
 	$(BIN)/lint-imports --no-logo
 
-format: $(INSTALLED) ## format the code and mend what lint can mend
+format: $(INSTALLED) ## format the code and apply the automatic lint fixes
 	$(BIN)/ruff check --fix-only .
 	$(BIN)/ruff format .
 
