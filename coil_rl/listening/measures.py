@@ -23,10 +23,7 @@ Act = Callable[[TensorDictBase], Tensor]
 
 @torch.no_grad()
 def agreement(act: Act, states: TensorDictBase) -> Tensor:
-    """Return the distance between the action and the advice of each guide, |a - g_k|: [N, n_guides] in action units.
-
-    `states` are [N], with `guide_action` [N, n_guides, A].
-    """
+    """Return |a - g_k|, the distance between the action and the advice of each guide, [N, n_guides] in action units."""
     return (_act(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
 
 

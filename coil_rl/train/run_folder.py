@@ -59,12 +59,9 @@ def begin(config: DictConfig, folder: Path) -> None:
 
 
 def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
-    """Return the configuration of the run in a folder.
+    """Return the configuration of the run in a folder, with `changes`, new values of top-level keys.
 
-    Args:
-        folder: of the run.
-        key: of the configuration that names the folder, for the message.
-        changes: new values of top-level keys.
+    `key` is the key of the calling program that names the folder, for the message.
 
     Raises:
         UserError: if the folder holds no run, or its configuration cannot be read.
