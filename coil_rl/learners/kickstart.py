@@ -1,4 +1,4 @@
-"""Kickstarting (Schmitt et al. 2018): an auxiliary loss that draws the policy to the action of a guide."""
+"""Kickstarting (Schmitt et al. 2018): an auxiliary loss for the distance of the policy from the action of a guide."""
 
 from __future__ import annotations
 

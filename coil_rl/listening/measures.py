@@ -1,8 +1,7 @@
 """Measures of how much an agent uses the advice of each guide, and policies with changed advice.
 
-Agreement alone cannot separate use of advice from coincidence: an agent that sees the road and an agent that copies a
-guide who sees the road act alike. `intervention` and `gradient` therefore change the advice. All actions are
-deterministic.
+Agreement alone cannot separate use of advice from coincidence: an agent and a guide may choose the same action because
+both observe the same cones. `intervention` and `gradient` therefore change the advice. All actions are deterministic.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
         Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=1.6, label=name) for name, stroke in strokes.items()
     ]
     if invalid.any():
-        handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary is only remembered"))
+        handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary from the memory"))
     with style.picture(path, title, handles, 5.0, h_pad=0.08) as figure:
         steering_axes, omega_axes = figure.subplots(2, sharex=True)
         for axes, label in ((steering_axes, "steering (degrees)"), (omega_axes, "omega (radians/s)")):

@@ -64,7 +64,7 @@ def policy_iteration(mdp: MDP, policy: ArrayLike | None = None, tolerance: float
         V = policy_evaluation(mdp, policy, tolerance)
         history.append(V)
         Q = mdp.q(V)
-        # Keep the present action on a tie, or two optimal policies could alternate for ever.
+        # Keep the present action on a tie, or two optimal policies could alternate endlessly.
         improves = Q.max(axis=1) > Q[np.arange(count), policy] + TIE
         if not improves.any():
             return PlanningResult(policy, V, Q, np.array(history))

@@ -112,17 +112,17 @@ def is_evaluated(folder: Path) -> bool:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and important packages, the commit, and the machine."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    result = {"python": platform.python_version(), "platform": platform.platform()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            result[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+            result[name] = "not installed"
     git = ["git", "-C", str(Path(__file__).resolve().parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    found["commit"] = _output(git) or "not a git checkout"
-    found["cpus"] = str(os.cpu_count())
-    found["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
-    return found
+    result["commit"] = _output(git) or "not a git checkout"
+    result["cpus"] = str(os.cpu_count())
+    result["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    return result
 
 
 def _output(command: list[str]) -> str:
