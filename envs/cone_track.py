@@ -18,6 +18,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -118,23 +119,15 @@ class ConeTrackEnv(SeededEnv):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        _check_choice("spline", spline, "cubic", "quadratic")
-        _check_choice("cone_bonus", cone_bonus, "first_sighting", "every_sighting")
-        _check_choice("assignment", assignment, "random", "cyclic")
-        positive = {
-            "num_cars": num_cars, "rate": rate, "laps": laps, "time_limit": time_limit, "kept_cones": kept_cones,
-            "speed": speed, "car_length": car_length, "max_steering": max_steering,
-        }  # fmt: skip
-        for name, value in positive.items():
-            if not value > 0:
-                raise ValueError(f"{name}={value} must be more than 0")
-        for name, value in {"held_steps": held_steps, "seed": seed}.items():
-            if value < 0:
-                raise ValueError(f"{name}={value} must be at least 0")
+        check_choice(("cubic", "quadratic"), spline=spline)
+        check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
+        check_choice(("random", "cyclic"), assignment=assignment)
+        check_range(0, above=True, num_cars=num_cars, laps=laps, kept_cones=kept_cones, rate=rate)
+        check_range(0, above=True, time_limit=time_limit, speed=speed, car_length=car_length)
+        check_range(0, 90, above=True, max_steering=max_steering)
+        check_range(0, held_steps=held_steps, seed=seed)
         if round(time_limit * rate) < 1:
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
-        if max_steering > 90:
-            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
         self.dtype_, self.generator = dtype, torch.Generator()
@@ -328,8 +321,3 @@ class ConeTrackEnv(SeededEnv):
             entries |= {"pose": self.pose.t(), "reward": TensorDict(rewards, self.batch_size, device=self.device)}
             data["info"] = TensorDict(entries, self.batch_size, device=self.device)
         return TensorDict(data, self.batch_size, device=self.device)
-
-
-def _check_choice(name: str, value: str, *choices: str) -> None:
-    if value not in choices:
-        raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

@@ -14,15 +14,10 @@ from torch import Tensor
 
 
 def constant(value: float | Sequence[float], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
-    """Return a read-only number, or column of numbers, that broadcasts against another tensor.
+    """Return a read-only constant that broadcasts against `like` [any, *batch], with its device and, by default, dtype.
 
-    Args:
-        value: a number, or one number per row as a tuple or a range.
-        like: [any, *batch], the other tensor, whose device and, by default, dtype are used.
-        dtype: of the result.
-
-    Returns:
-        A tensor without dimensions, or [rows, 1, ...] with as many dimensions as `like`.
+    A number gives a tensor without dimensions; one number per row, as a tuple or a range, gives [rows, 1, ...] with as
+    many dimensions as `like`.
     """
     make = _new if torch.compiler.is_compiling() else _cached
     return make(value, like.ndim - 1, dtype or like.dtype, like.device)

@@ -185,7 +185,7 @@ def _first_crossing(rings: dict[Side, Array]) -> tuple[set[Side], Array] | None:
     reach = np.linalg.norm(edge, axis=1).max()
     tree = cKDTree(begin + edge / 2)
     if tree.count_neighbors(tree, reach) > MAX_PAIRS:
-        raise TrackError("The boundaries are a tangle; list each side's cones in driving order, evenly spaced.")
+        raise TrackError("The boundaries overlap nearly everywhere; list each side's cones in driving order.")
     one, other = tree.query_pairs(reach, output_type="ndarray").T
 
     def on_left(point: NDArray[np.intp], line: NDArray[np.intp]) -> NDArray[np.bool_]:

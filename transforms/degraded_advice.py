@@ -119,12 +119,6 @@ class ScaledAdvice(DegradedAdvice):
     Args:
         gain: 0.5 for an undertuned guide, 0 for no advice, -1 for an adversary; finite.
         key: entry of the advice.
-
-    Example:
-        >>> from tensordict import TensorDict
-        >>> stored = TensorDict({"guide_action": torch.tensor([[[0.5]], [[-1.0]]])}, [2])
-        >>> ScaledAdvice(gain=-1)(stored)["guide_action"].flatten().tolist()
-        [-0.5, 1.0]
     """
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:

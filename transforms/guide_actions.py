@@ -1,4 +1,4 @@
-"""COIL: the actions of guides as an additional observation (paper section 3, equation 97)."""
+"""Advice: the actions of guides as an additional observation, as in COIL (paper section 3, equation 97)."""
 
 from __future__ import annotations
 
@@ -81,10 +81,8 @@ class Guides(TensorDictModuleBase):
 class GuideCache:
     """Cache of advice by observation, for the first states of episodes.
 
-    Episodes start in few states, and a lookup is much faster than a guide on one row.
-
-    Args:
-        max_rows: capacity; beyond it new rows are not cached.
+    Episodes start in few states, and a lookup is much faster than a guide on one row. Beyond `max_rows` new rows are
+    not cached.
     """
 
     def __init__(self, max_rows: int = 256) -> None:

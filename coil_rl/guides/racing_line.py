@@ -10,6 +10,7 @@ import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.splines import slots_in_use
 from coil_rl.guides.spline import TARGET_REACHED, SplineGuide, first_point
 
@@ -27,24 +28,12 @@ class RacingLineGuide(SplineGuide):
         turn: curvature as a multiple of that of the arc to the target.
         lookahead: maximum distance of the target, m.
         spacing: distance between targets along the path, m.
-        spline: this and the following arguments as for `SplineGuide`.
-        smoothing: lambda of the cubic smoothing spline, m^3.
         max_steering: steering angle of action 1, degrees, at most 90.
         car_length: m.
-        cones: number of nearest cones of each side used for pairs; arcs keep clear of all visible cones.
-        midpoints: maximum number of midpoints.
-        targets: maximum number of targets along the path.
-        in_keys: entries of cones, cone count and steering.
-        out_key: entry for the advice.
+        spline, smoothing, cones, midpoints, targets, in_keys, out_key: as for `SplineGuide`.
 
     Raises:
         ValueError: for a value out of range.
-
-    Example:
-        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = ConeTrackEnv(shipped_tracks("test"), num_cars=4)
-        >>> env.rollout(5, RacingLineGuide(), break_when_any_done=False)["action"].shape
-        torch.Size([4, 5, 1])
     """
 
     def __init__(
@@ -67,14 +56,10 @@ class RacingLineGuide(SplineGuide):
             spline, smoothing, max_steering=max_steering, cones=cones, midpoints=midpoints, targets=targets,
             in_keys=in_keys, out_key=out_key,
         )  # fmt: skip
-        positive = {"turn": turn, "lookahead": lookahead, "spacing": spacing, "car_length": car_length}
-        for name, value in positive.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name}={value} must be a finite number of more than 0")
+        check_range(0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length)
+        check_range(0, 90, above=True, max_steering=max_steering)
         if not 0 <= margin < car_length:  # the smallest turning radius
             raise ValueError(f"margin={margin} must be at least 0 and less than car_length={car_length}")
-        if max_steering > 90:
-            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
         self.margin, self.turn, self.lookahead = margin, turn, lookahead
         self.spacing, self.car_length = spacing, car_length
 
@@ -93,13 +78,9 @@ class RacingLineGuide(SplineGuide):
         return torch.where(excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def _blocked(self, curvature: Tensor, distance: Tensor, cones: Tensor, count: Tensor) -> Tensor:
-        """Return 1 for arcs too close to a cone or with a target beyond the lookahead, else 0.
+        """Return 1 for arcs too close to a cone or with a target beyond the lookahead, else 0: [T, B].
 
-        Args:
-            curvature: [T, B] 1/m, positive to the left.
-            distance: [T, B] m, distance of the targets.
-            cones: [B, 2, K, 2] m.
-            count: [B, 2].
+        Curvatures [T, B] are in 1/m, positive to the left; distances [T, B] m are those of the targets.
         """
         x, y = cones[:, :, : slots_in_use(count, cones.shape[2])].permute(3, 2, 1, 0)
         slot = torch.arange(len(x), dtype=x.dtype, device=x.device).view(-1, 1, 1)

@@ -11,16 +11,15 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.envs.limits import check_range
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class _Constant(nn.Module):
-    value: Tensor
-
     def __init__(self, value: Tensor) -> None:
         super().__init__()
-        self.register_buffer("value", value)
+        self.value: Tensor = nn.Buffer(value)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.value.expand(*observation.shape[:-1], -1)
@@ -54,16 +53,10 @@ class ConstantGuide(TensorDictModule):
 
 
 class ZeroGuide(ConstantGuide):
-    """Guide with the action 0.
-
-    Args:
-        size: A, size of an action.
-        in_key: any entry [*batch, N], for the batch shape.
-        out_key: entry for the action, [*batch, A].
-    """
+    """Guide with the action 0, [*batch, size]; keys as for `ConstantGuide`."""
 
     def __init__(self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action") -> None:
-        _check_size(size)
+        check_range(1, size=size)
         super().__init__([0.0] * size, in_key, out_key)
 
 
@@ -75,8 +68,7 @@ class RandomGuide(TensorDictModule):
         high: upper bound.
         size: A, size of an action.
         seed: seed of the generator.
-        in_key: any entry [*batch, N], for the batch shape.
-        out_key: entry for the action, [*batch, A].
+        in_key, out_key: as for `ConstantGuide`.
     """
 
     def __init__(
@@ -88,7 +80,7 @@ class RandomGuide(TensorDictModule):
         in_key: NestedKey = "observation",
         out_key: NestedKey = "action",
     ) -> None:
-        _check_size(size)
+        check_range(1, size=size)
         super().__init__(_Uniform(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
 
 
@@ -102,8 +94,6 @@ class FollowAdvice(TensorDictModuleBase):
         out_key: entry for the action.
     """
 
-    guide: Tensor
-
     def __init__(
         self,
         env: EnvBase,
@@ -114,15 +104,10 @@ class FollowAdvice(TensorDictModuleBase):
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
         self.action_space = ActionSpace(env.full_action_spec[out_key], env.batch_dims)
-        self.register_buffer("guide", torch.as_tensor(guide, device=env.device))
+        self.guide: Tensor = nn.Buffer(torch.as_tensor(guide, device=env.device))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         advice = tensordict[self.in_keys[0]]
         guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
         return tensordict.set(self.out_keys[0], self.action_space.actions(advice.gather(-2, guide).squeeze(-2)))
-
-
-def _check_size(size: int) -> None:
-    if size < 1:
-        raise ValueError(f"size={size} must be at least 1")

@@ -14,6 +14,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.sight import field_of_view_margin
 from coil_rl.envs.sorting import smallest
 from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
@@ -92,16 +93,12 @@ class SplineGuide(TensorDictModuleBase):
     ) -> None:
         self.in_keys, self.out_keys = list(in_keys), [out_key]
         super().__init__()
-        if spline not in ("cubic", "quadratic"):
-            raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
-        for name, value, low in (("cones", cones, 1), ("midpoints", midpoints, 2), ("targets", targets, 2)):
-            if value < low:
-                raise ValueError(f"{name}={value} must be at least {low}")
-        for name, number in {"smoothing": smoothing, "sharpness": sharpness}.items():
-            if not 0 <= number < math.inf:
-                raise ValueError(f"{name}={number} must be a finite number of at least 0")
-        if not 0 < max_steering < math.inf or not math.isfinite(gain):
-            raise ValueError(f"max_steering={max_steering} must be more than 0 and gain={gain} finite")
+        check_choice(("cubic", "quadratic"), spline=spline)
+        check_range(1, cones=cones)
+        check_range(2, midpoints=midpoints, targets=targets)
+        check_range(0, smoothing=smoothing, sharpness=sharpness)
+        check_range(0, above=True, max_steering=max_steering)
+        check_range(-1e6, 1e6, gain=gain)
         self.fit = least_squares_parabola if spline == "quadratic" else partial(smoothing_spline, smoothing=smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
         self.cones, self.midpoints, self.targets = cones, midpoints, targets

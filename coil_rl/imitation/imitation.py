@@ -18,10 +18,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.imitation.regressors import Regressor
 from coil_rl.imitation.validation import cross_validate, scores
-from coil_rl.learners.limits import check_range
 from coil_rl.learners.networks import ConcatObservations, FastTensorDictModule
 from coil_rl.train import checkpoint
 from coil_rl.transforms.action_space import ActionSpace

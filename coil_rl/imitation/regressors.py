@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.modules import MLP
 
+from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
-from coil_rl.learners.limits import LARGEST_SEED, check_range
 from coil_rl.learners.networks import mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -55,13 +55,6 @@ class NetworkRegressor(Regressor):
 
     Raises:
         ValueError: for a value out of range.
-
-    Example:
-        >>> x = torch.rand(256, 2)
-        >>> network = NetworkRegressor(epochs=200).fresh(inputs=2, outputs=1)
-        >>> network.fit(x, x[:, :1] - x[:, 1:])
-        >>> bool((network(torch.tensor([0.9, 0.4])) - 0.5).abs() < 0.05)
-        True
     """
 
     layers: MLP

@@ -68,10 +68,7 @@ def cross_validate(
 
 
 def group_splits(groups: Tensor) -> list[Split]:
-    """Return splits in which each row is tested once and no group is on both sides, ten at most.
-
-    Args:
-        groups: [N], integers.
+    """Return at most ten splits of rows with group numbers [N]; each row is tested once, no group is on both sides.
 
     Raises:
         UserError: if there is only one group.
@@ -84,12 +81,10 @@ def group_splits(groups: Tensor) -> list[Split]:
 
 
 def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) -> dict[str, float]:
-    """Return `mse_NAME` and `r2_NAME`: mean squared error and R^2 over all folds, means over the A outputs.
+    """Return `mse_NAME` and `r2_NAME` of the split NAME: mean squared error and R^2, means over the A outputs.
 
-    Args:
-        predictions: [N, A] each.
-        targets: [N, A] each. Where they are constant, R^2 is 1 for correct predictions and else 0.
-        name: of the split.
+    Predictions and targets are [N, A] for each fold. Where targets are constant, R^2 is 1 for correct predictions and
+    else 0.
     """
     numbers = (torch.cat(list(targets)).cpu().numpy(), torch.cat(list(predictions)).cpu().numpy())
     return {f"mse_{name}": float(mean_squared_error(*numbers)), f"r2_{name}": float(r2_score(*numbers))}

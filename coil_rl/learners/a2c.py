@@ -31,8 +31,6 @@ class A2C(PPO):
         options: as for `PPO`.
     """
 
-    kind = "agent"
-
     def __init__(
         self,
         env: EnvBase,

@@ -19,8 +19,8 @@ from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
 from torchrl.objectives import DQNLoss
 
+from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.limits import check_range
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -53,8 +53,6 @@ class DQN(OffPolicy):
         >>> dqn = DQN(env, starts=256)
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
-
-    kind = "agent"
 
     minimised = reported = ("loss",)
 

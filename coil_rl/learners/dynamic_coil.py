@@ -18,8 +18,8 @@ from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
+from coil_rl.envs.limits import LARGEST_SEED, check_choice, check_range
 from coil_rl.learners import networks
-from coil_rl.learners.limits import LARGEST_SEED, check_choice, check_range
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides

@@ -1,4 +1,4 @@
-"""Kickstarting (Schmitt et al. 2018): an auxiliary loss that draws the policy to the action of a guide."""
+"""Kickstarting (Schmitt et al. 2018): an auxiliary loss for the distance of the policy from the action of a guide."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
 
-from coil_rl.learners.limits import check_choice, check_range
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.schedules import Linear, Schedule, schedule
 
 EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fraction of half the range

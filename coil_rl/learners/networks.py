@@ -14,7 +14,7 @@ from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 from torchrl.envs import EnvBase
 from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
 
-from coil_rl.learners.limits import check_range
+from coil_rl.envs.limits import check_range
 
 
 class ConcatObservations(nn.Module):
@@ -61,13 +61,7 @@ def mlp(
 ) -> MLP:
     """Return a tanh network with orthogonal weights and zero biases, or a ReLU network with PyTorch's initial weights.
 
-    Args:
-        inputs: width of the input.
-        outputs: width of the output.
-        hidden: widths of the hidden layers.
-        gain: scale of the weights of the last layer.
-        device: device of the parameters.
-        activation: `nn.Tanh` or `nn.ReLU`.
+    `gain` scales the weights of the last layer.
     """
     check_range(1, hidden=min(hidden, default=1))
     layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=activation, device=device)
@@ -163,19 +157,11 @@ def actor(
     """Return a stochastic policy for the actions of an env.
 
     Its distribution is a tanh-squashed normal for bounded actions, a normal for unbounded ones and a categorical for
-    discrete ones. Its deterministic action is the mode.
+    discrete ones. Its deterministic action is the mode. It writes `action` and `action_log_prob`.
 
-    Args:
-        env: the env.
-        in_keys: entries that the policy observes.
-        hidden: widths of the hidden layers.
-        scale: initial standard deviation, before squashing.
-        gain: initial scale of the weights of the last layer.
-        shapes: as for `ConcatObservations`.
-        state_dependent_scale: whether the standard deviation is an output of the network; continuous actions only.
-
-    Returns:
-        A module that writes `action` and `action_log_prob`.
+    The initial standard deviation before squashing is `scale`; with `state_dependent_scale` it is an output of the
+    network, for continuous actions only. `gain` scales the initial weights of the last layer. `shapes` are as for
+    `ConcatObservations`.
     """
     spec = env.action_spec
     common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")

@@ -12,7 +12,7 @@ from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
-from coil_rl.learners.limits import LARGEST_SEED, check_range
+from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_transform import GuideTransform
 

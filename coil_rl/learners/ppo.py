@@ -19,9 +19,9 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
+from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners import networks
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.limits import LARGEST_SEED, check_range
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -234,11 +234,6 @@ class Advantages:
 
     The state after a step is the state before the next step, unless the episode ended. So the critic evaluates each
     state once, and in addition the last states of the batch and those of truncated episodes.
-
-    Args:
-        critic: writes `state_value` [..., 1].
-        gamma: discount, in [0, 1].
-        gae_lambda: lambda, in [0, 1].
     """
 
     def __init__(self, critic: TensorDictModuleBase, gamma: float, gae_lambda: float) -> None:

@@ -21,8 +21,8 @@ from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBas
 from torchrl.envs import EnvBase
 from torchrl.objectives import ReinforceLoss
 
+from coil_rl.envs.limits import check_choice
 from coil_rl.learners import networks
-from coil_rl.learners.limits import check_choice
 from coil_rl.learners.ppo import PPO, standardise
 
 
@@ -36,8 +36,6 @@ class Reinforce(PPO):
         standardise: whether to standardise G - b in a minibatch.
         options: as for `PPO`.
     """
-
-    kind = "agent"
 
     def __init__(
         self,

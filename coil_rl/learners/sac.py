@@ -14,8 +14,8 @@ from typing import Any
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss
 
+from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.limits import check_range
 from coil_rl.learners.off_policy import OffPolicy
 
 
@@ -40,8 +40,6 @@ class SAC(OffPolicy):
     Raises:
         ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
     """
-
-    kind = "agent"
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
     reported = (*minimised, "alpha", "entropy")

@@ -20,7 +20,7 @@ from torch.nn.utils import parameters_to_vector
 from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
-from coil_rl.learners.limits import check_range
+from coil_rl.envs.limits import check_range
 from coil_rl.learners.ppo import PPO, standardise
 
 
@@ -37,8 +37,6 @@ class TRPO(PPO):
         shrink: factor by which it shortens a step.
         options: as for `PPO`; auxiliary losses are part of the objective.
     """
-
-    kind = "agent"
 
     def __init__(
         self,
@@ -142,12 +140,9 @@ def unsquashed(distribution: Any) -> Distribution:
 
 
 def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, iterations: int) -> Tensor:
-    """Solve A x = b for a positive definite matrix, without waiting for the device.
+    """Solve A x = b for a positive definite A, given its `product` with a vector, without waiting for the device.
 
-    Args:
-        product: A times a vector.
-        target: b, [n].
-        iterations: n are enough in exact arithmetic; iterations after convergence change nothing.
+    For b = `target` [n], n iterations suffice in exact arithmetic. Iterations after convergence change nothing.
     """
     solution, residual, direction = torch.zeros_like(target), target.clone(), target.clone()
     square = first_square = residual @ residual

@@ -1,8 +1,7 @@
 """Measures of how much an agent uses the advice of each guide, and policies with changed advice.
 
-Agreement alone cannot separate use of advice from coincidence: an agent that sees the road and an agent that copies a
-guide who sees the road act alike. `intervention` and `gradient` therefore change the advice. All actions are
-deterministic.
+Agreement alone cannot separate use of advice from coincidence: an agent and a guide may choose the same action because
+both observe the same cones. `intervention` and `gradient` therefore change the advice. All actions are deterministic.
 """
 
 from __future__ import annotations
@@ -23,10 +22,7 @@ Act = Callable[[TensorDictBase], Tensor]
 
 @torch.no_grad()
 def agreement(act: Act, states: TensorDictBase) -> Tensor:
-    """Return the distance between the action and the advice of each guide, |a - g_k|: [N, n_guides] in action units.
-
-    `states` are [N], with `guide_action` [N, n_guides, A].
-    """
+    """Return |a - g_k|, the distance between the action and the advice of each guide, [N, n_guides] in action units."""
     return (_act(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
 
 

@@ -49,13 +49,8 @@ def survey(
 ) -> Survey:
     """Evaluate the deterministic agent for one episode per car, and measure in every visited state.
 
-    Args:
-        env: cars with `info`, [B].
-        policy: the agent; reads `guide_action`.
-        sections: of the tracks of this env.
-        donors: as for `intervention`.
-        seed: of the donors.
-        tick: called every step.
+    The env has cars with `info`, [B], on the tracks of `sections`. The agent reads `guide_action`. `donors` are as for
+    `intervention`, the seed is theirs, and `tick` is called every step.
     """
     history: list[TensorDictBase] = []
 

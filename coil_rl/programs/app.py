@@ -72,7 +72,7 @@ def check_run(config: DictConfig) -> None:
 def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check_run) -> None:
     """Run a task as a program after a check of its configuration; `config_name` is also the name of the program."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
-    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs what it raises
+    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     _new_folders.clear()
     _check_options(config_name)
     bugs: list[Exception] = []

@@ -7,9 +7,9 @@ from coil_rl.train.run_folder import versions
 
 def main() -> None:
     """Print a version a line."""
-    found = versions()
-    width = max(map(len, found))
-    for name, version in found.items():
+    result = versions()
+    width = max(map(len, result))
+    for name, version in result.items():
         print(f"{name:{width}}  {version}")
 
 

@@ -13,7 +13,7 @@ from coil_rl.programs import app
 COLUMNS = {
     "guide": ("guide", ""),
     "section": ("section", ""),
-    "share": ("of the way", ".0%"),
+    "share": ("of the states", ".0%"),
     "agreement": ("|a - g|", ".3f"),
     "intervention": ("intervention", ".4f"),
     "gradient": ("gradient", ".3f"),
@@ -27,9 +27,9 @@ replaced by its mean in that section. """
 CONTINUOUS_NOTE = "gradient: |da/dg|."
 DISCRETE_NOTE = "Actions are discrete: |a - g| and intervention are 0\nfor the same action and 1.414 for any other."
 MAPS = {
-    "intervention": ("listening.png", "Where the agent listens", "action moved by other advice"),
-    "agreement": ("listening_agreement.png", "Where the agent does otherwise", "|action - advice|"),
-    "gradient": ("listening_gradient.png", "How the agent follows small changes of advice", "|da / dg|"),
+    "intervention": ("listening.png", "Effect of other advice on the action", "change of the action"),
+    "agreement": ("listening_agreement.png", "Difference between action and advice", "|action - advice|"),
+    "gradient": ("listening_gradient.png", "Effect of small changes of the advice on the action", "|da / dg|"),
 }
 
 
@@ -92,25 +92,16 @@ def _summary(label: str, table: list[dict[str, Any]]) -> str:
     best = max(means, key=lambda guide: means[guide])
     rows = [row for row in table if row["guide"] == best and row["section"] != "everywhere"]
     where = max(rows, key=lambda row: row["intervention"])
-    others = ", ".join(f"{guide} moves it by {change:.4f}" for guide, change in means.items() if guide != best)
+    others = "".join(f"; {guide} changes it by {change:.4f}" for guide, change in means.items() if guide != best)
     return (
-        f"{label} listens most to {best}, which moves its action by {means[best]:.4f}, "
-        f"most of all at {where['section']} ({where['intervention']:.4f}){f'; {others}' if others else ''}"
+        f"{label} depends most on {best}: other advice of it changes the action by {means[best]:.4f}, "
+        f"and by {where['intervention']:.4f} in the section {where['section']}{others}"
     )
 
 
-def check(config: DictConfig) -> None:
-    """Raise UserError, one sentence, for an invalid configuration."""
-    from coil_rl.train.check import check as check_common
-
-    if not config.run:
-        raise UserError("run must be the folder of a run: write run=FOLDER")
-    check_common(config)
-
-
 def main() -> None:
-    """Run the program."""
-    app.run(listen, "listen", check)
+    """Entry point."""
+    app.run(listen, "listen")
 
 
 if __name__ == "__main__":

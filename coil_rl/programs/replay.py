@@ -142,11 +142,7 @@ def _check_unique(key: str, paths: Sequence[Path]) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """Reject a configuration without a recording or a policy, and create the folder of the results.
-
-    Raises:
-        UserError: in one sentence, the problem.
-    """
+    """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
     from coil_rl.train.check import check_values, make_folder
 
     check_values(config)

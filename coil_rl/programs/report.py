@@ -111,7 +111,7 @@ def _folders(config: DictConfig) -> list[Path]:
 
 
 def check(config: DictConfig) -> None:
-    """Raise UserError, one sentence, for an invalid configuration."""
+    """Raise a `UserError` for the first mistake in the configuration."""
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
@@ -126,7 +126,7 @@ def check(config: DictConfig) -> None:
 
 
 def main() -> None:
-    """Run the program."""
+    """Entry point."""
     app.run(report, "report", check)
 
 

@@ -104,23 +104,15 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
 
 
 def check(config: DictConfig) -> None:
-    """Check the configuration.
-
-    Raises:
-        UserError: for the first mistake.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     from coil_rl.train.check import check_values
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError("results are made one after the other; leave out -m, and request several as in table=[1,4]")
-    if config.threads < 1:
-        raise UserError(f"threads={config.threads} must be at least 1")
     if config.budget not in config.budgets:
         names = list(config.budgets)
         raise UserError(f"budget={config.budget} must be one of {', '.join(names)}{did_you_mean(config.budget, names)}")
-    if (seeds := config.budgets[config.budget].seeds) < 1:
-        raise UserError(f"budgets.{config.budget}.seeds={seeds} must be at least 1")
     requested(config)
 
 

@@ -79,11 +79,7 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
 
 
 def check(config: DictConfig) -> None:
-    """Reject a configuration with which a step would fail.
-
-    Raises:
-        UserError: in one sentence, the problem.
-    """
+    """Raise a `UserError` for the first mistake in the configuration."""
     from coil_rl.envs import SimulatedRobotEnv
     from coil_rl.reproduce import Result
     from coil_rl.train.build import build

@@ -26,7 +26,7 @@ CYLINDER, LINE_STRIP, DELETE_ALL = 3, 4, 3
 COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
 DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
 CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
-FADED = 0.3  # opacity of a boundary that is only remembered
+FADED = 0.3  # opacity of a boundary from the memory
 
 TRANSFORMS = ("/tf", "/tf_static")
 POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
@@ -49,7 +49,7 @@ def annotate(
 
     Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue
     right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers are in the
-    scanner's frame. A boundary that is only remembered is faded. Equal results make equal bytes.
+    scanner's frame. A boundary from the memory is faded. Equal results make equal bytes.
 
     Args:
         result: of one recording.

@@ -77,13 +77,9 @@ class OpenLoop:
 def open_loop(
     env: McapReplayEnv, policies: Policies, *, seed: int = 0, tick: Callable[[str], Any] | None = None
 ) -> list[OpenLoop]:
-    """Return the result of each recording for all policies. The last action in their observation is their own.
+    """Return the result of each recording of an env without transforms. Each policy observes its own last action.
 
-    Args:
-        env: without transforms; its recordings side by side.
-        policies: at least one.
-        seed: of PyTorch's generator, set again for each policy.
-        tick: called after every scan with the policy's name.
+    The seed of PyTorch's generator is set again for each policy. `tick` is called with its name after every scan.
     """
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}

@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.artist import Artist
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from coil_rl.files import whole_file
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import markdown_table, style
 
@@ -23,7 +18,6 @@ NOTES = """
 Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
 |omega|. from X: mean |a - x|. No policy controlled the drive: each action is the policy's choice at a scan of a drive
 that went another way. recorded: the recorded commands, as actions with the same turn rate."""
-HEIGHT = 5.0  # inches
 
 
 def describe(result: OpenLoop) -> str:
@@ -91,12 +85,8 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
         Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=1.6, label=name) for name, stroke in strokes.items()
     ]
     if invalid.any():
-        handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary is only remembered"))
-    with mpl.rc_context(style.LETTERS):
-        figure = Figure(figsize=(style.WIDTH, HEIGHT), dpi=style.RESOLUTION)
-        FigureCanvasAgg(figure)
-        header = style.draw_header(figure, handles, title)
-        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / HEIGHT), w_pad=style.MARGIN / 2, h_pad=0.08)
+        handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary from the memory"))
+    with style.picture(path, title, handles, 5.0, h_pad=0.08) as figure:
         steering_axes, omega_axes = figure.subplots(2, sharex=True)
         for axes, label in ((steering_axes, "steering (degrees)"), (omega_axes, "omega (radians/s)")):
             axes.set_ylabel(label)
@@ -111,8 +101,6 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
             steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), **line)
             omega_axes.plot(seconds, result.steering[name].omega, **line)
         omega_axes.set_xlabel("time (s)")
-        with whole_file(path) as unfinished:
-            figure.savefig(unfinished, format=Path(path).suffix[1:] or "png")
 
 
 def _mean(values: np.ndarray) -> float:

@@ -7,12 +7,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike, NDArray
+from sklearn.decomposition import PCA
+from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
-from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
-from coil_rl.report import markdown_table, write_csv
-from coil_rl.report.cone_features import draw_cone_features
+from coil_rl.envs.robot.clusters import FEATURES
+from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
+from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.robot.classifier import (
     Scans,
@@ -25,8 +30,11 @@ from coil_rl.robot.classifier import (
     train_on_drives,
 )
 
+Array = NDArray[np.float64]
+
 PAPER_ACCURACY = Share(240, 243)
 DRAW_EVERY = 4  # scans
+ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
 COLUMNS = {
     "measure": ("measure", ""), "of": ("of", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"),
@@ -82,7 +90,7 @@ class Figure25(Result):
         self.left, self.right, self.both = (
             [read_recording(path, self.scan, self.odometry, None) for path in paths] for paths in (left, right, both)
         )
-        self.surveyed = [surveyed_drive(recording) for recording in self.both]
+        self.test_drives = [labelled_drive(recording) for recording in self.both]
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
@@ -98,17 +106,17 @@ class Figure25(Result):
         classifier = training.classifier
         shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
         shares["cross-validation"] = {"all": Share(training.correct, training.total)}
-        if self.surveyed:
-            labelled = label_clusters(self.surveyed)
+        if self.test_drives:
+            labelled = label_clusters(self.test_drives)
             shares["accuracy"] = accuracy(classifier, labelled)
-            shares |= {f"recall of {kind} cones": of for kind, of in recall(classifier, self.surveyed).items()}
+            shares |= {f"recall of {kind} cones": of for kind, of in recall(classifier, self.test_drives).items()}
             drawn = labelled.scan % DRAW_EVERY == 0
             features, thick = labelled.features[drawn], labelled.thick[drawn]
         else:
             thin_features, thick_features = (clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
             features = np.concatenate([thin_features, thick_features])
             thick = np.arange(len(features)) >= len(thin_features)
-        kind = "test" if self.surveyed else "training"
+        kind = "test" if self.test_drives else "training"
         draw_cone_features(
             features, thick, stem.with_suffix(".png"), wrong=classifier.thick(features) != thick,
             title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
@@ -128,3 +136,56 @@ def _row(of: str, share: Share) -> dict[str, Any]:
 
 def _scans(recordings: Sequence[Recording]) -> list[Scans]:
     return [(recording.ranges, recording.angles(0)) for recording in recordings]
+
+
+def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:
+    """Return the first two principal components of standardised features [N, F], none of them constant.
+
+    Returns:
+        Coordinates of the rows, [N, 2]; directions in standardised features, [F, 2], each with its largest component
+        above 0; and the shares of the variance, [2].
+    """
+    pca = PCA(2, svd_solver="full")
+    coordinates = pca.fit_transform(StandardScaler().fit_transform(np.asarray(features, dtype=np.float64)))
+    signs = np.sign(pca.components_[[0, 1], np.abs(pca.components_).argmax(axis=1)])
+    return coordinates * signs, pca.components_.T * signs, pca.explained_variance_ratio_
+
+
+def draw_cone_features(
+    features: ArrayLike,
+    thick: ArrayLike,
+    path: Path,
+    *,
+    wrong: ArrayLike | None = None,
+    title: str | None = None,
+) -> None:
+    """Draw clusters [N] by the two principal components of their features [N, 3]; `wrong` ones get a ring.
+
+    Arrows show the direction in which each feature grows.
+    """
+    xy, directions, share = principal_components(features)
+    is_thick = np.asarray(thick, dtype=bool)
+    is_wrong = np.zeros(len(xy), dtype=bool) if wrong is None else np.asarray(wrong, dtype=bool)
+    kinds = (("thin (left)", ~is_thick, style.LEFT_CONE, "o"), ("thick (right)", is_thick, style.RIGHT_CONE, "s"))
+    handles: list[Artist] = [
+        Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"{name}, {int(rows.sum())} clusters")
+        for name, rows, colour, marker in kinds
+    ]
+    if is_wrong.any():
+        label = f"misclassified, {int(is_wrong.sum())}"
+        handles.append(Line2D([], [], ls="", marker="o", mfc="none", mec=style.INK, ms=6.5, label=label))
+    with style.picture(path, title, handles, 4.4) as figure:
+        first, second = (f"principal component ({100 * part:.0f} % of the variance)" for part in share)
+        axes = figure.add_subplot(xlabel=f"first {first}", ylabel=f"second {second}")
+        axes.spines[["top", "right"]].set_visible(False)
+        for _, rows, colour, marker in kinds:
+            axes.plot(*xy[rows].T, marker, color=colour, ms=3.6, mec=style.BACKGROUND, mew=0.3, alpha=0.75)
+        axes.plot(*xy[is_wrong].T, "o", ms=7.0, mfc="none", mec=style.INK, mew=0.9)
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        # The upper right corner has few clusters.
+        start = (high[0] - ARROW_LENGTH, high[1] - ARROW_LENGTH / 2)
+        for name, direction in zip(FEATURES, directions, strict=True):
+            tip = start + ARROW_LENGTH / 2 * direction
+            axes.annotate("", tip, start, arrowprops={"arrowstyle": "->", "color": style.QUIET, "lw": 1.2})
+            axes.annotate(name, tip, 3 * np.sign(direction), textcoords="offset points", color=style.QUIET, size=8)
+        axes.set_xlim(low[0] - 0.2, high[0] + 0.4)

@@ -49,7 +49,7 @@ def certain_verdict(holds: bool, details: str) -> str:
 
 def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
     """Return the last section of a page: rows with the paper's `claim`, and further columns by key with headings."""
-    headings = {key: (heading, "") for key, heading in {"claim": "the paper says", **columns}.items()}
+    headings = {key: (heading, "") for key, heading in {"claim": "claim of the paper", **columns}.items()}
     return f"{CLAIMS_HEADING}\n\n{markdown_table(claims, headings)}"
 
 

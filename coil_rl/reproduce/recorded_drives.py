@@ -82,10 +82,7 @@ def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
 def smoothness(recording: Recording, car_length: float, max_steering: float) -> float:
     """Return the mean of |a - weighted mean of the last 20 actions|; NaN for a recording without commands.
 
-    Args:
-        recording: of one drive.
-        car_length: L of the robot, m.
-        max_steering: degrees of an action of 1.
+    The robot has the length `car_length` in m; `max_steering` is the angle of an action of 1 in degrees.
     """
     if recording.commands is None:
         return np.nan

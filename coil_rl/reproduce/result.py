@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import stratified_bootstrap
@@ -32,14 +33,9 @@ class Result(ABC):
 
     @abstractmethod
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
-        """Make the result.
+        """Make the result from the finished runs of its experiments, and return its page in Markdown.
 
-        Args:
-            stem: output path without suffix: the numbers are written to `stem.csv`, the picture to `stem.png`.
-            runs: finished runs of its experiments.
-
-        Returns:
-            The page in Markdown.
+        The numbers are written to `stem.csv`, the picture to `stem.png`; `stem` is a path without suffix.
         """
 
 
@@ -62,8 +58,7 @@ class WorldsResult(Result):
         resamples: int = 2000,
         seed: int = 0,
     ) -> None:
-        if resamples < 1:
-            raise ValueError(f"resamples={resamples} must be at least 1")
+        check_range(1, resamples=resamples)
         # The main world has no name.
         self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}
         self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]

@@ -12,6 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from coil_rl.envs import SimulatedRobotEnv
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
@@ -105,9 +106,7 @@ class Table6(Result):
         resamples: int = 2000,
         seed: int = 0,
     ) -> None:
-        for name, count in {"repeats": repeats, "laps": laps, "resamples": resamples}.items():
-            if count < 1:
-                raise ValueError(f"{name}={count} must be at least 1")
+        check_range(1, repeats=repeats, laps=laps, resamples=resamples)
         if not labels:
             raise ValueError("labels=[] leaves the guide alone; give at least one")
         by_name = recordings if isinstance(recordings, Mapping) else {"": recordings}

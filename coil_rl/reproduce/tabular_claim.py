@@ -19,6 +19,7 @@ from matplotlib.transforms import ScaledTranslation
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
@@ -76,13 +77,10 @@ class TabularCoil(Result):
         episode_steps: int = 50,
         steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000),
     ) -> None:
-        for name, value in {"worlds": worlds, "actions": actions, "classes": classes}.items():
-            if value < 1:
-                raise ValueError(f"{name}={value} must be at least 1")
+        check_range(1, worlds=worlds, actions=actions, classes=classes)
         if states < max(3, classes):
             raise ValueError(f"states={states} must be at least 3, and at least classes={classes}")
-        if not 0 <= noise <= 1:
-            raise ValueError(f"noise={noise} must be between 0 and 1")
+        check_range(0, 1, noise=noise)
         if not steps or list(steps) != sorted(set(steps)) or steps[0] < 1:
             raise ValueError(f"steps={list(steps)} must be increasing integers from 1")
         self.worlds, self.states, self.actions, self.classes = worlds, states, actions, classes

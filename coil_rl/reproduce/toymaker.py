@@ -10,6 +10,7 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
@@ -31,8 +32,7 @@ class Table1(Result):
     """
 
     def __init__(self, tolerance: float = 1e-9) -> None:
-        if not tolerance > 0:
-            raise ValueError(f"tolerance={tolerance} must be more than 0")
+        check_range(0, above=True, tolerance=tolerance)
         self.tolerance = tolerance
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -81,8 +81,7 @@ class Figure6(Result):
     """
 
     def __init__(self, iterations: int = 160) -> None:
-        if iterations < 1:
-            raise ValueError(f"iterations={iterations} must be at least 1")
+        check_range(1, iterations=iterations)
         self.iterations = iterations
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:

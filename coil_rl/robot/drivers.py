@@ -35,14 +35,9 @@ class Driver:
 def agent_driver(
     run: Path, config: DictConfig, make_robots: Callable[[], EnvBase], which: str = "last", name: str | None = None
 ) -> Driver:
-    """Return the agent of a run as a driver, with its own guides and transforms.
+    """Return the last or best agent of a run as a driver, with its own guides and transforms.
 
-    Args:
-        run: folder of the run.
-        config: of the run.
-        make_robots: returns the robots, without transforms.
-        which: last or best policy.
-        name: of the driver; by default that of the folder.
+    `make_robots` returns the robots without transforms. The name is that of the run's folder by default.
     """
     about = {"policy": str(config.label), "seed": str(config.seed), "run": run.name}
     if (weights := weights_file(run, which)).is_file():  # a missing file is reported when the policy is loaded
@@ -55,11 +50,8 @@ def record(
 ) -> list[Recording]:
     """Return recordings of a deterministic episode of each driver; existing ones with equal notes are reused.
 
-    Args:
-        drivers: guides and agents.
-        folder: destination of `NAME_0.mcap`, `NAME_1.mcap` and so on.
-        robots: number of robots of each driver.
-        about: further notes for all recordings, such as the settings of the robots.
+    The files are `NAME_0.mcap`, `NAME_1.mcap` and so on, one for each of the `robots` of a driver. `about` has further
+    notes for all recordings, such as the settings of the robots.
 
     Raises:
         UserError: for a driver that cannot drive the robots.

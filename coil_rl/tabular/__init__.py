@@ -1,7 +1,7 @@
 """Tabular methods of the paper's second section.
 
-In the paper's order: `mdp`, a Markov decision process as arrays; `planning`, dynamic programming with a known model;
-`learning`, control from sampled transitions; `coil`, the same methods with a guide's advice; `worlds`, examples.
+In the paper's order: `mdp`, Markov decision processes as arrays; `planning`, dynamic programming with a known model;
+`learning`, control from sampled transitions; `coil`, the same methods with a guide's advice.
 """
 
 from coil_rl.tabular.coil import observations_with_advice, with_advice
@@ -13,9 +13,8 @@ from coil_rl.tabular.learning import (
     q_learning,
     sample_transitions,
 )
-from coil_rl.tabular.mdp import MDP
+from coil_rl.tabular.mdp import MDP, garnet, toymaker
 from coil_rl.tabular.planning import PlanningResult, policy_evaluation, policy_iteration, solve, value_iteration
-from coil_rl.tabular.worlds import garnet, toymaker
 
 __all__ = [
     "MDP",

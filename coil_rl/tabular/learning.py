@@ -19,7 +19,7 @@ from coil_rl.tabular.mdp import MDP, Array, Integers
 
 
 class Simulator:
-    """A Markov decision process that is played step by step.
+    """Step-by-step simulation of a Markov decision process.
 
     Args:
         mdp: the world.
@@ -70,15 +70,7 @@ class Transitions:
 def sample_transitions(
     mdp: MDP, policy: ArrayLike, steps: int, rng: Generator, episode_steps: int | None = None
 ) -> Transitions:
-    """Sample consecutive transitions of a policy.
-
-    Args:
-        mdp: the world.
-        policy: actions [S], or their probabilities [S, A].
-        steps: N.
-        rng: random generator.
-        episode_steps: see `Simulator`.
-    """
+    """Sample N = `steps` consecutive transitions of a policy, actions [S] or their probabilities [S, A]."""
     choices = _cumulative(mdp.probabilities(policy)).tolist()
     world = Simulator(mdp, rng, episode_steps)
     integers, reward = np.zeros((3, steps), dtype=np.int64), np.zeros(steps)
@@ -100,15 +92,6 @@ class ModelEstimate:
     Attributes:
         counts: [S, A, S], number of observed transitions.
         rewards: [S, A, S], sum of their rewards.
-
-    Example:
-        >>> import numpy as np
-        >>> from coil_rl.tabular import ModelEstimate, sample_transitions, toymaker, value_iteration
-        >>> world, uniform = toymaker(), np.full((2, 2), 0.5)
-        >>> model = ModelEstimate(2, 2)
-        >>> model.add(sample_transitions(world, uniform, 2_000, np.random.default_rng(0)))
-        >>> value_iteration(model.mdp(world.gamma)).policy.tolist()
-        [1, 1]
     """
 
     def __init__(self, states: int, actions: int) -> None:

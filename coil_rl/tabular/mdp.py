@@ -1,10 +1,11 @@
-"""Finite Markov decision processes as arrays."""
+"""Finite Markov decision processes as arrays, and two examples: the toymaker and random worlds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -79,10 +80,7 @@ class MDP:
         return values
 
     def probabilities(self, policy: ArrayLike) -> Array:
-        """Return a policy as action probabilities [S, A].
-
-        Args:
-            policy: [S] integers, the action in each state; or probabilities [S, A].
+        """Return a policy, which is actions [S] or their probabilities [S, A], as probabilities [S, A].
 
         Raises:
             ValueError: if it is neither, naming the state.
@@ -124,3 +122,36 @@ def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...
     if len(names) != count:
         raise ValueError(f"{kind} has {len(names)} names, but P has {count} {kind}")
     return tuple(names)
+
+
+def toymaker(gamma: float = 0.95) -> MDP:
+    """Return Howard's toymaker (1960), the paper's first example, small enough to solve by hand.
+
+    The toy is successful or not, and the toymaker advertises or not. Advertising costs reward now and makes a
+    successful toy more likely.
+
+    Args:
+        gamma: discount factor; below 20/29, about 0.69, advertising does not pay.
+    """
+    P = [[[0.5, 0.5], [0.8, 0.2]], [[0.4, 0.6], [0.7, 0.3]]]
+    R = [[[9.0, 3.0], [4.0, 4.0]], [[3.0, -7.0], [1.0, -19.0]]]
+    return MDP(P, R, gamma, states=("successful toy", "unsuccessful toy"), actions=("no advertising", "advertising"))
+
+
+def garnet(states: int, actions: int, rng: Generator, *, branches: int = 3, gamma: float = 0.9) -> MDP:
+    """Return a random world (a Garnet, Archibald et al. 1995).
+
+    Each action leads to a few randomly drawn states, with probabilities from a flat Dirichlet distribution and a
+    normally distributed reward that does not depend on the next state.
+
+    Raises:
+        ValueError: unless `branches`, the number of possible next states of an action, is from 1 to `states`.
+    """
+    if not 1 <= branches <= states:
+        raise ValueError(f"branches={branches} must be between 1 and states={states}")
+    P = np.zeros((states, actions, states))
+    for s in range(states):
+        for a in range(actions):
+            P[s, a, rng.choice(states, branches, replace=False)] = rng.dirichlet(np.ones(branches))
+    R = np.broadcast_to(rng.normal(size=(states, actions, 1)), P.shape)
+    return MDP(P, R, gamma)

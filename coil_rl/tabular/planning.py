@@ -33,15 +33,9 @@ class PlanningResult:
 
 
 def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> Array:
-    """Return V [S] of a policy, by iteration from 0 (algorithm 1).
+    """Return V [S] of a policy, by iteration from 0 (algorithm 1); `tolerance` is the largest error of V, above 0.
 
-    Args:
-        mdp: the world.
-        policy: actions [S], or their probabilities [S, A].
-        tolerance: largest error of V.
-
-    Raises:
-        ValueError: if the policy does not fit the world, or the tolerance is not more than 0.
+    The policy is actions [S], or their probabilities [S, A].
     """
     pi = mdp.probabilities(policy)
     V = np.zeros(len(mdp.states))
@@ -52,12 +46,7 @@ def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> A
 
 
 def solve(mdp: MDP, policy: ArrayLike) -> Array:
-    """Return V [S] of a policy as the solution of the linear equations V = r + gamma P V, without iteration.
-
-    Args:
-        mdp: the world.
-        policy: actions [S], or their probabilities [S, A].
-    """
+    """Return V [S] of a policy as the solution of the linear equations V = r + gamma P V, without iteration."""
     pi = mdp.probabilities(policy)
     P, r = np.einsum("sa,sat->st", pi, mdp.P), (pi * mdp.r).sum(axis=1)
     return np.linalg.solve(np.eye(len(r)) - mdp.gamma * P, r)
@@ -66,13 +55,7 @@ def solve(mdp: MDP, policy: ArrayLike) -> Array:
 def policy_iteration(mdp: MDP, policy: ArrayLike | None = None, tolerance: float = 1e-12) -> PlanningResult:
     """Alternate policy evaluation and greedy improvement until the policy is stable (algorithm 2).
 
-    Args:
-        mdp: the world.
-        policy: initial actions [S]; the first action everywhere by default.
-        tolerance: of each evaluation.
-
-    Returns:
-        An optimal policy; `history` has V of each intermediate policy.
+    It starts from `policy` [S], by default the first action everywhere. `history` has V of each intermediate policy.
     """
     count = len(mdp.states)
     policy = np.zeros(count, dtype=np.int64) if policy is None else np.asarray(policy, dtype=np.int64)
@@ -81,7 +64,7 @@ def policy_iteration(mdp: MDP, policy: ArrayLike | None = None, tolerance: float
         V = policy_evaluation(mdp, policy, tolerance)
         history.append(V)
         Q = mdp.q(V)
-        # Keep the present action on a tie, or two optimal policies could alternate for ever.
+        # Keep the present action on a tie, or two optimal policies could alternate endlessly.
         improves = Q.max(axis=1) > Q[np.arange(count), policy] + TIE
         if not improves.any():
             return PlanningResult(policy, V, Q, np.array(history))
@@ -91,15 +74,7 @@ def policy_iteration(mdp: MDP, policy: ArrayLike | None = None, tolerance: float
 def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
     """Iterate V <- max over actions of r + gamma P V from 0 until convergence (algorithm 3).
 
-    Args:
-        mdp: the world.
-        tolerance: largest error of V.
-
-    Returns:
-        An optimal policy; `history` has V after each iteration.
-
-    Raises:
-        ValueError: if the tolerance is not more than 0.
+    The tolerance is the largest error of V, above 0. `history` has V after each iteration.
     """
     history = [np.zeros(len(mdp.states))]
     while True:

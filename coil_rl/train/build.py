@@ -49,10 +49,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
 def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
     """Return a node with its references resolved after the checks of `build`, without building anything.
 
-    Args:
-        node: as in `build`.
-        name: as in `build`.
-        program: names of the arguments that the program adds.
+    `program` has the names of the arguments that the program adds.
     """
     if isinstance(node, (DictConfig, ListConfig)):
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
@@ -89,10 +86,7 @@ def _target(path: Any, name: str) -> Callable[..., Any]:
 def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
     """Return the env of a configuration with all transforms; it also writes the sum of rewards, `episode_reward`.
 
-    Args:
-        config: with `env`, `method`, `degrade` and `action`.
-        overrides: of `env`.
-        advice: key in `evaluation.advice` of one more transform of the advice.
+    `overrides` are of `env`; `advice` is the key in `evaluation.advice` of one more transform of the advice.
 
     Raises:
         UserError: as `build`, and if the transforms do not fit together.
@@ -171,12 +165,9 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
-    """Return the learner of a configuration, which observes `method.observes` and `also_observes`.
+    """Return the learner of a configuration, which observes `method.observes` and `also_observes` of an env.
 
-    Args:
-        config: with these and `learner`.
-        env: with its transforms.
-        guides: for a learner that trains guides.
+    `guides` are for a learner that trains guides.
     """
     arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
     keys = [*config.method.observes, *config.also_observes]

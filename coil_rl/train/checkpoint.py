@@ -55,10 +55,9 @@ def save_newest(state: Any, folder: Path) -> None:
 
 
 def load_newest(folder: Path) -> Any | None:
-    """Return the newest checkpoint of a run, or the previous one if it is damaged, which is reported on standard error.
+    """Return the newest checkpoint of a run, or the previous one if it is damaged; None before the first one.
 
-    Returns:
-        The state; None before the first checkpoint.
+    The use of the previous one is reported on standard error.
 
     Raises:
         UserError: if both are damaged.

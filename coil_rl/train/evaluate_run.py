@@ -15,8 +15,9 @@ from tqdm import tqdm
 
 from coil_rl.files import write_text
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
+from coil_rl.report.runs import PER_STEP
 from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node
-from coil_rl.train.evaluation import PER_STEP, EvaluationResult, evaluate_policy, summarise
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy, summarise
 
 COLUMNS = {
     "driver": ("driver", ""),
@@ -38,11 +39,7 @@ def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder:
     Each guide drives each track once. An agent drives it once with deterministic actions, `evaluation.repeats` times
     with sampled ones if it samples, and once with each advice of `evaluation.advice` instead of its own.
 
-    Args:
-        config: of a run.
-        agent: policy of the run; None for the guides alone.
-        folder: of the files.
-        seed: of the sampled actions.
+    The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
     """
     tracks = build(config.track.test, "track.test")
     names = [track.name for track in tracks]
@@ -109,13 +106,9 @@ def drive_guides(
     names: Sequence[str],
     guides: Mapping[str, TensorDictModuleBase] | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Evaluate each guide of a run alone, on each track once; keyed by display name, see `driver_names`.
+    """Evaluate each guide of a run alone, once on each of the tracks `names`; return the results by `driver_names`.
 
-    Args:
-        config: of the run.
-        overrides: of `env`; one car a track.
-        names: of the tracks.
-        guides: instead of those of the configuration, whose results are cached.
+    `overrides` are of `env`. `guides` replace those of the configuration, whose results are cached.
     """
     if not guides:
         nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}

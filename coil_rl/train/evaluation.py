@@ -16,8 +16,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
-PER_STEP = "per_step_"  # followed by the name of a task
+from coil_rl.report.runs import MEASURES, PER_STEP
 
 
 @dataclass(frozen=True)
@@ -60,10 +59,10 @@ def evaluate_policy(
     names: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> EvaluationResult:
-    """Run one episode on every row of an env.
+    """Run one episode on every row of an env [B], with its transforms in evaluation mode.
 
     Args:
-        env: batched env, [B]; its transforms are set to evaluation mode.
+        env: batched env.
         policy: writes the action.
         sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B] for each row.
         names: of the tracks.

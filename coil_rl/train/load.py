@@ -17,13 +17,9 @@ PROXIES = "proxies"  # subfolder with the networks that replace guides without p
 
 
 def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
-    """Return the policy of a run.
+    """Return the policy of a run, `last` or `best` (highest mean return of a training batch).
 
-    Args:
-        folder: of the run.
-        config: of the run.
-        env: with the transforms of the run.
-        which: `last`, or `best` (highest mean return of a training batch).
+    The env has the transforms of the run.
 
     Raises:
         UserError: if there is no such policy, or it does not fit the configuration.

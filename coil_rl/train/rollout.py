@@ -109,11 +109,9 @@ class Rollout:
 
 
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
-    """Raise an error if a number of a batch is NaN or infinite. The check waits for the device once.
+    """Raise an error if a number of a batch [*B, T] is NaN or infinite; `steps` is the number of earlier steps.
 
-    Args:
-        batch: [*B, T] consecutive steps of B cars.
-        steps: of each car before this batch.
+    The check waits for the device once.
 
     Raises:
         UserError: for the earliest such number, with its entry, step (from 1) and car (from 0).

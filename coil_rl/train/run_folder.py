@@ -59,12 +59,9 @@ def begin(config: DictConfig, folder: Path) -> None:
 
 
 def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
-    """Return the configuration of the run in a folder.
+    """Return the configuration of the run in a folder, with `changes`, new values of top-level keys.
 
-    Args:
-        folder: of the run.
-        key: of the configuration that names the folder, for the message.
-        changes: new values of top-level keys.
+    `key` is the key of the calling program that names the folder, for the message.
 
     Raises:
         UserError: if the folder holds no run, or its configuration cannot be read.
@@ -115,17 +112,17 @@ def is_evaluated(folder: Path) -> bool:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and important packages, the commit, and the machine."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
+    result = {"python": platform.python_version(), "platform": platform.platform()}
     for name in PACKAGES:
         try:
-            found[name] = metadata.version(name)
+            result[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
-            found[name] = "not installed"
+            result[name] = "not installed"
     git = ["git", "-C", str(Path(__file__).resolve().parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    found["commit"] = _output(git) or "not a git checkout"
-    found["cpus"] = str(os.cpu_count())
-    found["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
-    return found
+    result["commit"] = _output(git) or "not a git checkout"
+    result["cpus"] = str(os.cpu_count())
+    result["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    return result
 
 
 def _output(command: list[str]) -> str:

@@ -11,9 +11,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
@@ -54,26 +55,7 @@ class McapReplayEnv(EnvBase):
     Raises:
         RecordingError: for a recording that cannot be used.
         ValueError: for a value outside its range.
-
-    Example:
-        >>> from coil_rl.envs.recordings.reading import Recording
-        >>> times, ones = np.arange(5) * 10**8, np.ones(5)
-        >>> drive = Recording("drive", False, times, times, np.ones((5, 360), np.float32), ones * 360, -ones, ones / 60)
-        >>> env = McapReplayEnv(drive, lambda ranges, angles: (np.zeros((5, 2, 16, 2)), np.zeros((5, 2))))
-        >>> env.rollout(100)["next", "observation"].shape
-        torch.Size([1, 5, 20])
     """
-
-    steps: Tensor
-    history: Tensor
-    first: Tensor
-    length: Tensor
-    cones: Tensor
-    count: Tensor
-    samples: Tensor
-    valid: Tensor
-    pose: Tensor
-    seconds: Tensor
 
     def __init__(
         self,
@@ -96,19 +78,10 @@ class McapReplayEnv(EnvBase):
         max_steering: float = 80.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        if remembered not in ("held", "moved"):
-            raise ValueError(f"remembered={remembered!r} must be one of held, moved")
-        positive = {
-            "kept_cones": kept_cones, "scale": scale, "sight": sight, "speed": speed, "car_length": car_length,
-            "max_steering": max_steering,
-        }  # fmt: skip
-        for name, value in positive.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name}={value} must be a finite number above 0")
-        if max_steering > 90:
-            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
-        if not math.isfinite(smooth):
-            raise ValueError(f"smooth={smooth} must be a finite number")
+        check_choice(("held", "moved"), remembered=remembered)
+        check_range(0, above=True, kept_cones=kept_cones, scale=scale, sight=sight, speed=speed, car_length=car_length)
+        check_range(0, 90, above=True, max_steering=max_steering)
+        check_range(-1e6, 1e6, smooth=smooth)
         sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
@@ -122,29 +95,24 @@ class McapReplayEnv(EnvBase):
         self.turn_rate = speed / car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         self._load(perception)
-        self.register_buffer("steps", torch.zeros(len(sources), dtype=torch.int64))
-        self.register_buffer("history", torch.zeros(HISTORY, len(sources)))
+        self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
+        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, len(sources)))
         self.to(self.device)
         declare_specs(self, self._reset())
 
     def _load(self, perception: Perceive) -> None:
         """Perceive all scans; store them end to end, [T] scans per buffer."""
-        views = [_perceive(recording, perception, self.kept_cones) for recording in self.recordings]
-        poses = [recording.poses() for recording in self.recordings]
-        length = torch.tensor([len(pose) for pose in poses])
-        for name, value in {
-            "cones": np.concatenate([cones for cones, _ in views]),
-            "count": np.concatenate([count for _, count in views]),
-            "pose": np.concatenate([_from_start(pose) for pose in poses]).astype(np.float32),
-            "seconds": np.concatenate([recording.seconds for recording in self.recordings]).astype(np.float32),
-        }.items():
-            self.register_buffer(name, torch.from_numpy(value), persistent=False)
+        cones, count = zip(*(_perceive(each, perception, self.kept_cones) for each in self.recordings), strict=True)
+        self.cones, self.count = _joined(cones), _joined(count)
+        self.pose = _joined([_from_start(each.poses()).astype(np.float32) for each in self.recordings])
+        self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
+        length = torch.tensor([len(each.ranges) for each in self.recordings])
+        self.length: Tensor = nn.Buffer(length, persistent=False)
+        self.first: Tensor = nn.Buffer(length.cumsum(0) - length, persistent=False)
         # Much faster here, for all scans at once, than step by step.
         samples, valid = self.memory.estimate(self.cones, self.count)
-        self.register_buffer("samples", samples, persistent=False)
-        self.register_buffer("valid", valid, persistent=False)
-        self.register_buffer("length", length, persistent=False)
-        self.register_buffer("first", length.cumsum(0) - length, persistent=False)
+        self.samples: Tensor = nn.Buffer(samples, persistent=False)
+        self.valid: Tensor = nn.Buffer(valid, persistent=False)
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: the env is deterministic."""
@@ -210,6 +178,10 @@ class McapReplayEnv(EnvBase):
         entries |= {"steering": steering, "omega": (steering * self.max_steering).sin() * self.turn_rate}
         entries |= {"info": TensorDict(info, self.batch_size, device=self.device)}
         return TensorDict(entries, self.batch_size, device=self.device)
+
+
+def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:
+    return nn.Buffer(torch.from_numpy(np.concatenate(parts)), persistent=False)
 
 
 def _from_start(poses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -54,13 +54,9 @@ class Clusters:
 
 
 def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float) -> Points:
-    """Return the points of scans between two distances.
+    """Return the points between two ranges in m of scans [N, P] m; NaN and infinity are no points.
 
-    Args:
-        ranges: [N, P] m; NaN and infinity are no point.
-        angles: [P] radians, bearings of the beams in any order.
-        range_min: m, smaller ranges are no point.
-        range_max: m, greater ranges are no point.
+    The beams have the bearings `angles` [P] radians, in any order.
 
     Raises:
         ValueError: if the shapes do not match or a bearing is not finite.

@@ -29,7 +29,7 @@ BOUNDARY_MARGIN = 0.02  # m, the centre of the robot this close to a boundary ha
 FAR = 1e3  # m, position of padding
 
 LINE_HALF_WIDTH = 0.5  # m to either side of the start of a drive
-SHORTEST_LAP = 1.0  # m, a shorter lap is swaying at the line
+SHORTEST_LAP = 1.0  # m, shorter ones are oscillations across the line
 LINE_OFFSET = 1e-3  # m, so that a robot that stands on the line has not crossed it
 
 
@@ -68,11 +68,7 @@ def noted_track(notes: Mapping[str, str]) -> Track:
 
 
 class RobotCourse:
-    """Cones and boundaries of T tracks, with the distance of robots to a crash.
-
-    Args:
-        tracks: in the robot's own metres.
-    """
+    """Cones and boundaries of T tracks in the robot's own metres, with the distance of robots to a crash."""
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         cones = [cones_of(track) for track in tracks]
@@ -82,14 +78,10 @@ class RobotCourse:
         self.boundaries = [_stack_padded(side, FAR) for side in lines]  # [2, T, points] m each
 
     def clearance(self, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances of robots to a crash: of the outline to a cone, of the centre to a boundary.
+        """Return the distance of robots to a crash [B] m, and those of their centres to both boundaries [2, B] m.
 
-        Args:
-            track: [B] index of the track.
-            pose: [3, B] m, m, radians.
-
-        Returns:
-            [B] m, a crash if not positive; and the distances of the centre to the left and right boundary, [2, B] m.
+        A crash, a distance of at most 0, is that of the outline into a cone or of the centre into a boundary. Robots
+        are at poses [3, B] (m, m, radians) on tracks [B].
         """
         cones, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
         outside = Frame(pose).to_car(cones).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
@@ -129,12 +121,6 @@ def laps(poses: Array, seconds: Array) -> Laps:
     Args:
         poses: [N, 3] m, m, radians, ordered by time.
         seconds: [N].
-
-    Example:
-        >>> angle = np.linspace(0, 4.2 * np.pi, 500)  # two laps of a circle of 1 m, at 1 m/s
-        >>> poses = np.stack([np.sin(angle), 1 - np.cos(angle), angle], axis=1)
-        >>> laps(poses, angle).seconds.round(3).tolist()
-        [6.283, 6.283]
     """
     x, y, heading = poses[0]
     forward = (poses[:, 0] - x) * np.cos(heading) + (poses[:, 1] - y) * np.sin(heading) - LINE_OFFSET

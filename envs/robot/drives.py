@@ -20,6 +20,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
+from coil_rl.envs.limits import check_choice
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, header, twist
 from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError
@@ -78,20 +79,11 @@ def simulated_drive(
     lidar: SimulatedLidar | None = None,
     laps: int = 1,
 ) -> SimulatedDrive:
-    """Simulate a drive along the centre line of a track.
+    """Simulate a drive along the centre line of a track with cones on one side or both.
 
-    Args:
-        sides: of the track with cones.
-        seed: of the noise and the sway.
-        track: None for `robot_track()`.
-        lidar: None for an RPLIDAR A1M8.
-        laps: number of laps.
-
-    Raises:
-        ValueError: for unknown sides.
+    The seed is that of the noise and the sway. By default the track is `robot_track()`, the LiDAR an RPLIDAR A1M8.
     """
-    if sides not in ("left", "right", "both"):
-        raise ValueError(f"sides={sides!r} must be one of left, right, both")
+    check_choice(("left", "right", "both"), sides=sides)
     track, lidar = track or robot_track(), lidar or SimulatedLidar()
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(np.tile(middle_line(track, SPEED / lidar.rate), (laps, 1)))
@@ -113,7 +105,7 @@ def labelling_drives(seeds: Sequence[int]) -> list[SimulatedDrive]:
     return [simulated_drive(side, seed) for seed in seeds for side in ("left", "right")]
 
 
-def surveyed_drive(recording: Recording) -> SimulatedDrive:
+def labelled_drive(recording: Recording) -> SimulatedDrive:
     """Return a recorded drive, simulated or real, with the ground truth that follows from its odometry and track.
 
     The last scan is left out, as the pose at its end is unknown.

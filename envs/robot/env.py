@@ -2,7 +2,7 @@
 
 It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone: cones hide one
 another, are misclassified or missed. The entries have the keys and the scale of the cone world, so guides and policies
-of that world run unchanged. The figures come from data sheets, not from a real robot.
+of that world run unchanged. The numbers come from data sheets, not from a real robot.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -42,8 +43,9 @@ class SimulatedRobotEnv(SeededEnv):
     `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
     `reward`, `done`, `terminated`, `truncated` [B, 1], and under `info` the same entries in the robot's own metres, and
     `valid` [B, 2], whether each side is valid in this scan. The reward is that of the cone world without the term for
-    new cones, which the robot cannot tell from known ones. A robot crashes if its outline touches a cone or its centre
-    reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a return.
+    new cones, as the robot cannot distinguish new cones from known ones. A robot crashes if its outline touches a cone
+    or its centre reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a
+    return.
 
     Args:
         tracks: in the robot's own metres; None for `robot_track()`.
@@ -65,15 +67,6 @@ class SimulatedRobotEnv(SeededEnv):
         torch.Size([2, 3, 20])
     """
 
-    track: Tensor
-    pose: Tensor
-    history: Tensor
-    steps: Tensor
-    lap: Tensor
-    lap_start: Tensor
-    in_finish: Tensor
-    scan: Tensor
-
     def __init__(
         self,
         tracks: Sequence[Track] | None = None,
@@ -92,17 +85,10 @@ class SimulatedRobotEnv(SeededEnv):
         max_steering: float = 80.0,
         seed: int = 0,
     ) -> None:
-        positive = {
-            "num_cars": num_cars, "laps": laps, "time_limit": time_limit, "speed": speed, "car_length": car_length,
-            "max_steering": max_steering,
-        }  # fmt: skip
-        for name, number in positive.items():
-            if not 0 < number < math.inf:
-                raise ValueError(f"{name}={number} must be a finite number above 0")
-        if max_steering > 90:
-            raise ValueError(f"max_steering={max_steering} must be at most 90 degrees")
-        if assignment not in ("random", "cyclic"):
-            raise ValueError(f"assignment={assignment!r} must be one of random, cyclic")
+        check_range(0, above=True, num_cars=num_cars, laps=laps)
+        check_range(0, above=True, time_limit=time_limit, speed=speed, car_length=car_length)
+        check_range(0, 90, above=True, max_steering=max_steering)
+        check_choice(("random", "cyclic"), assignment=assignment)
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
         check_weights("reward", reward or {}, RewardWeights._fields)
@@ -121,14 +107,14 @@ class SimulatedRobotEnv(SeededEnv):
         self.course = RobotCourse(self.tracks)
         self.starts = torch.tensor([track.start for track in self.tracks]).t()
         self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
-        for name, value in {
-            "track": torch.arange(num_cars) % len(self.tracks), "pose": torch.zeros(3, num_cars),
-            "history": torch.zeros(HISTORY, num_cars),
-            "steps": torch.zeros(num_cars, dtype=torch.int64), "lap": torch.zeros(num_cars, dtype=torch.int64),
-            "lap_start": torch.full((num_cars,), -1), "in_finish": torch.zeros(num_cars, dtype=torch.bool),
-            "scan": torch.full((num_cars, self.lidar.beams), torch.inf),
-        }.items():  # fmt: skip
-            self.register_buffer(name, value)
+        self.track: Tensor = nn.Buffer(torch.arange(num_cars) % len(self.tracks))
+        self.pose: Tensor = nn.Buffer(torch.zeros(3, num_cars))
+        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_cars))
+        self.steps: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
+        self.lap: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
+        self.lap_start: Tensor = nn.Buffer(torch.full((num_cars,), -1))
+        self.in_finish: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.bool))
+        self.scan: Tensor = nn.Buffer(torch.full((num_cars, self.lidar.beams), torch.inf))
         declare_specs(self, self._reset())
         self.set_seed(seed)
 

@@ -1,6 +1,6 @@
 """Simulated LiDAR: the distance along each beam of a rotating, moving sensor to the nearest of several upright cones.
 
-The figures are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per second). A cone is a disc in the plane of
+The defaults are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per second). A cone is a disc in the plane of
 the beams. A nearer cone hides a farther one, and the robot moves during a scan.
 """
 
@@ -10,6 +10,8 @@ import math
 
 import torch
 from torch import Tensor
+
+from coil_rl.envs.limits import check_range
 
 RANGE_MIN = 0.15  # m, minimum range of the sensor
 RANGE_MAX = 12.0  # m, maximum range
@@ -29,12 +31,6 @@ class SimulatedLidar:
 
     Raises:
         ValueError: for a value outside its range.
-
-    Example:
-        >>> lidar = SimulatedLidar(beams=4, no_return=0.0, outliers=0.0)
-        >>> ranges, outlier = lidar.measure(torch.tensor([[1.0, torch.inf]]), torch.Generator().manual_seed(0))
-        >>> ranges.shape, ranges[0, 1].item()
-        (torch.Size([1, 2]), inf)
     """
 
     def __init__(
@@ -47,12 +43,8 @@ class SimulatedLidar:
         no_return: float = 0.02,
         outliers: float = 0.005,
     ) -> None:
-        for name, value in {"beams": beams, "rate": rate, "quantum": quantum}.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name}={value} must be a finite number above 0")
-        for name, value in {"noise": noise, "noise_growth": noise_growth}.items():
-            if not 0 <= value < math.inf:
-                raise ValueError(f"{name}={value} must be a finite number of at least 0")
+        check_range(0, above=True, beams=beams, rate=rate, quantum=quantum)
+        check_range(0, noise=noise, noise_growth=noise_growth)
         if min(no_return, outliers) < 0 or no_return + outliers > 1:
             raise ValueError(f"no_return={no_return} and outliers={outliers} must be shares of all beams")
         self.beams, self.rate, self.quantum = beams, rate, quantum

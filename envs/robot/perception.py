@@ -18,6 +18,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import make_composite_from_td
 
+from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
@@ -128,15 +129,12 @@ class Perception:
         gap: float = GAP,
         kept_cones: int = 16,
     ) -> None:
-        for name, value in {"range_max": range_max, "scale": scale, "gap": gap, "kept_cones": kept_cones}.items():
-            if not 0 < value < math.inf:
-                raise ValueError(f"{name}={value} must be a finite number above 0")
+        check_range(0, above=True, range_max=range_max, scale=scale, gap=gap, kept_cones=kept_cones)
         if not 0 < range_min < range_max:
             raise ValueError(f"range_min={range_min} must be above 0, the code for no return, and below range_max")
-        if not 0 <= margin < math.inf:
-            raise ValueError(f"margin={margin} must be a finite number of at least 0")
-        if not 0 < bearing_max <= 180 or not math.isfinite(laser_yaw):
-            raise ValueError(f"bearing_max={bearing_max} must be in (0, 180] degrees and laser_yaw={laser_yaw} finite")
+        check_range(0, margin=margin)
+        check_range(0, 180, above=True, bearing_max=bearing_max)
+        check_range(-360, 360, laser_yaw=laser_yaw)
         self.classifier = classifier
         self.range_min, self.range_max, self.margin, self.gap = range_min, range_max, margin, gap
         self.bearing_max, self.laser_yaw = math.radians(bearing_max), math.radians(laser_yaw)
@@ -195,20 +193,7 @@ class BoundaryMemory(nn.Module):
         batch: B.
         spline, smoothing: of the boundary estimate, as in `ConeTrackEnv`.
         sight: m, range of view in the scale of the cone world.
-
-    Raises:
-        ValueError: for an unknown spline.
-
-    Example:
-        >>> cones = torch.zeros(1, 2, 16, 2)
-        >>> cones[0, 0, :2] = torch.tensor([[2.0, 1.0], [4.0, 1.0]])
-        >>> observation, valid = BoundaryMemory(1)(cones, torch.tensor([[2, 0]]))
-        >>> observation.shape, valid.tolist()
-        (torch.Size([1, 20]), [[True, False]])
     """
-
-    samples: Tensor
-    ever_valid: Tensor
 
     def __init__(
         self,
@@ -218,12 +203,11 @@ class BoundaryMemory(nn.Module):
         sight: float = SIGHT,
     ) -> None:
         super().__init__()
-        if spline not in ("cubic", "quadratic"):
-            raise ValueError(f"spline={spline!r} must be one of cubic, quadratic")
+        check_choice(("cubic", "quadratic"), spline=spline)
         self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
         self.sight = sight
-        self.register_buffer("samples", torch.zeros(2, SAMPLES, 2, batch))
-        self.register_buffer("ever_valid", torch.zeros(2, batch))
+        self.samples: Tensor = nn.Buffer(torch.zeros(2, SAMPLES, 2, batch))
+        self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
 
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Update the memory with the cones in view.

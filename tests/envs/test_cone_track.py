@@ -349,7 +349,7 @@ def test_outputs_are_finite_far_off_the_track(tracks: list[Track]) -> None:
         ({"held_steps": -1}, "held_steps=-1 must be at least 0"),
         ({"seed": -1}, "seed=-1 must be at least 0"),
         ({"time_limit": 0.01}, "time_limit=0.01 must be at least one step"),
-        ({"max_steering": 91}, "max_steering=91 must be at most 90 degrees"),
+        ({"max_steering": 91}, "max_steering=91 must be more than 0 and at most 90"),
         ({"reward": {"finish": 1e300}}, "reward.finish=1e[+]300 must be between -1e6 and 1e6"),
         ({"reward": {"cone": 1.0, "speed": 1.0}}, r"reward has no weight \['speed'\]; it has finish, second, crash"),
         ({"smoothing": -0.1}, "smoothing=-0.1 must be"),

@@ -43,7 +43,7 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
     assert {path.name for path in folder.iterdir() if path.is_file()} == FILES
     assert out.startswith((folder / "listening.md").read_text())
     last = out.splitlines()[-1]
-    assert last.startswith("coil listens most to ")
+    assert last.startswith("coil depends most on ")
     assert last.endswith(f"; see {folder}")
     table = read_csv(folder / "listening_sections.csv")
     assert {row["guide"] for row in table} == {"spline", "random"}
@@ -57,7 +57,7 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
 
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):
     out, _ = listen(tmp_path, f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=out")
-    assert out.splitlines()[-1].startswith("coil_dqn listens most to spline, which moves its action by")
+    assert out.splitlines()[-1].startswith("coil_dqn depends most on spline: other advice of it changes the action by")
     assert "gradient" not in out
     assert "|a - g| and intervention are 0\nfor the same action and 1.414 for any other." in out
     files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}

@@ -189,7 +189,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
         ("recording=text.mcap", "text.mcap is not an MCAP file"),
         ("recording=silent.mcap", "silent.mcap has no scans of a LiDAR"),
         ("recording=drive.mcap env.scan=/lidar", "has no topic /lidar; give the topic of the LiDAR, here /scan"),
-        ("recording=drive.mcap env.speed=-1", "env: speed=-1 must be a finite number above 0"),
+        ("recording=drive.mcap env.speed=-1", "env: speed=-1 must be more than 0"),
         ("recording=drive.mcap guide=[]", "there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]"),
         ("recording=drive.mcap guide=constant guide.constant.value=[1,2]", "its action has the shape [1, 2]"),
         ("recording=drive.mcap runs=[nowhere]", "runs=nowhere is not the folder of a run: it has no config.yaml"),

@@ -2,7 +2,7 @@ import numpy as np
 from PIL import Image
 
 from coil_rl.report import style
-from coil_rl.report.cone_features import draw_cone_features, principal_components
+from coil_rl.reproduce.classifier import draw_cone_features, principal_components
 
 
 def clusters(count=300, seed=0):

@@ -5,7 +5,7 @@ import pytest
 from reproduced_runs import read_csv
 
 from coil_rl.envs import RecordingError, read_recording, save_drive, simulated_drive
-from coil_rl.envs.robot.drives import record_labelling_drives, surveyed_drive
+from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.reproduce import Figure25
 from coil_rl.robot.classifier import accuracy, label_clusters, load_classifier
@@ -18,7 +18,7 @@ def drives(tmp_path_factory):
 
 def test_the_page_has_the_accuracy_of_the_saved_classifier(drives, tmp_path):
     page = Figure25(**drives).make(tmp_path / "figure_25")
-    tested = surveyed_drive(read_recording(drives["both"][0]))
+    tested = labelled_drive(read_recording(drives["both"][0]))
     shares = accuracy(load_classifier(tmp_path / "cones.json"), label_clusters([tested]))
     assert page.startswith("## Figure 25: thin cones and thick ones (simulated)\n")
     for name, share in shares.items():
@@ -53,7 +53,7 @@ def test_unusable_drives_are_rejected(drives, tmp_path):
 def test_a_recorded_drive_has_the_ground_truth_of_the_simulated_one(tmp_path):
     drive = simulated_drive("both", seed=7)
     save_drive(drive, tmp_path / "both.mcap")
-    again = surveyed_drive(read_recording(tmp_path / "both.mcap"))
+    again = labelled_drive(read_recording(tmp_path / "both.mcap"))
     length = len(drive.seconds) - 1
     assert np.array_equal(again.ranges, drive.ranges[:length])
     assert (again.hit == drive.hit[:length]).float().mean() > 0.999

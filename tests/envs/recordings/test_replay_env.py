@@ -216,9 +216,9 @@ def test_cones_are_padded_or_cut_to_the_nearest(tmp_path):
     ("options", "reason"),
     [
         ({"remembered": "lost"}, "remembered='lost' must be one of held, moved"),
-        ({"speed": 0.0}, "speed=0.0 must be a finite number above 0"),
-        ({"max_steering": 91.0}, "at most 90 degrees"),
-        ({"smooth": math.nan}, "smooth=nan must be a finite number"),
+        ({"speed": 0.0}, "speed=0.0 must be more than 0"),
+        ({"max_steering": 91.0}, "at most 90"),
+        ({"smooth": math.nan}, "smooth=nan must be at least -1000000.0"),
         ({"recordings": []}, "recordings is empty; give at least one"),
         ({"recordings": ["missing.mcap"]}, "missing.mcap cannot be read"),
         ({"perception": lambda ranges, angles: blind(ranges[:1], angles)}, r"must return \[3, 2, K, 2\]"),

@@ -22,7 +22,7 @@ from coil_rl.envs import (
     simulated_drive,
 )
 from coil_rl.envs.robot.course import middle_line
-from coil_rl.envs.robot.drives import surveyed_drive, track_of
+from coil_rl.envs.robot.drives import labelled_drive, track_of
 from coil_rl.guides import ConstantGuide, FollowAdvice, SplineGuide
 from coil_rl.transforms import GuideActions
 
@@ -102,7 +102,7 @@ def test_saved_drive_is_read_back_and_marked_as_simulated(tmp_path):
     save_drive(drive, tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
     with pytest.raises(RecordingError, match="lacks the positions of its cones"):
-        surveyed_drive(recording)
+        labelled_drive(recording)
 
 
 def robots():

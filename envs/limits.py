@@ -1,4 +1,4 @@
-"""Range checks for hyper-parameters."""
+"""Checks of numbers and choices among the arguments of a constructor."""
 
 from __future__ import annotations
 
