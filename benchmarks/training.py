@@ -124,7 +124,7 @@ def measure_one_car(args: Namespace) -> list[Row]:
 def one_car(args: Namespace) -> Work:
     """Return steps of `tests/oracle.py` on the training tracks in turn, driven by the guide."""
     sys.path.append(str(TESTS))
-    import oracle  # type: ignore[import-not-found]
+    import oracle  # type: ignore[import-not-found,import-untyped,unused-ignore]
 
     config = train_config(args, "coil")
     options = {key: config.env[key] for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")}

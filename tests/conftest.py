@@ -30,3 +30,9 @@ def ring() -> Track:
     inner, outer = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.linspace(0, 2 * np.pi, 26, endpoint=False)
     left, right = (np.stack([np.cos(turn), np.sin(turn)], axis=1) for turn in (inner, outer))
     return Track("ring", left=3.7 * left, right=6.3 * right)
+
+
+@pytest.fixture(scope="session")
+def rings(ring: Track) -> list[Track]:
+    """Return three round tracks with maps that are fast to build."""
+    return [Track(f"ring_{size}", size * ring.left, size * ring.right) for size in (1.0, 1.1, 1.2)]

@@ -66,13 +66,3 @@ def uncompressed(path):
             writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
         writer.finish()
     return path
-
-
-def flipped(path, chunk=0):
-    """The same recording with one bit flipped in the middle of a chunk."""
-    with path.open("rb") as stream:
-        index = make_reader(stream).get_summary().chunk_indexes[chunk]
-    data = bytearray(path.read_bytes())
-    data[index.chunk_start_offset + index.chunk_length // 2] ^= 1
-    path.write_bytes(data)
-    return path

@@ -10,9 +10,9 @@ def circle(radius, points=60, clockwise=False):
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def ring_track(name, radius):
-    """A circular track, 2 m wide, anticlockwise."""
-    return Track(name, left=circle(radius - 1, 24), right=circle(radius + 1, 28))
+def ring_track(name, radius, width=2.0):
+    """A circular track, anticlockwise."""
+    return Track(name, left=circle(radius - width / 2, 24), right=circle(radius + width / 2, 28))
 
 
 def oval_line(length=40.0, radius=6.0, spacing=0.1):

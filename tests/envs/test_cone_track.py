@@ -1,6 +1,5 @@
 import copy
 import math
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -8,11 +7,11 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
-from torchrl.envs.utils import check_env_specs
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
+from coil_rl.testing import check_env
 
 AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}
 
@@ -20,18 +19,6 @@ AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "e
 @pytest.fixture(scope="module")
 def tracks() -> list[Track]:
     return random_tracks(3, seed=1)
-
-
-@pytest.fixture(scope="module")
-def rings(ring: Track) -> list[Track]:
-    """Three small tracks with maps that are fast to build."""
-    return [Track(f"ring_{size}", size * ring.left, size * ring.right) for size in (1.0, 1.1, 1.2)]
-
-
-@pytest.fixture(autouse=True)
-def no_gradients() -> Iterator[None]:
-    with torch.no_grad():
-        yield
 
 
 def steering(steps: int, cars: int, seed: int) -> Tensor:
@@ -60,43 +47,27 @@ def drive(env: ConeTrackEnv, actions: Tensor) -> list[TensorDictBase]:
     return outputs
 
 
-def leaves(data: TensorDictBase) -> dict[Any, Tensor]:
-    return dict(data.items(include_nested=True, leaves_only=True))
-
-
-def assert_finite(data: TensorDictBase) -> None:
-    for key, value in leaves(data).items():
-        assert value.isfinite().all(), key
-
-
-def same(a: TensorDictBase, b: TensorDictBase) -> bool:
-    ours, theirs = leaves(a), leaves(b)
-    return ours.keys() == theirs.keys() and all(torch.equal(ours[key], theirs[key]) for key in ours)
-
-
 def buffers(env: ConeTrackEnv) -> dict[str, Tensor]:
     return {name: value.clone() for name, value in env.state_dict().items() if not name.endswith("_extra_state")}
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("assignment", ["random", "cyclic"])
-@pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
-def test_specs_match_the_data(rings: list[Track], preset: dict, assignment: str, dtype: torch.dtype) -> None:
-    check_env_specs(ConeTrackEnv(rings, 3, assignment=assignment, dtype=dtype, **preset))
+@pytest.mark.parametrize("options", [{}, {"assignment": "cyclic"}, {"dtype": torch.float64}, {"info": False}, AUTHORS])
+def test_env_contract_holds(rings: list[Track], options: dict[str, Any]) -> None:
+    check_env(ConeTrackEnv(rings, 3, **options))
 
 
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
 def test_outputs_are_finite_and_within_their_specs(preset: dict) -> None:
-    env = ConeTrackEnv(shipped_tracks("train"), 256, **preset)
+    env = ConeTrackEnv(shipped_tracks("train"), 128, **preset)
     assert env.observation_spec.is_in(env.reset().select(*env.observation_spec.keys()))
-    for emitted in drive(env, steering(120, 256, seed=2)):
+    for emitted in drive(env, steering(120, 128, seed=2)):
         assert env.observation_spec.is_in(emitted.select(*env.observation_spec.keys()))
         assert emitted["cones"].square().sum(-1).max() <= 49 + 1e-4
-        assert_finite(emitted)
+        assert emitted.isfinite().all()
 
 
 def test_env_is_batch_invariant(tracks: list[Track]) -> None:
-    cars, chosen = 4096, (1731, 4095)
+    cars, chosen = 1536, (600, 1533)
     env = ConeTrackEnv(tracks, cars, assignment="cyclic")
     actions = steering(150, cars, seed=3)
     state = env.reset()
@@ -116,7 +87,7 @@ def test_env_is_batch_invariant(tracks: list[Track]) -> None:
         resets += int(emitted["done"].sum())
         for car, single in alone.items():
             own, states[car] = advance(single, states[car], action[car : car + 1])
-            assert same(own, emitted[car : car + 1])
+            assert (own == emitted[car : car + 1]).all()
     assert resets > cars / 2
     for car, single in alone.items():
         assert all(
@@ -126,13 +97,10 @@ def test_env_is_batch_invariant(tracks: list[Track]) -> None:
 
 def test_info_does_not_change_the_other_outputs(tracks: list[Track]) -> None:
     full, bare = (ConeTrackEnv(tracks, 8, info=info, seed=3) for info in (True, False))
-    check_env_specs(bare)
-    for env in (full, bare):
-        env.set_seed(3)
     actions = steering(60, 8, seed=3)
     for with_info, without in zip(drive(full, actions), drive(bare, actions), strict=True):
         assert "info" not in without
-        assert same(with_info.exclude("info"), without)
+        assert (with_info.exclude("info") == without).all()
 
 
 @pytest.mark.parametrize("assignment", ["random", "cyclic"])
@@ -152,18 +120,6 @@ def test_partial_reset_changes_only_the_masked_cars(rings: list[Track], assignme
     for name in ("history", "steps", "lap", "in_finish"):
         assert not after[name][..., mask].any(), name
     assert fresh["observation"][mask].ne(state["observation"][mask]).any(dim=-1).all()
-
-
-def test_partial_reset_keeps_the_observations_of_other_cars(tracks: list[Track]) -> None:
-    env = ConeTrackEnv(tracks, 64)
-    state = env.reset()
-    for action in steering(150, 64, seed=5):
-        emitted, state = advance(env, state, action)
-        running = ~emitted["done"].squeeze(-1)
-        for key in ("observation", "cones", "cone_count", "steering"):
-            assert torch.equal(state[key][running], emitted[key][running])
-        assert state["steering"][~running].eq(0).all()
-        assert not state["done"].any()
 
 
 def drawn_tracks(env: ConeTrackEnv) -> Tensor:
@@ -193,13 +149,13 @@ def test_cyclic_assignment_keeps_cars_on_their_tracks(rings: list[Track]) -> Non
 @pytest.mark.parametrize("preset", [{}, AUTHORS], ids=["paper", "authors"])
 def test_restored_env_continues_bit_for_bit(tracks: list[Track], preset: dict) -> None:
     env = ConeTrackEnv(tracks, 16, seed=3, **preset)
-    actions = steering(280, 16, seed=6)
+    actions = steering(220, 16, seed=6)
     state = env.reset()
-    for action in actions[:100]:
+    for action in actions[:60]:
         _, state = advance(env, state, action)
     saved, saved_state = copy.deepcopy(env.state_dict()), state.clone()
     trace = []
-    for action in actions[100:]:
+    for action in actions[60:]:
         emitted, state = advance(env, state, action)
         trace.append((emitted, state.clone()))
     # The draws of future tracks are part of the state, so some episodes have to end.
@@ -207,10 +163,10 @@ def test_restored_env_continues_bit_for_bit(tracks: list[Track], preset: dict) -
 
     restored = ConeTrackEnv(tracks, 16, seed=99, **preset)
     restored.load_state_dict(saved)
-    for action, (emitted, after) in zip(actions[100:], trace, strict=True):
+    for action, (emitted, after) in zip(actions[60:], trace, strict=True):
         ours, saved_state = advance(restored, saved_state, action)
-        assert same(ours, emitted)
-        assert same(saved_state, after)
+        assert (ours == emitted).all()
+        assert (saved_state == after).all()
 
 
 def test_time_limit_truncates(rings: list[Track]) -> None:
@@ -223,27 +179,13 @@ def test_time_limit_truncates(rings: list[Track]) -> None:
     assert not rollout["terminated"].any()
 
 
-def test_crash_replaces_all_other_reward_terms(tracks: list[Track]) -> None:
-    crashes = 0
-    for emitted in drive(ConeTrackEnv(tracks, 32), steering(150, 32, seed=7)):
-        crashed, terms = emitted["info", "crashed"], emitted["info", "reward"]
-        crashes += int(crashed.sum())
-        assert emitted["reward"][crashed].eq(-100).all()
-        assert torch.equal(terms["crash"], -100.0 * crashed)
-        assert all(terms[term][crashed].eq(0).all() for term in REWARD_TERMS if term != "crash")
-        assert all(terms[term][~crashed].ne(0).any() for term in ("alive", "smooth"))
-        assert torch.equal(crashed, emitted["info", "clearance"] <= 0)
-        assert torch.equal(crashed, emitted["terminated"])
-    assert crashes > 10
-
-
 def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
     weights = {"finish": 3.0, "second": -0.1, "cone": 0.5, "smooth": -7.0, "alive": 0.25, "crash": -9.0}
-    env = ConeTrackEnv([ring], 8, rate=12, laps=1, reward=weights)
+    env = ConeTrackEnv([ring], 8, rate=8, laps=1, reward=weights)
     guide = SplineGuide()
     state = env.reset()
     finished = 0
-    for action in steering(240, 8, seed=8):
+    for action in steering(155, 8, seed=8):
         emitted, state = advance(env, state, guide(state)["action"] + 0.2 * action)
         terms, alive = emitted["info", "reward"], ~emitted["info", "crashed"]
         lap_time = emitted["info", "lap_time"]
@@ -256,59 +198,6 @@ def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
     assert finished > 0
 
 
-def test_held_steps_keep_the_steering_at_zero(rings: list[Track]) -> None:
-    env = ConeTrackEnv(rings, 3, held_steps=2)
-    state = env.reset()
-    heading = state["info", "pose"][:, 2]
-    for expected in (0.0, 0.0, 1.0):
-        state["action"] = torch.ones(3, 1)
-        emitted = env.step(state)["next"]
-        assert emitted["steering"].eq(expected).all()
-        assert emitted["info", "pose"][:, 2].eq(heading).all() == (expected == 0)
-        assert emitted["info", "smoothness"].eq(expected).all()
-        state = env.step_mdp(state)
-
-
-def drive_episode(track: Track, weave: float = 0.0, **kwargs: Any) -> TensorDictBase:
-    """Drive one car by the guide, weaving, until its episode ends: [steps, ...]."""
-    env = ConeTrackEnv([track], 1, rate=12, **kwargs)
-    guide = SplineGuide()
-
-    def policy(data: TensorDictBase) -> TensorDictBase:
-        data = guide(data)
-        data["action"] = (data["action"] + weave * math.sin(1.6 * float(env.steps))).clamp(-1, 1)
-        return data
-
-    return env.rollout(5000, policy)["next"][0]
-
-
-def test_an_episode_ends_after_its_laps(ring: Track) -> None:
-    episode = drive_episode(ring, laps=1)
-    assert episode["terminated"][-1]
-    assert not episode["truncated"][-1]
-    assert not episode["info", "crashed"].any()
-    assert episode["info", "lap"].flatten().tolist() == [0] * (len(episode) - 1) + [1]
-    times = episode["info", "lap_time"]
-    assert times[:-1].eq(0).all()
-    # Lap time counts from the first entry of the finish circle instead of the start.
-    assert 0.9 * ring.length / 2 < times[-1].item() < len(episode) / 12
-
-
-def test_cone_bonus_is_paid_once_a_lap_or_at_every_sighting(ring: Track) -> None:
-    cones = len(ring.left) + len(ring.right)
-    once = drive_episode(ring, 0.5, cone_bonus="first_sighting")
-    again = drive_episode(ring, 0.5, cone_bonus="every_sighting", laps=1)
-    assert torch.equal(once["info", "pose"][: len(again)], again["info", "pose"])
-    assert once["info", "lap"][-1] == 2
-    paid = [episode["info", "reward", "cone"] / 2.5 for episode in (once, again)]
-    assert all(set(sightings.flatten().tolist()) <= {0, 1, 2} for sightings in paid)
-    # The visible cones are new again in the step that completes a lap.
-    first_lap = once["info", "lap"] == 0
-    assert cones / 2 < paid[0][first_lap].sum() <= cones
-    assert paid[0][~first_lap].sum() <= cones + 2
-    assert paid[1].sum() > paid[0][: len(again)].sum()
-
-
 def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
     env = ConeTrackEnv(tracks, 24)
     state = env.reset()
@@ -317,21 +206,10 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
         before = state.clone()
         emitted, after = advance(env, state, action)
         kept += [(emitted, emitted.clone()), (after, after.clone())]
-        assert same(state.select(*before.keys()).exclude("action"), before.exclude("action"))
+        assert (state.select(*before.keys()).exclude("action") == before.exclude("action")).all()
         state = after.clone(recurse=False)
     env.reset()
-    assert all(same(data.select(*copied.keys()), copied) for data, copied in kept)
-
-
-def test_outputs_are_finite_far_off_the_track(tracks: list[Track]) -> None:
-    env = ConeTrackEnv(tracks, 16)
-    state = env.reset()
-    for action in steering(400, 16, seed=11):
-        state["action"] = 0.2 * action
-        emitted = env.step(state)["next"]
-        assert_finite(emitted)
-        state = env.step_mdp(state)
-    assert (state["info", "pose"] - env.map.starts[:, env.track].t())[:, :2].norm(dim=-1).max() > 25
+    assert all((data.select(*copied.keys()) == copied).all() for data, copied in kept)
 
 
 @pytest.mark.parametrize(
@@ -364,7 +242,7 @@ def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict, message
 def test_actions_are_clamped(rings: list[Track]) -> None:
     wild = torch.tensor([[[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]])
     outputs = [drive(ConeTrackEnv(rings, 4, assignment="cyclic"), actions) for actions in (wild, wild.clamp(-1, 1))]
-    assert all(same(*pair) for pair in zip(*outputs, strict=True))
+    assert all((ours == theirs).all() for ours, theirs in zip(*outputs, strict=True))
 
 
 def test_number_of_kept_cones_changes_only_the_padding(rings: list[Track]) -> None:
@@ -374,7 +252,7 @@ def test_number_of_kept_cones_changes_only_the_padding(rings: list[Track]) -> No
     for narrow, wide in zip(drive(few, actions), drive(many, actions), strict=True):
         assert wide["cones"].shape == (8, 2, 30, 2)
         assert torch.equal(wide["cones"][:, :, :16], narrow["cones"])
-        assert same(narrow.exclude("cones"), wide.exclude("cones"))
+        assert (narrow.exclude("cones") == wide.exclude("cones")).all()
 
 
 @pytest.mark.slow
@@ -389,7 +267,7 @@ def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
         step, state = env.step_and_maybe_reset(state)
         driven += cars
         if driven // cars % 100 == 0:
-            assert all(value.isfinite().all() for value in leaves(step["next"]).values())
+            assert step["next"].isfinite().all()
             resident.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096)
     assert max(resident[len(resident) // 2 :]) < 1.02 * max(resident[: len(resident) // 2])
 
@@ -397,9 +275,9 @@ def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
     envs = [ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")]
-    check_env_specs(envs[1])
+    check_env(envs[1])
     actions = steering(30, 32, seed=13)
     for ours, theirs in zip(*(drive(env, actions) for env in envs), strict=True):
-        assert all(value.device.type == "cuda" for value in leaves(theirs).values())
+        assert theirs.device.type == "cuda"
         assert torch.allclose(ours["observation"], theirs["observation"].cpu(), atol=1e-2)
         assert torch.equal(ours["info", "track"], theirs["info", "track"].cpu())

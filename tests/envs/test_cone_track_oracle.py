@@ -28,8 +28,6 @@ PRESETS = {
         {"spline": "quadratic", "gain": 80 / 120},
     ),
 }
-HALF_RATE = Preset({"rate": 12.0}, {})
-LAP = Preset(PRESETS["authors"].env | {"laps": 1, "rate": 20.0}, PRESETS["authors"].guide)
 # Level, reward and lap time in s of the authors' program with its guide (shared/tracks/README.md).
 AUTHORS = [("MAP_1", 835.4, 69.58), ("MAP_2", 776.7, 63.55), ("MAP_3", 536.1, 41.13)]
 
@@ -128,36 +126,11 @@ def column(trace: dict[str, Array], car: int) -> dict[str, Array]:
     return {key: value[:, car] for key, value in trace.items()}
 
 
-def lap_times(trace: dict[str, Array], car: int) -> Array:
-    times = trace["lap_time"][:, car, 0]
-    return times[times > 0]
-
-
-@pytest.fixture(scope="module")
-def shipped() -> dict[str, Array]:
-    """The guide on the ten shipped tracks at half the rate: at least a lap on each, both laps on the shortest."""
-    return drive(shipped_tracks("all"), HALF_RATE, "guide", 875)
-
-
-@pytest.fixture(scope="module")
-def third_level(levels: list[Track]) -> dict[str, Array]:
-    """A lap of the authors' shortest level at a third of the rate."""
-    return drive(levels[2:], LAP, "guide", 1000)
-
-
-def test_guide_drives_the_shipped_tracks_without_crashing(shipped: dict[str, Array]) -> None:
-    assert not shipped["crashed"].any()
-    assert (shipped["lap"].max(axis=0) >= 1).all()
-    assert (shipped["lap"].max(axis=0) == 2).any()
-
-
-def test_env_agrees_with_the_oracle_on_shipped_tracks(shipped: dict[str, Array]) -> None:
-    shortest = shipped_tracks("all")[0]
-    assert assert_agreement(shortest, HALF_RATE, column(shipped, 0)).lap == 2
-
-
-def test_env_agrees_with_the_oracle_on_an_authors_level(levels: list[Track], third_level: dict[str, Array]) -> None:
-    assert assert_agreement(levels[2], LAP, column(third_level, 0)).lap == 1
+def test_env_agrees_with_the_oracle_over_two_laps(ring: Track) -> None:
+    preset = Preset({"rate": 8.0}, {})
+    trace = drive([ring], preset, "guide", 500)
+    assert assert_agreement(ring, preset, column(trace, 0)).lap == 2
+    assert trace["terminated"][-1].all()
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -167,6 +140,7 @@ def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: st
     trace = drive(tracks, PRESETS[preset], driver, 150, seed=1)
     for car, track in enumerate(tracks):
         assert_agreement(track, PRESETS[preset], column(trace, car))
+    assert trace["crashed"].any() or driver == "disturbed"
 
 
 def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Track]) -> None:
@@ -176,53 +150,26 @@ def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Trac
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 
-def oracle_episode(track: Track, **kwargs: Any) -> tuple[float, Outcome]:
-    """Drive the oracle by its own guide; return the total reward and the last outcome."""
-    car = OneCar(track.left, track.right, track.start, **kwargs)
-    total = 0.0
-    while True:
-        outcome = car.step(guide_action(*car.cones(), car.steering))
-        total += outcome.reward
-        if outcome.terminated or outcome.truncated:
-            return total, outcome
-
-
-def assert_float32_agrees(tracks: list[Track], laps: int, **kwargs: Any) -> None:
-    trace = drive(tracks, Preset({"laps": laps, **kwargs}, {}), "guide", 5000, dtype=torch.float32)
-    for car, track in enumerate(tracks):
-        total, outcome = oracle_episode(track, laps=laps, **kwargs)
-        end = int(trace["terminated"][:, car, 0].argmax())
-        assert trace["lap"][end, car, 0] == outcome.lap == laps
-        assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(total, rel=1e-3)
-
-
 def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
-    assert_float32_agrees([ring], laps=1, rate=12)
+    preset = Preset({"laps": 1, "rate": 8.0}, {})
+    trace = drive([ring], preset, "guide", 500, dtype=torch.float32)
+    car, total, terminated = OneCar(ring.left, ring.right, ring.start, **preset.env), 0.0, False
+    while not terminated:
+        outcome = car.step(guide_action(*car.cones(), car.steering))
+        total, terminated = total + outcome.reward, outcome.terminated
+    assert trace["lap"][-1, 0, 0] == outcome.lap == 1
+    assert trace["reward"][:, 0, 0].sum() == pytest.approx(total, rel=1e-3)
 
 
 @pytest.mark.slow
-def test_float32_reward_agrees_with_the_oracle_on_all_test_tracks() -> None:
-    assert_float32_agrees(shipped_tracks("test"), laps=2)
-
-
-def assert_fidelity(trace: dict[str, Array], car: int, reward: float, lap_time: float, within: float = 0.03) -> None:
-    end = int(trace["terminated"][:, car, 0].argmax())
-    assert not trace["crashed"][: end + 1, car].any()
-    assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(reward, rel=within)
-    assert lap_times(trace, car)[:2] == pytest.approx(lap_time, rel=0.01)
-
-
-def test_authors_preset_earns_the_reward_of_their_program(third_level: dict[str, Array]) -> None:
-    _, reward, lap_time = AUTHORS[2]
-    # The reward is of two laps. At a third of the rate, cone bonuses differ slightly.
-    assert_fidelity(third_level, 0, reward / 2, lap_time, within=0.06)
-
-
-@pytest.mark.slow
-def test_authors_preset_earns_the_reward_of_their_program_on_all_levels(levels: list[Track]) -> None:
+def test_authors_preset_earns_the_reward_of_their_program(levels: list[Track]) -> None:
     trace = drive(levels, PRESETS["authors"], "guide", 10_000, dtype=torch.float32)
     for car, (_, reward, lap_time) in enumerate(AUTHORS):
-        assert_fidelity(trace, car, reward, lap_time)
+        end = int(trace["terminated"][:, car, 0].argmax())
+        assert not trace["crashed"][: end + 1, car].any()
+        assert trace["reward"][: end + 1, car, 0].sum() == pytest.approx(reward, rel=0.03)
+        times = trace["lap_time"][:, car, 0]
+        assert times[times > 0][:2] == pytest.approx(lap_time, rel=0.01)
 
 
 @pytest.mark.slow

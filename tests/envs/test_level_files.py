@@ -1,7 +1,7 @@
 """Level files: reading, writing, and one-sentence errors for every other file."""
 
 import os
-from pathlib import Path
+import re
 
 import numpy as np
 import pytest
@@ -15,9 +15,7 @@ from coil_rl.envs.track import Track, TrackError
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
-LEVELS = Path(__file__).parents[2] / "../shared/tracks"
 HEADER = ",Cone_Type,Cone_X,Cone_Y"
-needs_levels = pytest.mark.skipif(not LEVELS.is_dir(), reason="the authors' level files are not in the repository")
 
 
 def write_level(path, left=9 * CIRCLE, right=11 * CIRCLE):
@@ -49,11 +47,6 @@ def test_saved_track_is_read_back(tmp_path):
     assert loaded.start == pytest.approx(track.start, abs=1e-4)
 
 
-def test_start_of_a_file_is_in_degrees(tmp_path):
-    start = load_track(write_level(tmp_path / "ring.csv"), start=(0, -10, 90)).start
-    assert start == pytest.approx((0, -10, np.pi / 2))
-
-
 def test_case_blank_lines_line_ends_and_extra_columns_are_ignored(tmp_path):
     plain = load_track(write_level(tmp_path / "plain.csv"))
     text = (tmp_path / "plain.csv").read_text().replace(HEADER, ", cone_type ,CONE_X,Cone_Y,Colour")
@@ -62,17 +55,21 @@ def test_case_blank_lines_line_ends_and_extra_columns_are_ignored(tmp_path):
     np.testing.assert_array_equal(load_track(tmp_path / "odd.csv").left, plain.left)
 
 
+def test_start_is_three_numbers_with_the_heading_in_degrees(tmp_path):
+    path = write_level(tmp_path / "ring.csv")
+    assert load_track(path, start=(0, -10, 90)).start == pytest.approx((0, -10, np.pi / 2))
+    for start in ((1, 2), ("a", 0, 0), 5):
+        assert "give three numbers" in error_of(load_track, path, start)
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
         (b"", "is empty"),
-        (b" \n\n", "is empty"),
         (b"\xff\xfe\x00\x81", "is not a text file"),
         (b",Cone_Type,X,Y\n", "has no column Cone_X; the columns of its first line are ['', 'Cone_Type', 'X', 'Y']."),
-        (b",,\n", "has no column Cone_Type; the columns of its first line are ['', '', '']."),
         (f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2".encode(), "line 4: Cone_Type is 'BLUE'; it must be LEFT or RIGHT."),
         (f"{HEADER}\n0,LEFT,1,two".encode(), "line 2: Cone_X, Cone_Y are ['1', 'two']; they must be finite numbers"),
-        (f"{HEADER}\n0,LEFT,nan,2".encode(), "['nan', '2']"),
         (f"{HEADER}\n0,LEFT,1,-inf".encode(), "['1', '-inf']"),
         (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
         (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
@@ -95,12 +92,10 @@ def ring(count, radius):
 @pytest.mark.parametrize(
     ("left", "right", "words"),
     [
-        (9 * CIRCLE, 11 * CIRCLE[:3], "The right side of track 'level' has 3 cones"),
         (9 * CIRCLE + [3, 0], 11 * CIRCLE, "The two sides cross"),
         (ring(1001, 9), ring(32, 11), "left side of track 'level' has 1001 cones, of shape [1001, 2]; give 4 to 1000"),
         (ring(32, 9000), ring(32, 9002), "left side of track 'level' is too large; the limits are 500 m across"),
         ([(200.0 * (k % 2), k / 9) for k in range(900)], ring(32, 11), "is too large"),
-        ([(0.0, 0.0), (1e-5, 0.0), (1e-5, 1e-5), (400.0, 0.0)], ring(32, 11), ""),
         ([(x * 1e-5, 0.0) for x in range(999)] + [(300.0, 9.0)], ring(32, 11), ""),
         ([(7.0 * (k * k % 97), 5.0 * (k * 31 % 89)) for k in range(19)], ring(32, 11), ""),
     ],
@@ -127,11 +122,6 @@ def test_paths_without_a_level_are_rejected_by_name(tmp_path, monkeypatch, path)
     assert "bad.csv is no file" in error_of(load_tracks, tmp_path)
 
 
-@pytest.mark.parametrize("start", [(1, 2), ("a", 0, 0), 5])
-def test_invalid_starts_are_rejected(tmp_path, start):
-    assert "give three numbers" in error_of(load_track, write_level(tmp_path / "ring.csv"), start)
-
-
 def test_folders_are_read_in_natural_order_with_one_start(tmp_path):
     for number in ("10", "2", "1", "²3"):
         write_level(tmp_path / f"MAP_{number}.csv")
@@ -153,12 +143,10 @@ def test_seven_tracks_are_shipped_to_train_and_three_to_test():
         shipped_track("test_4")
 
 
-@needs_levels
-def test_the_authors_level_files_are_read():
-    tracks = load_tracks(LEVELS, start=(7, -10, 0))
-    sizes = {track.name: (len(track.left), len(track.right)) for track in tracks}
+def test_the_authors_level_files_are_read(levels):
+    sizes = {track.name: (len(track.left), len(track.right)) for track in levels}
     assert sizes == {"MAP_1": (82, 91), "MAP_2": (83, 73), "MAP_3": (46, 54)}
-    for track in tracks:
+    for track in levels:
         assert np.linalg.norm(track.finish - (7, -10)) < 2
         assert 57 < track.length < 148
 
@@ -182,66 +170,49 @@ def mutations(draw, lines):
     lines = list(lines)
     for _ in range(draw(st.integers(1, 3))):
         at = draw(st.integers(0, max(0, len(lines) - 1)))
-        kind = draw(st.sampled_from(["cut", "double", "swap", "cell", "cell", "more", "reverse", "text"]))
+        kind = draw(st.sampled_from(["cut", "double", "cell", "cell", "reverse", "text"]))
         if not lines or kind == "text":
             lines.insert(at, draw(st.text(max_size=20)))
         elif kind == "cut":
             del lines[at : at + draw(st.sampled_from([1, 1, 2, 1000]))]
         elif kind == "double":
             lines[at:at] = lines[at : at + draw(st.sampled_from([1, 1, 1000]))]
-        elif kind == "swap":
-            other = draw(st.integers(0, len(lines) - 1))
-            lines[at], lines[other] = lines[other], lines[at]
         elif kind == "cell":
             cells = lines[at].split(",")
             value = draw(st.sampled_from(CELLS) | st.floats(-600, 600).map(str))
             cells[draw(st.integers(0, len(cells) - 1))] = value
             lines[at] = ",".join(cells)
-        elif kind == "more":
-            lines[at] += draw(st.sampled_from([",", ",7,8", '"', ";", " "]))
         else:
             lines[1:] = lines[:0:-1]
-    text = draw(st.sampled_from(["\n", "\r\n", "\r"])).join(lines)
-    data = text.encode(draw(st.sampled_from(["utf-8"] * 4 + ["utf-16"])), "replace")
-    if draw(st.integers(0, 5)) == 0:
-        at = draw(st.integers(0, len(data)))
-        data = data[:at] + draw(st.binary(max_size=8)) + data[at + draw(st.integers(0, 8)) :]
-    return draw(st.sampled_from([b"", b"", b"", b"\xef\xbb\xbf"])) + data
+    data = "\n".join(lines).encode(draw(st.sampled_from(["utf-8"] * 4 + ["utf-16"])), "replace")
+    at = draw(st.integers(0, len(data)))
+    return data[:at] + draw(st.sampled_from([b"", b"", b"", b"\xff", b"\0", b'"', b"\r"])) + data[at:]
 
 
-def load_mutated(data, lines, path):
-    """Return the track of a mutated file, or None if it is rejected properly."""
+def assert_read_or_rejected(data, lines, path, drive):
+    """Load a mutated file; drive on its track if it has one."""
     path.write_bytes(data.draw(mutations(lines)))
     try:
         track = load_track(path)
     except TrackError as error:
-        message = str(error)
-    else:
-        assert 0 < track.length < 10_000
-        return track
-    assert str(path) in message
-    assert message.endswith(".")
-    assert "\n" not in message
-    return None
+        track, message = None, str(error)
+    if track is None:
+        assert re.fullmatch(f".*{re.escape(str(path))}.*[.]", message)
+        return
+    assert 0 < track.length < 10_000
+    if drive:
+        steps = ConeTrackEnv([track], num_cars=4).rollout(5, break_when_any_done=False)
+        assert all(torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones"))
 
 
-@settings(max_examples=150, **SHARED)
+@settings(max_examples=100, **SHARED)
 @given(data=st.data())
 def test_mutated_files_are_read_or_rejected_by_name(lines, tmp_path, data):
-    load_mutated(data, lines, tmp_path / "level.csv")
+    assert_read_or_rejected(data, lines, tmp_path / "level.csv", drive=False)
 
 
 @pytest.mark.slow
-@settings(max_examples=5000, **SHARED)
+@settings(max_examples=500, **SHARED)
 @given(data=st.data())
-def test_many_mutated_files_are_read_or_rejected_by_name(lines, tmp_path, data):
-    load_mutated(data, lines, tmp_path / "level.csv")
-
-
-@settings(max_examples=12, **SHARED)
-@given(data=st.data())
-def test_tracks_of_mutated_files_can_be_driven(lines, tmp_path, data):
-    track = load_mutated(data, lines, tmp_path / "level.csv")
-    if track is not None:
-        steps = ConeTrackEnv([track], num_cars=4).rollout(5, break_when_any_done=False)
-        assert all(torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones"))
+def test_many_mutated_files_are_rejected_or_can_be_driven(lines, tmp_path, data):
+    assert_read_or_rejected(data, lines, tmp_path / "level.csv", drive=True)

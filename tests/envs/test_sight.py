@@ -27,13 +27,9 @@ def polar(distance: float, degrees: float) -> tuple[float, float]:
 
 
 def visible(left: list[tuple[float, float]], dtype: torch.dtype = torch.float64) -> list[bool]:
-    return in_sight(view(sides(left, [], dtype), limit=16), len(left))[:, 0, 0].tolist()
-
-
-def in_sight(result: View, candidates: int) -> Tensor:
-    """Return which candidates are visible: [candidates, 2, B] bool."""
-    mask = torch.zeros(candidates, *result.count.shape, dtype=result.real.dtype)
-    return mask.scatter_add(0, result.candidate.long(), result.real) > 0
+    result = view(sides(left, [], dtype), limit=16)
+    mask = torch.zeros(len(left), *result.count.shape, dtype=result.real.dtype)
+    return (mask.scatter_add(0, result.candidate.long(), result.real) > 0)[:, 0, 0].tolist()
 
 
 def random_cones(seed: int, candidates: int = 20, cars: int = 7) -> Tensor:
@@ -63,19 +59,11 @@ def test_view_agrees_with_brute_force(seed: int, limit: int) -> None:
 
 
 @both_dtypes
-def test_cones_are_visible_up_to_seven_metres(dtype: torch.dtype) -> None:
-    assert visible([(7.0, 0.0), (7.00001, 0.0), (6.99999, 0.0)], dtype) == [True, False, True]
-
-
-@both_dtypes
-def test_cones_are_visible_up_to_sixty_degrees(dtype: torch.dtype) -> None:
+def test_cones_are_visible_up_to_seven_metres_and_sixty_degrees(dtype: torch.dtype) -> None:
+    assert visible([(7.0, 0.0), (7.00001, 0.0), (6.99999, 0.0), (0.0, 0.0)], dtype) == [True, False, True, True]
     # 60 degrees has no exact floating-point representation.
     angles = [59.999, 60.001, -59.999, -60.001, 90.0, 120.0, 180.0]
     assert visible([polar(5, angle) for angle in angles], dtype) == [True, False, True, False, False, False, False]
-
-
-def test_cone_at_the_origin_is_visible() -> None:
-    assert visible([(0.0, 0.0)]) == [True]
 
 
 def test_equidistant_cones_keep_their_order() -> None:
@@ -83,34 +71,6 @@ def test_equidistant_cones_keep_their_order() -> None:
     result = view(sides(cones, cones[::-1]), limit=3)
     assert result.cones[:, :, 0, 0].t().tolist() == [[1, 0], [3, 1], [3, -1]]
     assert result.cones[:, :, 1, 0].t().tolist() == [[1, 0], [3, 1], [3, -1]]
-    assert in_sight(result, 4)[:, 0, 0].tolist() == [True, True, True, False]
-
-
-def test_the_nearest_cones_are_kept() -> None:
-    cones = [(7.0 - 0.25 * i, 0.0) for i in range(20)]
-    result = view(sides(cones, cones[:1]), limit=16)
-    assert result.count[:, 0].tolist() == [16, 1]
-    assert result.cones[0, :, 0, 0].tolist() == [2.25 + 0.25 * i for i in range(16)]
-    assert in_sight(result, 20)[:, 0, 0].tolist() == [False] * 4 + [True] * 16
-
-
-def test_view_without_cones_is_zero() -> None:
-    result = view(sides([(-3.0, 0.0)], [(8.0, 0.0)]), limit=16)
-    assert result.count.eq(0).all()
-    assert result.cones.eq(0).all()
-    assert not result.real.any()
-
-
-def test_view_is_batch_invariant() -> None:
-    local = random_cones(5, cars=37).float()
-    together = view(local, 16)
-    for car in (0, 17, 36):
-        alone = view(local[..., car : car + 1], 16)
-        assert torch.equal(alone.count, together.count[..., car : car + 1])
-        # The car with the most cones determines the number of slots.
-        most = alone.cones.shape[1]
-        assert torch.equal(alone.cones, together.cones[:, :most, :, car : car + 1])
-        assert together.cones[:, most:, :, car].eq(0).all()
 
 
 def test_points_left_of_the_car_are_positive() -> None:
@@ -150,13 +110,6 @@ def test_unknown_side_is_encoded_as_zeros() -> None:
     assert observation[2].eq(0).all()
 
 
-@given(seeds)
-def test_observations_are_bounded(seed: int) -> None:
-    draw = torch.Generator().manual_seed(seed)
-    samples = 10 ** (4 * torch.rand(2, 5, 2, 64, generator=draw) - 2) * torch.randn(2, 5, 2, 64, generator=draw)
-    assert encode(samples, torch.ones(2, 64, dtype=torch.bool)).abs().max() <= 1
-
-
 @both_dtypes
 def test_observations_agree_with_hypot_and_atan2(dtype: torch.dtype) -> None:
     line = torch.tensor([-7.0, -1.0, -1e-6, -0.0, 0.0, 1e-6, 0.5, 3.0], dtype=dtype)
@@ -167,13 +120,3 @@ def test_observations_agree_with_hypot_and_atan2(dtype: torch.dtype) -> None:
     assert torch.allclose(distance, (torch.hypot(x, y).flatten() * 2 / 7 - 1).clamp(-1, 1))
     # A sample straight behind the car is encoded as left of it.
     assert torch.allclose(angle, (known.where(y.flatten() != 0, known.abs()) / math.radians(120)).clamp(-1, 1))
-
-
-@both_dtypes
-def test_observations_are_batch_invariant(dtype: torch.dtype) -> None:
-    draw = torch.Generator().manual_seed(1)
-    samples = 3 * torch.randn(2, 5, 2, 1003, dtype=dtype, generator=draw)
-    known = torch.ones(2, 1003)
-    together = encode(samples, known)
-    for car in range(0, 1003, 17):
-        assert torch.equal(encode(samples[..., car : car + 1], known[:, :1]), together[car : car + 1])

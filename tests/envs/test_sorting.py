@@ -28,19 +28,3 @@ def test_smallest_agrees_with_argsort(dtype: torch.dtype, size: int, data: st.Da
 def test_equal_entries_keep_their_order(dtype: torch.dtype) -> None:
     values = torch.tensor([[3.0], [1.0], [3.0], [0.0], [3.0]], dtype=dtype)
     assert smallest(values, torch.zeros_like(values), 5).flatten().tolist() == [3, 1, 0, 2, 4]
-
-
-def test_masked_entries_come_last() -> None:
-    values, masked = torch.tensor([[0.0], [5.0], [1e9]]), torch.tensor([[1.0], [0.0], [0.0]])
-    assert smallest(values, masked, 3).flatten().tolist() == [1, 2, 0]
-
-
-@both_dtypes
-@pytest.mark.parametrize("k", [1, 2, 7, 24])
-def test_results_do_not_depend_on_the_number_of_columns(dtype: torch.dtype, k: int) -> None:
-    draw = torch.Generator().manual_seed(1)
-    values = torch.rand(24, 2, 1003, dtype=dtype, generator=draw).mul_(30).round_()
-    masked = torch.rand(24, 2, 1003, generator=draw).lt(0.3).to(dtype)
-    together = smallest(values, masked, k)
-    for columns in (slice(0, 5), slice(500, 501), slice(1002, 1003)):
-        assert torch.equal(together[..., columns], smallest(values[..., columns], masked[..., columns], k))

@@ -10,7 +10,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
-from coil_rl.envs import ConeClassifier, labelling_drives, simulated_cone_classifier, simulated_drive
+from coil_rl.envs import labelling_drives, simulated_cone_classifier, simulated_drive
 from coil_rl.errors import UserError
 from coil_rl.robot.classifier import (
     Share,
@@ -116,22 +116,11 @@ def test_shipped_classifier_is_as_accurate_as_the_papers(held_out):
     assert 0.964 < shares["all"].share < 0.996
     assert shares["0.15-0.25 m"].share > shares["0.75-1 m"].share
     assert shares["0.999-1 visible"].share > 0.99 > shares["0.5-0.999 visible"].share > shares["0-0.5 visible"].share
-    assert sum(shares[name].total for name in shares if name.endswith(" m")) <= shares["all"].total
+    for found in recall(simulated_cone_classifier(), held_out).values():
+        assert found["0.999-1 visible"].share > 0.97
+        assert found["0-0.5 visible"].share < 0.6
+        assert found["all"].total > 2000
     assert sum(shares[name].total for name in shares if name.endswith("visible")) == shares["all"].total
-
-
-def test_recall_of_the_shipped_classifier_and_of_one_that_always_answers_thick(held_out):
-    shares = recall(simulated_cone_classifier(), held_out)
-    for kind in ("thin", "thick"):
-        assert shares[kind]["0.999-1 visible"].share > 0.97
-        assert shares[kind]["0-0.5 visible"].share < 0.6
-        assert shares[kind]["all"].total > 2000
-    always_thick = ConeClassifier(np.zeros(3), np.ones(3), np.zeros((1, 3)), np.ones(1), intercept=1.0, gamma=1.0)
-    shares = recall(always_thick, held_out)
-    assert shares["thin"]["all"].correct == 0
-    assert shares["thick"]["0.999-1 visible"].share > 0.98
-    labelled = label_clusters(held_out)
-    assert accuracy(always_thick, labelled)["all"].share == labelled.thick.mean()
 
 
 def test_shares_have_the_interval_of_wilson():

@@ -8,7 +8,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, decode, definition, encode, header, pose_of, twist
+from coil_rl.envs.recordings.messages import SCAN, TWIST, decode, definition, encode, header, twist
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 MARKER = {"ns": "left", "header": header(1_500_000_001, "laser"), "pose": {"orientation": {"w": 1.0}}}
@@ -62,13 +62,6 @@ def test_missing_fields_are_zero_or_empty():
     [marker, empty] = decode(encode(MARKERS, {"markers": [MARKER, {}]}), MARKERS).markers
     assert (marker.ns, marker.header.stamp.sec, marker.header.stamp.nanosec) == ("left", 1, 500_000_001)
     assert (empty.ns, empty.pose.position.x, empty.frame_locked, len(empty.points)) == ("", 0.0, False, 0)
-
-
-@pytest.mark.parametrize("heading", [0.0, 0.5, -3.1])
-def test_pose_of_odometry(heading):
-    orientation = {"z": np.sin(heading / 2), "w": np.cos(heading / 2)}
-    pose = {"position": {"x": 1.0, "y": -2.0}, "orientation": orientation}
-    assert pose_of(decode(encode(ODOMETRY, {"pose": {"pose": pose}}), ODOMETRY)) == pytest.approx((1, -2, heading))
 
 
 def test_unknown_fields_and_types_are_refused():

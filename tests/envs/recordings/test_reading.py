@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import PERIOD, START, drive, flipped, odometry_fields, scan, store, uncompressed
+from drives import PERIOD, START, drive, odometry_fields, scan, store, uncompressed
+from mcap.reader import make_reader
 from rosbags import rosbag1, rosbag2
 from rosbags.convert.cli import main as convert
 from rosbags.highlevel import AnyReader
@@ -70,20 +71,26 @@ def test_scans_are_read_as_one_array(whole):
     assert (recording.frame, recording.cut_off) == ("laser", False)
 
 
-def test_ranges_outside_the_scanners_limits_are_no_return(tmp_path):
+def test_missing_points_and_ranges_outside_the_scanners_limits_are_no_return(tmp_path):
     ranges = np.array([0.0, 0.1, 0.15, 1.0, 12.0, 12.5, np.nan, np.inf, -1.0], np.float32)
-    read = read_recording(store(tmp_path / "a.mcap", scan(0, ranges=ranges))).ranges
-    np.testing.assert_array_equal(read, [[np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4]])
-
-
-def test_scans_may_have_different_numbers_of_points(tmp_path):
-    scans = [scan(number, points) for number, points in enumerate([5, 3, 0, 4])]
+    scans = [scan(0, ranges=ranges), scan(1, 3), scan(2, 0)]
     recording = read_recording(store(tmp_path / "a.mcap", *scans))
-    assert recording.points.tolist() == [5, 3, 0, 4]
-    for row, fields in zip(recording.ranges, scans, strict=True):
-        points = len(fields["ranges"])
-        np.testing.assert_array_equal(row[:points], fields["ranges"])
-        assert np.isinf(row[points:]).all()
+    assert recording.points.tolist() == [9, 3, 0]
+    np.testing.assert_array_equal(recording.ranges[0], [np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4])
+    np.testing.assert_array_equal(recording.ranges[1], [*scans[1]["ranges"], *[np.inf] * 6])
+    assert np.isinf(recording.ranges[2]).all()
+
+
+def test_folder_of_split_files_is_one_recording_in_order_of_log_time(tmp_path):
+    scans = [scan(number) for number in range(4)]
+    store(tmp_path / "b.mcap", *scans[:2])
+    store(tmp_path / "a.mcap", *scans[2:])
+    store(tmp_path / "another.mcap", scans[0])
+    recording = read_recording(rosbag(tmp_path, "drive/b.mcap", '"a.mcap"'))
+    np.testing.assert_array_equal(recording.log_time - START, np.array([0, 0, 1, 1]) * 10**9)
+    np.testing.assert_array_equal((recording.stamp - START) // PERIOD, [0, 2, 1, 3])
+    # The stamps are not ascending, so the log times are the clock.
+    assert recording.seconds.tolist() == [0, 0, 1, 1]
 
 
 def test_poses_are_interpolated_from_the_odometry(tmp_path, whole):
@@ -104,26 +111,6 @@ def test_poses_without_odometry_are_integrated_from_the_commands(tmp_path, whole
     store(tmp_path / "commands.mcap", *twists, kind=TWIST, topic="/cmd_vel")
     folder = rosbag(tmp_path, "scans.mcap", "commands.mcap")
     np.testing.assert_allclose(read_recording(folder).poses(), [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0, 0.5]])
-
-
-def test_messages_are_ordered_by_log_time(tmp_path):
-    scans = [scan(number) for number in range(4)]
-    store(tmp_path / "b.mcap", *scans[:2])
-    store(tmp_path / "a.mcap", *scans[2:])
-    recording = read_recording(rosbag(tmp_path, "b.mcap", "a.mcap"))
-    np.testing.assert_array_equal(recording.log_time - START, np.array([0, 0, 1, 1]) * 10**9)
-    np.testing.assert_array_equal((recording.stamp - START) // PERIOD, [0, 2, 1, 3])
-    # The stamps are not ascending, so the log times are the clock.
-    assert recording.seconds.tolist() == [0, 0, 1, 1]
-
-
-def test_folder_of_split_files_is_one_recording(tmp_path):
-    scans = [scan(number) for number in range(5)]
-    store(tmp_path / "drive_0.mcap", *scans[:3])
-    store(tmp_path / "drive_1.mcap", *scans[3:])
-    store(tmp_path / "another.mcap", scans[0])
-    recording = read_recording(rosbag(tmp_path, "drive/drive_0.mcap", '"drive_1.mcap"'))
-    np.testing.assert_array_equal(np.sort((recording.stamp - START) // PERIOD), range(5))
 
 
 def test_digest_is_that_of_all_files_in_their_order(tmp_path):
@@ -229,23 +216,21 @@ def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
 def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
     path = compression(copy(whole, tmp_path))
     data = path.read_bytes()
-    for size in [*range(1, 300), *range(300, len(data), 9973), *range(len(data) - 60, len(data))]:
+    for size in [*range(1, 130), *range(130, len(data), 49_973), *range(len(data) - 60, len(data))]:
         path.write_bytes(data[:size])
         assert "cut off" in refusal(path, strict=True)
 
 
 @EITHER_COMPRESSION
 def test_damaged_chunk_is_refused(tmp_path, whole, compression):
-    message = refusal(flipped(compression(copy(whole, tmp_path)), chunk=1))
-    assert "is damaged before byte" in message
-    assert ", after 17000000" in message
-    assert "mcap recover" in message
-
-
-def test_damaged_length_is_refused(tmp_path, whole):
-    path = copy(whole, tmp_path)
+    path = compression(copy(whole, tmp_path))
+    with path.open("rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[1]
     data = bytearray(path.read_bytes())
-    data[9:17] = (2**40).to_bytes(8, "little")  # of the header
+    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    path.write_bytes(data)
+    assert re.search("is damaged before byte .*, after 17000000.*mcap recover", refusal(path))
+    data[9:17] = (2**40).to_bytes(8, "little")  # length of the header
     path.write_bytes(data)
     assert "is damaged before byte 17 (" in refusal(path)
 
@@ -293,13 +278,7 @@ def test_recording_without_scans_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     "channel",
-    [
-        *({"encoding": encoding} for encoding in ("json", "protobuf", "ros1", "")),
-        *(
-            {"kind": kind}
-            for kind in ("sensor_msgs/msg/PointCloud2", "sensor_msgs/LaserScan", "foxglove.LaserScan", "")
-        ),
-    ],
+    [{"encoding": "json"}, {"encoding": ""}, {"kind": "sensor_msgs/msg/PointCloud2"}, {"kind": ""}],
 )
 def test_other_encodings_and_types_are_refused(tmp_path, channel):
     message = refusal(store(tmp_path / "a.mcap", json.dumps({"ranges": [1.0]}).encode(), **channel))
@@ -307,15 +286,12 @@ def test_other_encodings_and_types_are_refused(tmp_path, channel):
     assert f"topic /scan has messages of {kind} in {encoding}, not of {SCAN} in cdr" in message
 
 
-@pytest.mark.parametrize("size", [0, 3, 10, 40, 500, 1483])
-def test_truncated_message_is_refused(tmp_path, size):
+@pytest.mark.parametrize("size", [0, 10, 1483])
+def test_truncated_and_infinite_messages_are_refused(tmp_path, size):
     scans = [encode(SCAN, scan(number)) for number in range(3)]
     message = refusal(store(tmp_path / "a.mcap", scans[0], scans[1][:size], scans[2]))
     assert f"topic /scan, message 1 at 1700000001.000 s: it is not a valid {SCAN} (" in message
     assert "record it again" in message
-
-
-def test_values_that_are_not_finite_are_refused(tmp_path):
     path = store(tmp_path / "a.mcap", scan(0), scan(1, angle_min=np.nan))
     assert "message 1 at 1700000001.000 s: the angle" in refusal(path)
     store(tmp_path / "b.mcap", odometry_fields(START, np.inf, 0, 0), kind=ODOMETRY, topic="/odom")

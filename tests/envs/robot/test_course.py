@@ -23,6 +23,8 @@ def test_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
     straight = np.abs(curvature) < 0.2
     assert straight.mean() > 0.12
     assert heading[-1] - heading[0] == pytest.approx(2 * np.pi, abs=0.1)
+    (large,) = robot_tracks(scale=7.0)
+    assert large.length == pytest.approx(7 * track.length, rel=1e-3)
 
 
 def test_cones_are_evenly_spaced_and_leave_room_for_the_robot():
@@ -54,23 +56,14 @@ def test_clearance_is_the_distance_of_the_outline_to_a_cone(heading, half):
     assert clearance.item() == pytest.approx(0.15 - half - 0.045, abs=1e-5)
 
 
-def test_noted_track_is_equal():
-    again = noted_track(track_notes(robot_track()))
-    assert np.array_equal(again.left, robot_track().left)
-    assert np.array_equal(again.right, robot_track().right)
-    assert again.start == pytest.approx(robot_track().start)
-    assert again.name == robot_track().name
-
-
-@pytest.mark.parametrize("notes", [{}, {"left": "[[0, 0]", "right": "[]"}, {"left": "[1, 2, 3]", "right": "[]"}])
-def test_invalid_track_notes_are_refused(notes):
-    with pytest.raises(TrackError, match="note each side as"):
-        noted_track(notes)
-
-
-def test_scaled_track_is_proportionally_long():
-    (large,) = robot_tracks(scale=7.0)
-    assert large.length == pytest.approx(7 * robot_track().length, rel=1e-3)
+def test_noted_track_is_equal_and_invalid_notes_are_refused():
+    noted = noted_track(track_notes(robot_track()))
+    assert np.array_equal(noted.left, robot_track().left)
+    assert np.array_equal(noted.right, robot_track().right)
+    assert noted.start == pytest.approx(robot_track().start)
+    for notes in ({}, {"left": "[[0, 0]", "right": "[]"}, {"left": "[1, 2, 3]", "right": "[]"}):
+        with pytest.raises(TrackError, match="note each side as"):
+            noted_track(notes)
 
 
 def circle(rounds, points=400, radius=1.0, speed=0.5):
@@ -79,34 +72,20 @@ def circle(rounds, points=400, radius=1.0, speed=0.5):
     return np.stack([radius * np.sin(angle), -radius * np.cos(angle), angle], axis=1), angle * radius / speed
 
 
-def test_laps_of_a_circle_have_its_length_and_duration():
-    found = laps(*circle(3.2))
+@pytest.mark.parametrize("turn", [0.0, 2.5, -1.9])
+def test_laps_of_a_circle_have_its_length_and_duration_from_any_origin(turn):
+    poses, seconds = circle(3.2)
+    cos, sin = np.cos(turn), np.sin(turn)
+    x, y, heading = poses.T
+    found = laps(np.stack([cos * x - sin * y + 5, sin * x + cos * y - 3, heading + turn], axis=1), seconds)
     assert found.metres == pytest.approx([2 * np.pi] * 3, rel=1e-3)
     assert found.seconds == pytest.approx([4 * np.pi] * 3, rel=1e-3)
 
 
-def test_incomplete_lap_does_not_count():
-    assert len(laps(*circle(0.99)).seconds) == 0
-    assert len(laps(*circle(1.01)).seconds) == 1
-
-
-@pytest.mark.parametrize("turn", [0.7, 2.5, -1.9])
-def test_laps_do_not_depend_on_the_origin_of_the_odometry(turn):
-    poses, seconds = circle(2.3)
-    cos, sin = np.cos(turn), np.sin(turn)
-    x, y, heading = poses.T
-    moved = np.stack([cos * x - sin * y + 5, sin * x + cos * y - 3, heading + turn], axis=1)
-    assert laps(moved, seconds).seconds == pytest.approx(laps(poses, seconds).seconds)
-
-
-def test_standing_at_the_start_does_not_count():
+def test_only_complete_laps_count_without_the_time_before_the_start():
+    assert [len(laps(*circle(rounds)).seconds) for rounds in (0.99, 1.01)] == [0, 1]
     poses, seconds = circle(1.2)
-    poses = np.concatenate([np.repeat(poses[:1], 50, axis=0), poses])
-    seconds = np.concatenate([np.arange(50), seconds + 50])
-    assert laps(poses, seconds).seconds == pytest.approx([4 * np.pi], rel=1e-3)
-
-
-def test_swaying_at_the_line_is_no_lap():
-    x = np.array([0, 0.1, -0.1, 0.1, -0.1, 0.1])
-    poses = np.stack([x, 0 * x, 0 * x], axis=1)
-    assert len(laps(poses, np.arange(6.0)).seconds) == 0
+    waiting = np.concatenate([np.repeat(poses[:1], 50, axis=0), poses]), np.concatenate([np.arange(50), seconds + 50])
+    assert laps(*waiting).seconds == pytest.approx([4 * np.pi], rel=1e-3)
+    swaying = np.outer([0, 0.1, -0.1, 0.1, -0.1, 0.1], [1, 0, 0])
+    assert len(laps(swaying, np.arange(6.0)).seconds) == 0

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from mcap.reader import make_reader
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -70,23 +69,14 @@ def test_visibility_is_the_share_of_a_cone_that_no_other_cone_hides(both):
     assert (both.visibility.gather(1, nearest) == 1).float().mean() > 0.95
 
 
-def test_labelling_drives_have_cones_of_one_kind():
+def test_drive_is_determined_by_its_seed(both):
+    assert torch.equal(simulated_drive("both", seed=5).ranges, both.ranges)
     drives = labelling_drives([0, 1])
     assert [drive.name for drive in drives] == ["left_0", "right_0", "left_1", "right_1"]
     assert [set(drive.thick.tolist()) for drive in drives] == [{False}, {True}] * 2
     assert not torch.equal(drives[0].ranges, drives[2].ranges)
-
-
-def test_drive_is_determined_by_its_seed(both):
-    assert torch.equal(simulated_drive("both", seed=5).ranges, both.ranges)
-    assert not torch.equal(simulated_drive("both", seed=6).ranges, both.ranges)
     with pytest.raises(ValueError, match="sides='middle' must be one of left, right, both"):
         simulated_drive("middle", 0)
-
-
-def metadata(path):
-    with path.open("rb") as file:
-        return {entry.name: dict(entry.metadata) for entry in make_reader(file).iter_metadata()}
 
 
 def test_saved_drive_is_read_back_and_marked_as_simulated(tmp_path):
@@ -98,7 +88,7 @@ def test_saved_drive_is_read_back_and_marked_as_simulated(tmp_path):
     np.testing.assert_allclose(recording.angles(0), drive.angles, atol=1e-6)
     np.testing.assert_allclose(recording.seconds, drive.seconds, atol=1e-8)
     np.testing.assert_allclose(recording.poses()[:, :2], drive.poses[:2, :, 0].t(), atol=1e-6)
-    assert metadata(path)["simulated"]["drive"] == "left_3"
+    assert recording.notes["simulated"]["drive"] == "left_3"
     save_drive(drive, tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
     with pytest.raises(RecordingError, match="lacks the positions of its cones"):
@@ -128,7 +118,7 @@ def files(tmp_path_factory):
     return paths
 
 
-def test_replay_has_the_observations_and_commands_of_the_drive(files, live):
+def test_replay_has_the_observations_commands_and_poses_of_the_drive(files, live):
     replay = McapReplayEnv(files, Perception(simulated_cone_classifier()))
     again = replay.rollout(100, SplineGuide())
     assert again.shape == live.shape
@@ -141,9 +131,6 @@ def test_replay_has_the_observations_and_commands_of_the_drive(files, live):
         expected = (live["action"][robot, :, 0] * np.radians(80)).sin() * 0.15 / (2 / 7)
         np.testing.assert_allclose(commands[:, 1], expected, atol=1e-6)
         np.testing.assert_allclose(commands[:, 0], 0.15, atol=1e-6)
-
-
-def test_odometry_has_the_pose_at_the_start_of_each_scan(files, live):
     poses = read_recording(files[0]).poses()
     # The robot stands during the first scan; each later one starts at the pose one step before.
     np.testing.assert_allclose(poses[0], live["info", "pose"][0, 0], atol=1e-6)
@@ -155,7 +142,7 @@ def test_recording_ends_with_the_episode_of_its_robot(tmp_path):
     record_drives(env, ConstantGuide(1.0), [tmp_path / "crash.mcap"])
     recording = read_recording(tmp_path / "crash.mcap")
     assert 5 < len(recording.log_time) == int(env.steps) < 40
-    assert metadata(tmp_path / "crash.mcap")["simulated"]["drive"] == "closed loop"
+    assert recording.notes["simulated"]["drive"] == "closed loop"
 
 
 def test_track_is_noted_for_drives_past_both_sides(files, tmp_path):

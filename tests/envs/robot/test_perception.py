@@ -21,18 +21,6 @@ from coil_rl.guides import SplineGuide
 EXACT = SimulatedLidar(noise=0.0, noise_growth=0.0, no_return=0.0, outliers=0.0)
 
 
-def one_vector(**changed) -> ConeClassifier:
-    """A single support vector: exp(-0.5 |x - s|^2) of features in cm, minus a half."""
-    numbers = {"mean": [0.0, 0], "scale": [0.01, 0.01], "support": [[3.0, 4]], "weights": [1.0], "intercept": -0.5}
-    return ConeClassifier(**{**numbers, "gamma": 0.5, **changed})
-
-
-def test_decision_is_the_kernel_expansion():
-    decision = one_vector().decision(np.array([[0.03, 0.04], [0.0, 0.0], [0.04, 0.04]]))
-    np.testing.assert_allclose(decision, [0.5, np.exp(-12.5) - 0.5, np.exp(-0.5) - 0.5], atol=1e-12)
-    assert one_vector().thick(np.array([[0.03, 0.04], [0.0, 0.0]])).tolist() == [True, False]
-
-
 def test_clusters_are_classified_independently():
     features = np.random.default_rng(0).uniform(0, 0.12, (900, 3))
     classifier = simulated_cone_classifier()
@@ -46,7 +34,6 @@ def test_clusters_are_classified_independently():
     ("changed", "words"),
     [
         ({"weights": [1.0, 2.0]}, "shapes"),
-        ({"mean": [0.0]}, "shapes"),
         ({"support": [1.0, 2.0]}, "shapes"),
         ({"gamma": -1.0}, "more than 0"),
         ({"scale": [1.0, 0.0]}, "more than 0"),
@@ -54,8 +41,9 @@ def test_clusters_are_classified_independently():
     ],
 )
 def test_invalid_classifiers_are_refused(changed, words):
+    numbers = {"mean": [0.0, 0], "scale": [0.01, 0.01], "support": [[3.0, 4]], "weights": [1.0], "intercept": -0.5}
     with pytest.raises(ValueError, match=words):
-        one_vector(**changed)
+        ConeClassifier(**{**numbers, "gamma": 0.5, **changed})
 
 
 def scan_of(*cones: tuple[float, float, float]):
@@ -108,7 +96,7 @@ def test_missing_cones_are_zero():
     assert (cones.shape, count.shape) == ((0, 2, 2, 2), (0, 2))
 
 
-@pytest.mark.parametrize("no_return", [np.inf, np.nan, 0.0, 0.003, -1.0, 65.0])
+@pytest.mark.parametrize("no_return", [np.nan, 0.0, -1.0, 65.0])
 def test_all_codes_for_no_return_are_equal(no_return):
     ranges, angles = scan_of((0.4, 30, THIN), (0.6, -20, THICK))
     perception = Perception(simulated_cone_classifier())
@@ -117,11 +105,11 @@ def test_all_codes_for_no_return_are_equal(no_return):
 
 
 def test_scans_are_perceived_independently_in_any_order_of_the_beams():
-    drive, perception = simulated_drive("both", seed=3, laps=3), Perception(simulated_cone_classifier())
-    ranges, angles = drive.ranges.numpy(), drive.angles.numpy()
+    drive, perception = simulated_drive("both", seed=3), Perception(simulated_cone_classifier())
+    ranges, angles = drive.ranges.repeat(3, 1).numpy(), drive.angles.numpy()
     cones, count = perception(ranges, angles)
     assert len(cones) > 512
-    for row in (0, 300, 600):
+    for row in (0, 300, len(cones) - 1):
         alone = perception(ranges[row : row + 1, ::-1], angles[::-1] + 2 * np.pi)
         np.testing.assert_allclose(alone[0][0], cones[row], atol=1e-5)
         assert alone[1][0].tolist() == count[row].tolist()
@@ -165,17 +153,16 @@ def test_observation_of_valid_sides_is_that_of_the_cone_world():
     assert both > 50
 
 
-@pytest.mark.parametrize("run", [1, 7])
 @pytest.mark.parametrize(
     "invalid",
     [LEFT[:1], [], [(1.5, 1.0), (9.5, 1.0)], [(0.2, 0.1), (0.4, -0.2)]],
     ids=["one cone", "none", "too far", "inside the robot"],
 )
-def test_invalid_side_keeps_its_last_valid_numbers(invalid, run):
+def test_invalid_side_keeps_its_last_valid_numbers(invalid):
     memory = BoundaryMemory(1)
     last, valid = memory(*view(LEFT, RIGHT))
     assert valid.all()
-    for step in range(run):
+    for step in range(3):
         moved = [(x - 0.1 * step, y) for x, y in RIGHT]
         held, valid = memory(*view(invalid, moved))
         assert valid.tolist() == [[False, True]]
@@ -187,13 +174,10 @@ def test_invalid_side_keeps_its_last_valid_numbers(invalid, run):
     assert not torch.equal(fresh[:, :10], last[:, :10])
 
 
-def test_side_that_was_never_valid_is_zero():
-    observation, _ = BoundaryMemory(1)(*view(LEFT[:1], RIGHT))
-    assert not observation[:, :10].any()
-    assert observation[:, 10:].any()
-
-
 def test_rows_are_reset_independently_and_the_state_can_be_loaded():
+    never, _ = BoundaryMemory(1)(*view(LEFT[:1], RIGHT))
+    assert not never[:, :10].any()
+    assert never[:, 10:].any()
     memory, other = BoundaryMemory(2), BoundaryMemory(2)
     full, _ = memory(*view(LEFT, RIGHT, batch=2))
     other.load_state_dict(memory.state_dict())
