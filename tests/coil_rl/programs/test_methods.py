@@ -13,14 +13,12 @@ from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 from coil_rl.train import checkpoint
-from coil_rl.train.build import build_env
 from coil_rl.train.check import check
-from coil_rl.train.evaluation import evaluate_policy
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
 # Their parts are also tested with another method.
-SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "rfc"]
-SLOW += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint"]
+SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc"]
+SLOW += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint", "dynamic_coil_stochastic"]
 TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
 TINY = [*TRACKS, "env.laps=1", "env.time_limit=1", "env.rate=12", "evaluation.repeats=1", "evaluation.gif=false",
         "logger=none", "checkpoint_every=1", "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
@@ -78,10 +76,6 @@ def rows(folder, **where):
         return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in where.items())]
 
 
-def test_driver_is_the_label_of_the_run(residual):
-    assert {row["driver"] for row in rows(residual)} == {"guide", "mine"}
-
-
 def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
     before = {file: file.stat().st_mtime_ns for file in residual.iterdir() if file.name != ".lock"}
     trained(residual, "residual", "label=mine", "existing=resume")
@@ -96,18 +90,13 @@ def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
         config = compose("evaluate", [*TRACKS, f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
                                       "degrade=[zeroed,adversarial]"])  # fmt: skip
     evaluate.evaluate(config)
+    assert {row["driver"] for row in rows(tmp_path)} == {"guide", "mine"}
     normal, zeroed, adversarial = (
         rows(tmp_path, driver="mine", actions="deterministic", advice=name) for name in ("", "zeroed", "adversarial")
     )
     trained_rows = rows(residual, driver="mine", actions="deterministic")
     assert [row["reward"] for row in normal] == [row["reward"] for row in trained_rows]
     assert len({row["reward"] for row in (normal[-1], zeroed[-1], adversarial[-1])}) == 3
-
-
-def test_guide_is_evaluated_with_degraded_advice(tmp_path):
-    run = trained(tmp_path / "run", "guide", "degrade=[adversarial]")
-    alone = trained(tmp_path / "alone", "guide")
-    assert rows(run)[0]["reward"] != rows(alone)[0]["reward"]
 
 
 def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
@@ -132,18 +121,6 @@ def test_residual_of_scale_zero_is_the_guide(tmp_path):
     assert [row["reward"] for row in agent] == [row["reward"] for row in guide]
 
 
-def test_evaluation_sets_transforms_to_evaluation_mode(residual):
-    config, agent = evaluate.restore(residual, compose_evaluate(residual))
-    env = build_env(config, {"num_cars": 2})
-    evaluate_policy(env, agent)
-    assert not env.transform.training
-
-
-def compose_evaluate(run):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("evaluate", [*TRACKS, f"run={run}", "run_dir=unused"])
-
-
 def test_first_round_of_dagger_collects_the_data_of_oil(tmp_path):
     given = ["learner.validate=false", "env.assignment=cyclic", "budget.frames=64"]
     oil = trained(tmp_path / "oil", "oil", *given)
@@ -159,3 +136,5 @@ def test_every_one_of_several_guides_is_evaluated(tmp_path):
     assert list(json.loads((run / "guide_return.json").read_text())) == ["guide zero", "guide spline"]
     alone = trained(tmp_path / "alone", "guide")
     assert rows(run, driver="guide spline")[0]["reward"] == rows(alone)[0]["reward"]
+    degraded = trained(tmp_path / "degraded", "guide", "degrade=[adversarial]")
+    assert rows(degraded)[0]["reward"] != rows(alone)[0]["reward"]

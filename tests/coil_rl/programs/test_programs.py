@@ -3,7 +3,6 @@ import subprocess
 import time
 
 import pytest
-from PIL import Image
 from programs import LAP, TINY, TRACK, called, command, environment
 
 STILL = "evaluation.gif=false"
@@ -21,11 +20,9 @@ def test_train_prints_a_table_and_writes_all_files(run):
     assert [line.split("|")[1].strip() for line in lines[2:-1]] == ["guide"] * 2 + ["coil"] * 4
     assert lines[-1].startswith("coil: mean test reward")
     files = {file.name for file in (folder / "run").iterdir()}
-    assert files >= {"config.yaml", "versions.json", "metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt"}
+    assert files >= {"config.yaml", "versions.json", "metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt",
+                     "lines.png", "lines.gif", "learning_curve.png"}  # fmt: skip
     assert json.loads((folder / "run" / "versions.json").read_text())["torchrl"] == "0.14.1"
-    for picture in ("lines.png", "lines.gif", "learning_curve.png"):
-        with Image.open(folder / "run" / picture) as image:
-            assert image.width >= 600
 
 
 def test_evaluate_repeats_the_numbers_of_train(run):
@@ -124,10 +121,3 @@ def test_part_of_another_package_is_used_by_its_name(tmp_path, monkeypatch):
     mine = ["--config-dir", "conf", *TINY, STILL, "+experiment=mine", "hydra.run.dir=run"]
     done = called("train", *mine, cwd=tmp_path)
     assert "100%" in done.stdout, "a constant steering of 8 degrees crashes every car"
-
-
-def test_sweep_gives_every_run_a_folder(tmp_path):
-    sweep = ["method=guide", "guide=zero", "seed=0,1", STILL]
-    called("train", "-m", *TINY, *sweep, cwd=tmp_path)
-    runs = sorted(path.parent.name for path in (tmp_path / "outputs" / "sweep").glob("*/*/evaluation.csv"))
-    assert runs == ["0_guide_seed0", "1_guide_seed1"]

@@ -1,9 +1,7 @@
 import csv
-import math
 from pathlib import Path
 
 import pytest
-from PIL import Image
 from programs import TINY, called, program
 from run_folders import driven, make_run, make_sweep
 
@@ -17,7 +15,6 @@ def sweep(monkeypatch, tmp_path):
 
 
 def report(*arguments):
-    """Return the exit code, standard output and standard error."""
     done = called("report", *arguments, code=None)
     return done.returncode, done.stdout, done.stderr
 
@@ -40,9 +37,6 @@ def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
     assert out == (sweep / "report.md").read_text() + "report: see sweep\n"
     assert "better than ppo" in out
     assert "6 of 8 runs that were started are finished" in out
-    for name in ("report.png", "report_curves.png"):
-        with Image.open(sweep / name) as image:
-            assert image.width == 1600
     assert report("folder=sweep") == (code, out, error)
     assert all_files() == after
 
@@ -52,11 +46,8 @@ def test_files_have_full_precision(sweep):
     rows = {(row["actions"], row["driver"], row["advice"]): row for row in read_csv(sweep / "report.csv")}
     assert len(rows) == 7
     coil = rows["deterministic", "coil", ""]
-    assert float(coil["iqm"]) == pytest.approx(571)
-    assert float(coil["low"]) <= 571 <= float(coil["high"])
+    assert float(coil["low"]) <= float(coil["iqm"]) == pytest.approx(571) <= float(coil["high"])
     assert (coil["improvement"], coil["needs_guide"], coil["guide"], coil["seeds"]) == ("0.0", "True", "guide", "3")
-    assert float(rows["sampled", "coil", ""]["improvement"]) == 0.5
-    assert math.isnan(float(rows["deterministic", "guide", ""]["low"]))
     tracks = {tuple(row.values())[:5]: row["reward"] for row in read_csv(sweep / "report_tracks.csv")}
     assert tracks["sampled", "ppo", "", "3", "b"] == "615.0"
     text = (sweep / "report.md").read_text()
@@ -73,24 +64,7 @@ def test_several_folders_make_one_report_in_the_first(sweep):
     assert {file.name for file in Path("other").iterdir()} == FILES | {"run"}
     assert not FILES & {file.name for file in sweep.iterdir()}
     assert "better than" not in report("folder=[sweep/0_coil,sweep/1_coil]")[1], "no ppo"
-
-
-def test_many_labels_or_different_guides_have_separate_plots(sweep):
-    for index, label in enumerate("abcdefghi"):
-        rows = driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0})
-        make_run(Path("many") / label, label, 0, rows)
-        make_run(Path("differ") / label, label, 0, rows, guide=300.0 + index % 2)
-    heights = []
-    for folder in ("[differ/a,differ/b]", "[many/a,many/b]", "many"):
-        assert report(f"folder={folder}")[0] == 0
-        with Image.open(Path(folder.strip("[]").split(",")[0]) / "report_curves.png") as image:
-            heights.append(image.height)
-    assert heights[0] < heights[1] < heights[2]
-
-
-def test_guides_alone_have_no_curves(sweep):
-    run = make_run(Path("guides") / "zero", "zero", 0, driven("guide", {"a": 1.0}), needs_guide=None)
-    (run / "metrics.csv").unlink()
+    (make_run(Path("guides/zero"), "zero", 0, rows[:3], needs_guide=None) / "metrics.csv").unlink()
     assert report("folder=guides", "against=guide")[0] == 0
     assert {file.name for file in Path("guides").iterdir()} == FILES - {"report_curves.png"} | {"zero"}
 
@@ -107,10 +81,7 @@ def test_guides_alone_have_no_curves(sweep):
         ("folder=sweep against=pop", "there are coil, ppo, guide; did you mean ppo?"),
         ("folder=sweep actions=sample", "actions='sample' must be 'deterministic', 'sampled' or 'both'"),
         ("folder=sweep resamples=0", "resamples=0 must be greater than or equal to 1"),
-        ("folder=sweep resamples=many", "resamples=many: Value 'many' of type 'str' could not be converted to Integer"),
-        ("folder=sweep seed=-1", "seed=-1 must be greater than or equal to 0"),
         ("foldr=sweep", "no key foldr; the configuration has folder, actions, against, resamples, seed"),
-        ("folder=sweep +sed=1", "no key sed; the configuration has folder"),
         ("-m folder=sweep,empty", "leave out -m"),
         ("folder=sweep,empty", "Ambiguous value for argument 'folder=sweep,empty'"),
         ("folder=damaged", "damaged/evaluation.csv is damaged ("),
@@ -137,7 +108,6 @@ def test_report_reads_the_runs_of_coil_train(tmp_path):
     assert "All 2 runs that were started are finished." in done.stdout
     assert done.stderr == ""
     assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
-    assert {path.name for path in tmp_path.iterdir()} == {"sweep"}
     reward = {row["driver"]: float(row["mean"]) for row in read_csv(tmp_path / "sweep" / "report.csv")[:3]}
     for run in (tmp_path / "sweep").glob("*_seed0"):
         means = [row for row in read_csv(run / "evaluation.csv") if row["track"] == "mean" and not row["advice"]]

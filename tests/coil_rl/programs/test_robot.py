@@ -5,41 +5,26 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
 from programs import called
+from run_folders import make_untrained_run
 
-import coil_rl.train.config  # noqa: F401  registers the typed roots
 from coil_rl.envs import McapReplayEnv, Perception, read_recording, simulated_cone_classifier
 from coil_rl.guides import SplineGuide
-from coil_rl.train import checkpoint
-from coil_rl.train.build import build_env, build_learner
 
 SHORT = ["evaluation.repeats=1", "env.time_limit=2"]
 SMALL = [*SHORT, "figure_25.pairs=2", "figure_25.tests=1"]
 
 
-def make_run(folder, *overrides):
-    """The parts of an untrained run that coil-robot reads."""
-    folder.mkdir()
-    torch.manual_seed(0)
-    with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
-        config = compose("train", ["track=robot", "track.train.scale=7", *overrides, f"run_dir={folder}"])
-    if config.method.observes is not None:
-        checkpoint.save(build_learner(config, build_env(config)).policy.state_dict(), folder / "policy_last.pt")
-    kept = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
-    kept.logger = None
-    OmegaConf.save(kept, folder / "config.yaml")
-    return folder
-
-
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
     folder = tmp_path_factory.mktemp("runs")
-    make_run(folder / "coil", "method=coil", "seed=3")
-    make_run(folder / "residual", "method=residual", "learner.action_gain=1.0")
-    make_run(folder / "guide", "method=guide")
-    make_run(folder / "tasks", "method=ppo", "env=driving_tasks", "also_observes=[task]")
+    for name, *overrides in (
+        ("coil", "method=coil", "seed=3"),
+        ("residual", "method=residual", "learner.action_gain=1.0"),
+        ("guide", "method=guide"),
+        ("tasks", "method=ppo", "env=driving_tasks", "also_observes=[task]"),
+    ):
+        make_untrained_run(folder / name, "track=robot", "track.train.scale=7", *overrides)
     return folder
 
 

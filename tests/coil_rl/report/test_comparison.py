@@ -39,19 +39,14 @@ def test_numbers_are_those_of_the_runs(sweep):
     assert coil["iqm"] == pytest.approx((0.5 * 521 + 522 + 620 + 0.5 * 621) / 3)
     assert coil["low"] < coil["iqm"] < coil["high"]
     assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
-    assert (zeroed["crashed"], zeroed["completed"]) == (1, 0)
     assert math.isnan(zeroed["lap_time"])
     assert math.isnan(rows["guide", ""]["low"])
     assert (coil["improvement"], rows["guide", ""]["improvement"], rows["ppo", ""]["improvement"]) == (0, 0, None)
     assert [row["improvement"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
-    by_track = {
-        (row["driver"], row["advice"], row["track"]): row["reward"] for row in compare(read_runs([sweep])).track_table()
-    }
+    tracks = compare(read_runs([sweep])).track_table()
+    by_track = {(row["driver"], row["advice"], row["track"]): row["reward"] for row in tracks}
     assert len(by_track) == 8
     assert by_track["coil", "", "b"] == pytest.approx(621)
-
-
-def test_sampled_actions_are_compared_separately(sweep):
     rows = table(sweep, "ppo", "sampled")
     assert list(rows) == [("guide", ""), ("coil", ""), ("ppo", "")]
     assert rows["coil", ""]["mean"] == pytest.approx(561)
@@ -90,11 +85,8 @@ def test_guide_with_random_actions_has_an_interval_over_its_different_evaluation
 def test_agents_and_guides_may_be_alone(tmp_path):
     make_run(tmp_path / "agents" / "0", "alone", 0, driven("alone", TRACKS), needs_guide=False)
     guide = driven("guide", TRACKS)
-    make_run(tmp_path / "agents" / "1", "coil", 0, guide + driven("coil", {"a": 1.0, "b": 2.0}))
     rows = table(tmp_path / "agents", against="guide")
-    assert list(rows) == [("guide", ""), ("alone", ""), ("coil", "")]
     assert (rows["alone", ""]["guide"], rows["alone", ""]["improvement"], rows["alone", ""]["seeds"]) == (None, None, 1)
-    assert rows["coil", ""]["improvement"] == 0
     make_run(tmp_path / "guides" / "0", "spline", 0, guide, needs_guide=None)
     make_run(tmp_path / "guides" / "1", "zero", 0, driven("guide", {"a": 1.0, "b": 2.0}), needs_guide=None)
     assert list(table(tmp_path / "guides")) == [("guide (spline)", ""), ("guide (zero)", "")]

@@ -2,7 +2,6 @@ import math
 
 import pytest
 from matplotlib.figure import Figure
-from PIL import Image
 
 from coil_rl.report.intervals import Interval, draw_intervals, draw_panel
 
@@ -11,14 +10,6 @@ ROWS = [
     Interval("coil", 650.0, 640.0, 655.0, [640.0, 655.0], guide=630.0),
     Interval("coil, zeroed", 400.0, guide=600.0, hollow=True),
 ]
-
-
-def test_height_grows_with_the_rows(tmp_path):
-    draw_intervals({"one": ROWS, "other": ROWS[:2]}, tmp_path / "few.png", title="Placebo")
-    draw_intervals({"one": [Interval(str(k), k) for k in range(20)]}, tmp_path / "many.png")
-    with Image.open(tmp_path / "few.png") as few, Image.open(tmp_path / "many.png") as many:
-        assert few.width == many.width == 1600
-        assert many.height > few.height + 15 * 0.2 * 200
 
 
 def test_panel_shows_the_given_values():
@@ -32,8 +23,10 @@ def test_panel_shows_the_given_values():
     assert any(math.isnan(x[0]) for x, _ in drawn), "no bar without an interval"
 
 
-@pytest.mark.parametrize("panels", [{}, {"one": []}])
-def test_plot_without_rows_is_an_error(panels, tmp_path):
-    with pytest.raises(ValueError, match="at least one driver"):
-        draw_intervals(panels, tmp_path / "plot.png")
+def test_plot_needs_rows(tmp_path):
+    for panels in ({}, {"one": []}):
+        with pytest.raises(ValueError, match="at least one driver"):
+            draw_intervals(panels, tmp_path / "plot.png")
     assert not list(tmp_path.iterdir())
+    draw_intervals({"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", title="Placebo")
+    assert (tmp_path / "plot.png").exists()

@@ -45,7 +45,6 @@ def test_guide_without_agent_has_no_curve(tmp_path):
     (run / "metrics.csv").unlink()
     (run / "guide_return.json").unlink()
     (found,) = read_runs([tmp_path])
-    assert found.finished
     assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
@@ -55,25 +54,17 @@ ROW = "driver,advice,actions,track,reward,lap_time,smoothness,completed,crashed,
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        (
-            "evaluation.csv",
-            "",
-            r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
-        ),
+        ("evaluation.csv", "", r"is damaged \(No columns.*\); remove the file and write it again by coil-train"),
         ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"\['advice', .*not in index"),
         ("evaluation.csv", ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
-        ("evaluation.csv", ROW + "1,1,1", "could not convert .* ''"),
         ("evaluation.csv", ROW + "1,1,1,1,1,1,1", "more values than columns"),
-        ("evaluation.csv", 'driver,advice\n"guide', "EOF inside string"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
         ("metrics.csv", "frames,train/return\n1,2\n3,\n", r"metrics.csv is damaged .*; restore the file"),
-        ("metrics.csv", "frames,train/return\n1,2\n3\n", "metrics.csv is damaged"),
         ("guide_return.json", "[1", "guide_return.json is damaged"),
         ("config.yaml", "seed: 0\n", r"no valid label, seed and method.needs_guide \(Missing key label\)"),
         ("config.yaml", "- 1\n", r"\(a list\); restore the file"),
         ("config.yaml", "seed: [\n", "remove the run from the folder"),
-        ("config.yaml", "seed: x\nlabel: a\nmethod: {needs_guide: true}\n", "invalid literal for int"),
     ],
 )
 def test_error_names_the_damaged_file(sweep, file, text, message):

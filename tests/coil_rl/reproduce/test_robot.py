@@ -39,13 +39,11 @@ def test_measures_of_recordings_equal_those_of_the_simulation(recordings, tmp_pa
     (crash,) = evaluate_policy(SimulatedRobotEnv(seed=4), ConstantGuide(1.0)).episodes
     assert rows["crash.mcap"]["crashed"] == "True"
     assert float(rows["crash.mcap"]["clearance"]) == pytest.approx(crash["clearance"], abs=1e-5)
-    assert "## Table 6: the robot (simulated)" in page
     assert row(page, "guide ")[:5] == ["guide", "-", "2", "0", "0"]
-    assert "sways, stays central" in page
     assert (tmp_path / "table_6.png").exists()
 
 
-def test_another_robots_recording_is_measured_by_odometry_and_commands(tmp_path):
+def test_another_robots_recording_is_measured_by_odometry_or_commands(tmp_path):
     file = circle(tmp_path / "mine.mcap", scans=250, odometry=True, commands=True)
     page = Table6(recordings=[str(file)]).make(tmp_path / "table_6")
     (measured,) = read_csv(tmp_path / "table_6.csv")
@@ -58,21 +56,12 @@ def test_another_robots_recording_is_measured_by_odometry_and_commands(tmp_path)
     assert float(measured["smoothness"]) == pytest.approx(steps.sum() / 250, rel=1e-3)
     assert (measured["crashed"], measured["method"]) == ("", "mine")
     assert "simulated" not in page
-    assert row(page, "mine ")[:5] == ["mine", "-", "1", "1", "-"]
     assert "held up" not in page
-
-
-def test_without_odometry_the_commands_are_integrated(tmp_path):
-    file = circle(tmp_path / "mine.mcap", scans=250, commands=True)
-    Table6(recordings=[str(file)]).make(tmp_path / "table_6")
-    (measured,) = read_csv(tmp_path / "table_6.csv")
-    assert float(measured["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-2)
-
-
-def test_drivers_can_be_named(recordings, tmp_path):
-    named = {"coil": [str(recordings / "0.mcap")], "ppo": [str(recordings / "1.mcap")]}
-    Table6(recordings=named).make(tmp_path / "table_6")
-    assert [line["method"] for line in read_csv(tmp_path / "table_6.csv")] == ["coil", "ppo"]
+    file = circle(tmp_path / "commands.mcap", scans=250, commands=True)
+    Table6(recordings={"named": [str(file)]}).make(tmp_path / "commands")
+    (integrated,) = read_csv(tmp_path / "commands.csv")
+    assert integrated["method"] == "named"
+    assert float(integrated["lap_time"]) == pytest.approx(2 * np.pi / 0.15, rel=1e-2)
 
 
 def test_the_last_pose_is_in_the_recording(recordings):
@@ -86,7 +75,7 @@ def runs(tmp_path_factory):
     """Untrained agents and a guide with constant steering, which all crash soon."""
     folder = tmp_path_factory.mktemp("runs")
     options = ["guide=constant", "guide.constant.value=1", "track=generated", "track.train.count=1"]
-    made = [("ppo", 0), ("coil", 0), ("coil", 1)]
+    made = [("ppo", 0), ("coil", 1)]
     for label, seed in made:
         make_untrained_run(folder / f"{label}_{seed}", f"method={label}", f"seed={seed}", *options)
     return {"mine": [Run(folder / f"{label}_{seed}", label, seed, None) for label, seed in made]}
@@ -97,11 +86,9 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert table.experiments == ["mine"]
     page = table.make(tmp_path / "table_6", runs)
     rows = read_csv(tmp_path / "table_6.csv")
-    drivers = [("guide", ""), ("ppo", "0"), ("coil", "0"), ("coil", "1")]
-    assert [(line["method"], line["seed"]) for line in rows] == drivers
-    assert "(simulated)" in page
+    assert [(line["method"], line["seed"]) for line in rows] == [("guide", ""), ("ppo", "0"), ("coil", "1")]
     drives = {path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()}
-    assert len(drives) == 4
+    assert len(drives) == 3
     assert Table6(["mine"], labels=["ppo", "coil"], repeats=1).make(tmp_path / "table_6", runs) == page
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()} == drives
     again = Table6(["mine"], recordings=[str(tmp_path / "table_6_drives")])
@@ -149,7 +136,6 @@ def test_drives_without_a_complete_lap_are_compared_by_clearance_only(page):
     assert row(page, "COIL's laps")[1:] == ["-0.61", "2 of 3", "**held up**: -1.00 (-1.00 to -1.00)"]
     expected = "**held up**: -0.195 (-0.200 to -0.190)"
     assert row(page, "COIL steers more smoothly than its guide")[1:] == ["-0.183", "2 of 3", expected]
-    assert row(page, "PPO drives nearer")[2] == "3 of 3"
     lost = page_of(drive("guide"), drive("ppo", "0", **LOST))
     assert row(lost, "PPO steers more smoothly")[2:] == ["0 of 1", "-"]
     assert row(lost, "PPO drives nearer")[2:] == ["1 of 1", "**undecided**: -0.050"]

@@ -55,8 +55,6 @@ def test_the_page_counts_the_worlds_in_which_coil_reaches_its_guide(made):
     reached = (column(rows, "coil_score") >= 1 - 1e-9).mean(axis=0)
     line = next(line for line in page.splitlines() if "one of 2 classes | optimal" in line)
     assert [f"{share:.0%}" for share in reached[[0, 2]]] == cells(line)[5:7]
-    assert "≥ guide, 50 steps | ≥ guide, 5,000 steps" in page
-    assert "means over 3 random worlds" in page
     pairs = [(column(rows, "coil_score"), column(rows, "guide_score")) for rows in groups.values()]
     reached = sum((coil[:, -1] >= own[:, -1] - 1e-9).sum() for coil, own in pairs)
     assert f"**: in {reached} of 24 worlds, guides and views |" in page
@@ -79,7 +77,6 @@ def test_worlds_do_not_depend_on_their_number(made, tmp_path):
         ({"noise": 1.5}, "noise=1.5 must be at least 0 and at most 1"),
         ({"epsilon": 0}, "epsilon=0 must be more than 0"),
         ({"power": 0.5}, "power=0.5 must be more than 1/2"),
-        ({"steps": []}, "must be increasing integers from 1"),
         ({"steps": [3, 2]}, "must be increasing integers from 1"),
         ({"steps": [0, 2]}, "must be increasing integers from 1"),
     ],

@@ -65,10 +65,8 @@ def test_optimal_advice_helps_an_agent_without_observations():
     alone = max(mdp.start @ solve(mdp, np.full(S, action)) for action in range(A))
     assert coil == pytest.approx(mdp.start @ policy_iteration(mdp).V)
     assert coil > alone
-
-
-def test_observations_with_advice_distinguish_observation_and_advice():
     assert observations_with_advice([1, 0, 1], 2).tolist() == [2, 3, 0, 1, 2, 3]
+    assert with_advice(toymaker(), [1, 1]).states[0] == "successful toy, advised no advertising"
 
 
 @FEW
@@ -81,7 +79,3 @@ def test_values_of_the_guides_are_ordered(seed):
     assert (values[1] <= other + 1e-8).all()
     np.testing.assert_allclose(noisy_guide(mdp, 0), optimal_guide(mdp))
     np.testing.assert_allclose(noisy_guide(mdp, 1), random_guide(mdp))
-
-
-def test_state_names_contain_the_advice():
-    assert with_advice(toymaker(), [1, 1]).states[0] == "successful toy, advised no advertising"

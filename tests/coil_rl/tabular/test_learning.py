@@ -46,12 +46,14 @@ def test_transition_frequencies_match_the_probabilities():
     np.testing.assert_array_equal(sample.next_state[:-1], sample.state[1:])
 
 
-def test_transitions_depend_on_the_seed_only():
+def test_transitions_and_q_depend_on_the_seed_only():
     mdp = garnet(5, 2, np.random.default_rng(1))
     first, again, other = (sample_transitions(mdp, UNIFORM, 100, np.random.default_rng(seed)) for seed in (3, 3, 4))
     np.testing.assert_array_equal(first.state, again.state)
     assert (first.state != other.state).any()
-    assert not len(sample_transitions(mdp, UNIFORM, 0, np.random.default_rng(0)).state)
+    values = [learn(mdp, seed, 500).Q for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(values[0], values[1])
+    assert (values[0] != values[2]).any()
 
 
 def test_an_episode_ends_at_a_terminal_state_or_after_its_steps():
@@ -106,7 +108,7 @@ def test_more_transitions_improve_the_plan(seed):
     assert (solve(mdp, plan.policy) > best.V - 0.1).all()
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(5))
 def test_all_methods_agree_on_random_worlds(seed):
     mdp = garnet(4, 2, np.random.default_rng(seed), gamma=0.8)
     plan, learned = value_iteration(mdp), learn(mdp, episode_steps=20)
@@ -133,27 +135,14 @@ def test_q_of_a_corridor_follows_equation_52():
     assert learned.Q[0, 1] == pytest.approx(2)
     assert 0.9 < learned.Q[0, 0] < 1
     assert learned.visits.sum() == learned.visits[0].sum() == 400
-
-
-def test_q_learning_depends_on_the_seed_only():
-    mdp = toymaker()
-    assert (learn(mdp, 1, 500).Q == learn(mdp, 1, 500).Q).all()
-    assert (learn(mdp, 1, 500).Q != learn(mdp, 2, 500).Q).any()
-
-
-def test_states_with_the_same_observation_share_q():
-    learned = learn(toymaker(), observations=[0, 0], steps=500)
-    assert learned.Q.shape == (1, 2)
-    assert learned.visits.sum() == 500
+    assert learn(toymaker(), observations=[0, 0], steps=500).Q.shape == (1, 2), "states share an observation"
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"power": 0.5}, "power=0.5 must be more than 1/2 and at most 1"),
-        ({"power": 1.1}, "power=1.1"),
         ({"epsilon": 0}, "epsilon=0 must be more than 0"),
-        ({"epsilon": 1.1}, "epsilon=1.1"),
         ({"snapshots": (1, 600)}, "snapshots: 600 must be between 0 and steps=500"),
         ({"observations": [0]}, "observations must be 2 integers"),
         ({"observations": [0, -1]}, "observations must be 2 integers"),

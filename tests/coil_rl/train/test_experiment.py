@@ -12,7 +12,7 @@ from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.train import checkpoint
-from coil_rl.train.experiment import Experiment, Metrics, check_losses, check_weights, watched_keys
+from coil_rl.train.experiment import Experiment, Metrics, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -39,8 +39,8 @@ def as_written(rows):
 
 def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
-    names = sorted(contents(tmp_path / "run"))
-    assert names == ["checkpoint.pt", "checkpoint_previous.pt", "metrics.csv", "policy_best.pt", "policy_last.pt"]
+    names = {"checkpoint.pt", "checkpoint_previous.pt", "metrics.csv", "policy_best.pt", "policy_last.pt"}
+    assert set(contents(tmp_path / "run")) == names
     with (tmp_path / "run" / "metrics.csv").open() as file:
         written = list(csv.DictReader(file))
     assert [float(row["frames"]) for row in written] == [row["frames"] for row in rows] == [128, 256, 384, 512]
@@ -58,7 +58,7 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 4), (RandomGuide, 5), (SplineGuide, 4)])
+@pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineGuide, 4)])
 def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
     rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
@@ -86,15 +86,10 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
     assert whole.keys() == resumed.keys()
     for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
         assert whole[name] == resumed[name], name
-
-
-def test_resume_of_a_finished_run_changes_nothing(tmp_path):
-    rows = experiment(tmp_path / "run").run()
-    before = contents(tmp_path / "run")
-    again = experiment(tmp_path / "run", seed=9)
-    again.resume()
-    assert as_written(again.run()) == str(rows)
-    assert contents(tmp_path / "run") == before
+    finished = experiment(tmp_path / "stopped", seed=9, frames=frames, guide=guide())
+    finished.resume()
+    assert as_written(finished.run()) == str(rows)
+    assert contents(tmp_path / "stopped") == resumed
 
 
 class WriteNaN(Transform):
@@ -117,8 +112,7 @@ class WriteNaN(Transform):
 
 
 # At step 20 the env itself raises an error, because of the NaN; step 24 is the last of a batch.
-@pytest.mark.parametrize("step", [20, 24])
-@pytest.mark.parametrize("key", ["observation", "reward"])
+@pytest.mark.parametrize(("key", "step"), [("observation", 20), ("observation", 24), ("reward", 24)])
 def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, step):
     good = experiment(tmp_path / "good", frames=16 * 8 * 2)
     good.run()
@@ -158,18 +152,6 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
-def test_finite_losses_and_infinite_bounds_pass():
-    check_losses({"learner/loss": 1.0}, 7)
-    check_weights({"bound": torch.tensor(-torch.inf), "order": [1]}, 7)
-
-
-def test_logged_reward_terms_add_up_to_the_reward(tmp_path):
-    run = experiment(tmp_path / "run")
-    batch = Rollout(run.rollout.env, run.learner.policy, 40).collect()
-    terms = sum(batch["next", "info", "reward", term] for term in ("finish", "crash", "cone", "smooth", "alive"))
-    torch.testing.assert_close(terms, batch["next", "reward"])
-
-
 ROWS = [{"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)]
 
 
@@ -180,9 +162,8 @@ def write_metrics(path, rows, logger=None):
     return metrics
 
 
-@pytest.mark.parametrize("torn", [b"", b"60,0.1", b"60,0.1,nan\r\n70"])
-@pytest.mark.parametrize("count", [0, 1, 3, 5])
-def test_truncated_metrics_continue_as_if_never_stopped(tmp_path, count, torn):
+@pytest.mark.parametrize(("count", "torn"), [(0, b""), (1, b"60,0.1"), (3, b"60,0.1,nan\r\n70"), (5, b"60,0.1")])
+def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
     whole, stopped = tmp_path / "whole.csv", tmp_path / "stopped.csv"
     write_metrics(whole, ROWS)
     write_metrics(stopped, ROWS)
@@ -199,8 +180,6 @@ def test_missing_rows_are_refused(tmp_path):
     write_metrics(tmp_path / "metrics.csv", ROWS[:2])
     with pytest.raises(UserError, match="has 2 of the 3 rows that belong to the checkpoint"):
         Metrics(tmp_path / "metrics.csv").truncate(3)
-    with pytest.raises(UserError, match="has 0 of the 1 rows"):
-        Metrics(tmp_path / "other.csv").truncate(1)
 
 
 @pytest.mark.parametrize("count", [0, 3])
