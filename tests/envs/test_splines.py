@@ -9,6 +9,7 @@ from scipy.interpolate import make_interp_spline, make_smoothing_spline
 from torch import Tensor
 
 from coil_rl.envs.splines import (
+    SelfEvolvingSpline,
     Spline,
     least_squares_parabola,
     quadratic_spline,
