@@ -84,7 +84,7 @@ def test_numbers_are_reproducible(runs, tmp_path):
         ("run={runs}/ppo", "does not use advice: the policy does not read guide_action; it reads observation"),
         ("run={runs}/guide", "has no agent, only a guide"),
         ("run={runs}/coil donors=0", "donors=0 must be greater than or equal to 1"),
-        ("run={runs}/coil bin=0", "bin=0.0 must be between 0.1 and 100.0"),
+        ("run={runs}/coil bin=0", "bin=0.0 must be greater than or equal to 0.1"),
         ("run={runs}/coil turn_radius=-1", "turn_radius=-1.0 must be greater than or equal to 0.5"),
         ("run={runs}/coil donor=1", "no key donor; the configuration has"),
     ],
