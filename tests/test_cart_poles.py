@@ -5,6 +5,7 @@ from torchrl.envs.utils import check_env_specs
 
 
 def test_states_equal_those_of_gymnasium():
+    check_env_specs(CartPoles(3))
     ours, theirs = CartPoles(1), gymnasium.make("CartPole-v1").unwrapped
     theirs.reset(seed=0)
     state = ours.reset()
@@ -16,7 +17,3 @@ def test_states_equal_those_of_gymnasium():
         expected, _, fallen, _, _ = theirs.step(push.item())
         torch.testing.assert_close(state["observation"][0], torch.from_numpy(expected), rtol=1e-4, atol=1e-4)
     assert state["terminated"].item()
-
-
-def test_specs():
-    check_env_specs(CartPoles(3))

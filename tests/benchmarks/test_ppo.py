@@ -76,7 +76,7 @@ def test_batch_has_every_kind_of_end_and_the_log_probability_of_our_policy(made)
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.5], ids=["near ratios", "clipped ratios"])
-def test_an_update_gives_the_same_weights(made, shift):
+def test_update_gives_the_same_weights(made, shift):
     plain, ours, batch = made
     batch = batch._replace(log_prob=batch.log_prob + shift * torch.randn_like(batch.log_prob))
     before = plain.actor[0].weight.detach().clone()
@@ -89,6 +89,6 @@ def test_an_update_gives_the_same_weights(made, shift):
     assert not torch.equal(before, plain.actor[0].weight)
 
 
-def test_an_entropy_bonus_is_rejected():
+def test_entropy_bonus_is_refused():
     with pytest.raises(ValueError, match=r"entropy=0.1 must be 0"):
         PlainPPO(ConeTrackEnv(shipped_tracks("train"), 2), None, 4, **OPTIONS | {"entropy": 0.1})

@@ -29,20 +29,6 @@ def test_first_loss_is_that_of_unit_ratios():
     assert abs(metrics["kl_approx"]) < 1e-6
 
 
-def test_truncation_bootstraps_and_termination_does_not():
-    ppo, rollout = make(gamma=0.5, gae_lambda=0.0)
-    batch = rollout.collect()
-    batch["next", "reward"].zero_()
-    for key in ("done", "terminated"):
-        batch["next", key].zero_()
-    batch["next", "done"][0, -1] = True
-    batch["next", "done"][1, -1] = batch["next", "terminated"][1, -1] = True
-    with torch.no_grad():
-        ppo.advantage(batch)
-        value = ppo.critic(batch["next"][:2, -1].select("observation"))["state_value"]
-    torch.testing.assert_close(batch["value_target"][:2, -1], value * torch.tensor([[0.5], [0.0]]))
-
-
 def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):
     torch.manual_seed(0)
     env = ConeTrackEnv([ring], 16, time_limit=1.8)
@@ -79,9 +65,3 @@ def test_policy_loss_depends_on_the_steps_of_the_agent_only():
     assert torch.equal(ppo.masked_losses(other)["loss_objective"], losses["loss_objective"])
     other["value_target"][~acted] += 1
     assert not torch.equal(ppo.masked_losses(other)["loss_critic"], losses["loss_critic"])
-
-
-def test_gain_of_zero_gives_the_action_zero():
-    ppo, rollout = make(action_gain=0.0)
-    batch = rollout.collect()
-    assert (ppo.policy.get_dist(batch.select("observation")).deterministic_sample == 0).all()
