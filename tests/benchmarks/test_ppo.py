@@ -87,8 +87,3 @@ def test_update_gives_the_same_weights(made, shift):
         torch.testing.assert_close(one.weight, other.weight, atol=2e-5, rtol=1e-4)
     torch.testing.assert_close(plain.log_scale, log_scale(ours.policy), atol=1e-5, rtol=1e-4)
     assert not torch.equal(before, plain.actor[0].weight)
-
-
-def test_entropy_bonus_is_refused():
-    with pytest.raises(ValueError, match=r"entropy=0.1 must be 0"):
-        PlainPPO(ConeTrackEnv(shipped_tracks("train"), 2), None, 4, **OPTIONS | {"entropy": 0.1})

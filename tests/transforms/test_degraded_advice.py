@@ -122,24 +122,20 @@ def test_advice_stays_within_the_bounds_of_other_envs():
     assert worlds.carts(BiasedAdvice(0.5)).reset()["guide_action"].le(1).all()
 
 
-def test_noise_is_gaussian_and_independent_for_each_guide_and_step():
-    stored = TensorDict({"guide_action": torch.zeros(50_000, 2, 1)}, [50_000])
-    noise = [NoisyAdvice(0.3, seed)(stored.clone())["guide_action"] for seed in (1, 1, 2)]
-    assert noise[0].std() == pytest.approx(0.3, abs=0.005)
-    assert noise[0].mean() == pytest.approx(0, abs=0.005)
-    assert torch.equal(noise[0], noise[1])
-    assert not torch.equal(noise[0], noise[2])
-    assert abs(torch.corrcoef(noise[0].squeeze(-1).t())[0, 1]) < 0.02
+def test_noise_is_gaussian_and_random_advice_uniform():
+    def drawn(make, number=0.0):
+        stored = TensorDict({"guide_action": torch.full((50_000, 2, 1), number)}, [50_000])
+        return make(stored)["guide_action"].squeeze(-1)
 
-
-def test_random_advice_is_uniform_and_independent_of_the_guide():
-    stored = [TensorDict({"guide_action": torch.full((50_000, 1, 1), number)}, [50_000]) for number in (-1.0, 0.7)]
-    advice, other = (RandomAdvice(-0.5, 1.0, seed=1)(data)["guide_action"] for data in stored)
-    assert torch.equal(advice, other)
-    assert -0.5 <= advice.min() < -0.49
-    assert 0.99 < advice.max() <= 1
-    assert advice.mean() == pytest.approx(0.25, abs=0.01)
-    assert advice.std() == pytest.approx(1.5 / 12**0.5, abs=0.01)
+    noise, advice = drawn(NoisyAdvice(0.3, seed=1)), drawn(RandomAdvice(-0.5, 1.0, seed=1))
+    for sample, mean, std in ((noise, 0, 0.3), (advice, 0.25, 1.5 / 12**0.5)):
+        assert sample.mean() == pytest.approx(mean, abs=0.005)
+        assert sample.std() == pytest.approx(std, abs=0.005)
+        assert abs(torch.corrcoef(sample.t())[0, 1]) < 0.02
+    assert -0.5 <= advice.min() < -0.49 < 0.99 < advice.max() <= 1
+    assert torch.equal(noise, drawn(NoisyAdvice(0.3, seed=1)))
+    assert not torch.equal(noise, drawn(NoisyAdvice(0.3, seed=2)))
+    assert torch.equal(advice, drawn(RandomAdvice(-0.5, 1.0, seed=1), number=0.7))
 
 
 @pytest.mark.parametrize("transform", [NoisyAdvice(0.1, seed=3), RandomAdvice(seed=3)], ids=["noisy", "random"])

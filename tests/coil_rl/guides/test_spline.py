@@ -7,7 +7,6 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from oracle import guide_action
-from tensordict import TensorDict
 from torch import Tensor
 
 from coil_rl.guides import RacingLineGuide, SplineGuide
@@ -164,14 +163,6 @@ def test_advice_is_an_action_for_any_cones(
         action = guide.steer(cones.to(dtype), count, current.to(dtype))
         assert (action.shape, action.dtype) == ((1, 1), dtype)
         assert action.abs() <= 1
-
-
-def test_keys_are_configurable() -> None:
-    cones, count, steering = roads(2, cars=5)
-    data = TensorDict({"seen": cones, "cone_count": count, "steering": steering}, 5)
-    written = SplineGuide(in_keys=("seen", "cone_count", "steering"), out_key=("guide", "action"))(data)
-    assert "action" not in written
-    assert torch.equal(written["guide", "action"], SplineGuide().steer(cones, count, steering))
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,7 @@ def test_fast_prediction_of_a_forest_equals_that_of_scikit_learn(forest, outputs
     expected = torch.from_numpy(regressor.model.predict(x.numpy())).float().reshape(300, outputs)
     monkeypatch.setattr(forest, "predict", None)
     assert torch.equal(regressor(x), expected)
+    monkeypatch.undo()
     with pytest.raises(ValueError, match="contains infinity"):
         regressor(torch.full((3, 4), torch.inf))
     with pytest.raises(ValueError, match=f"has 3 features, but {forest.__name__} is expecting 4"):

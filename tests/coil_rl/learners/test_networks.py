@@ -28,14 +28,6 @@ def test_advice_is_flattened_into_the_observation():
     assert data["action"].shape == data["state_value"].shape == (4, 1)
 
 
-def test_deterministic_action_is_the_squashed_mean():
-    env = ConeTrackEnv(shipped_tracks("test"), 3)
-    policy = actor(env, ["observation"])
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        data = policy(env.reset())
-    torch.testing.assert_close(data["action"], data["loc"].tanh())
-
-
 def test_fast_module_computes_what_a_tensordict_module_computes():
     split = Linear(3, 4)
     ours, theirs = (

@@ -7,8 +7,14 @@ import pytest
 import torch
 import worlds
 from cart_poles import CartPoles
+from torchrl.objectives.value import GAE
 
+from coil_rl.envs import ConeTrackEnv
+from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
+from coil_rl.learners.networks import critic
+from coil_rl.learners.ppo import Advantages
+from coil_rl.schedules import Linear
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import JumpStart, Takeover
 
@@ -66,6 +72,20 @@ def test_guide_that_never_acts_changes_no_bit(kind, make):
     assert torch.equal(weights(plain), weights(shared))
 
 
+def test_policy_loss_depends_on_the_steps_of_the_agent_only():
+    torch.manual_seed(0)
+    env = worlds.cones(Takeover(0.5))
+    ppo = PPO(env)
+    rows = ppo.prepare(Rollout(env, ppo.policy, 16, ppo.keys).collect(), 0.0)
+    other, of_guide = rows.clone(), ~rows["agent_acts"].squeeze(-1)
+    other["advantage"][of_guide] = 1e6
+    other["action_log_prob"][of_guide] = -1e6
+    other["value_target"][of_guide] += 1
+    losses, changed = ppo.masked_losses(rows), ppo.masked_losses(other)
+    assert torch.equal(changed["loss_objective"], losses["loss_objective"])
+    assert not torch.equal(changed["loss_critic"], losses["loss_critic"])
+
+
 @pytest.mark.parametrize("kind", LEARNERS)
 def test_only_the_critic_learns_from_steps_of_the_guide(kind):
     initial, learner = (trained(kind, worlds.cones(Takeover(1.0)), updates) for updates in (0, 1))
@@ -96,15 +116,33 @@ def test_entropy_bonus_keeps_the_policy_random(kind):
     assert largest_probability(1.0) < largest_probability(0.0)
 
 
-def test_reinforce_without_baseline_has_no_critic_parameters():
-    learner = trained(Reinforce, CartPoles(8), baseline="none")
-    assert not list(learner.critic.parameters())
-    assert not learner.state_dict()["critic"]
-
-
 @pytest.mark.parametrize("kind", LEARNERS)
 def test_minibatch_of_one_frame_is_refused(kind):
     # The standard deviation of one advantage is NaN.
     trained(kind, CartPoles(2), steps=4, minibatches=4)
     with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
+
+
+def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):
+    torch.manual_seed(0)
+    env = ConeTrackEnv([ring], 16, time_limit=1.8)
+    batch = Rollout(env, RandomGuide(-1, 1), 120).collect()
+    done, terminated = batch["next", "done"], batch["next", "terminated"]
+    assert terminated.any()
+    assert (done & ~terminated).any()
+    values = critic(env, ["observation"])
+    ours = Advantages(values, 0.98, 0.9)(batch.clone())
+    with torch.no_grad():
+        expected = GAE(gamma=0.98, lmbda=0.9, value_network=values)(batch.clone())
+    for key in ("advantage", "value_target", "state_value"):
+        torch.testing.assert_close(ours[key], expected[key], rtol=1e-5, atol=1e-5)
+
+
+def test_learning_rate_follows_its_schedule():
+    env = CartPoles(8)
+    learner = trained(PPO, env, updates=1, learning_rate=Linear(1e-3, 0.0))
+    batch, before = Rollout(env, learner.policy, 8, learner.keys).collect(), weights(learner)
+    assert learner.update(batch.clone(), 1.0)["learning_rate"] == 0
+    assert torch.equal(weights(learner), before)
+    assert learner.update(batch, 0.25)["learning_rate"] == pytest.approx(7.5e-4)
