@@ -6,13 +6,10 @@ from torchrl.data import Categorical
 from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
-from coil_rl.testing import check_env, check_transform
 from coil_rl.transforms import (
     BiasedAdvice,
-    DelayedAdvice,
     DiscreteActions,
     GuideActions,
-    JumpStart,
     RemovedAdvice,
     ResidualAction,
     RewardCoupling,
@@ -36,22 +33,13 @@ def close(tensor, numbers):
     return tensor.flatten().tolist() == pytest.approx(numbers)
 
 
-@pytest.mark.parametrize(
-    "transforms",
-    [[ResidualAction(0.5), RewardCoupling(0.1), Takeover(0.5)], [JumpStart(3), DelayedAdvice(3)], [RemovedAdvice()]],
-)
-def test_specs_hold_with_other_transforms(transforms):
-    check_env(worlds.cones(*transforms, DiscreteActions(3)).train(), steps=5)
-    check_transform(ConeTrackEnv(shipped_tracks("test"), 3), DiscreteActions(7))
-
-
 def test_choices_are_equally_spaced_from_bound_to_bound():
     env = worlds.pendulum(DiscreteActions(5))
     assert isinstance(env.action_spec, Categorical)
     assert env.transform[-1].values.tolist() == [-2, -1, 0, 1, 2]
 
 
-def test_the_env_gets_the_value_and_the_data_keep_the_choice():
+def test_env_gets_the_value_and_the_data_keep_the_choice():
     after = step(advised([0.0] * 3, choices=[-0.5, 0.1, 0.75]), 0, 1, 2)
     assert after["action"].tolist() == [0, 1, 2]
     assert close(after["next", "steering"], [-0.5, 0.1, 0.75])
@@ -72,23 +60,3 @@ def test_earlier_transforms_use_action_units():
     after = step(advised([0.3] * 5, RewardCoupling(1.0)), 0, 1, 2, 3, 4)
     assert close(after["next", "guide_distance"], [1.3, 0.8, 0.3, 0.2, 0.7])
     assert step(advised([0.3], RemovedAdvice()), 1)["next", "guide_action"].tolist() == [[[0, 1, 0, 0, 0]]]
-
-
-@pytest.mark.parametrize(
-    ("choices", "message"),
-    [
-        (1, "choices=1 must be at least 2"),
-        ([0.5], "must be at least two increasing numbers"),
-        ([0.5, 0.5], "must be at least two increasing numbers"),
-        ([0.0, float("inf")], "must be finite"),
-        ([0.0, 1.5], r"choices=\[0.0, 1.5\] must lie between the action's bounds -1.0 and 1.0"),
-    ],
-)
-def test_invalid_choices_are_rejected(choices, message):
-    with pytest.raises(ValueError, match=message):
-        worlds.cones(DiscreteActions(choices)).reset()
-
-
-def test_an_env_with_discrete_actions_is_rejected():
-    with pytest.raises(ValueError, match="one bounded number, but this env's action is Categorical"):
-        worlds.carts(DiscreteActions(5)).reset()

@@ -63,12 +63,8 @@ def test_target_is_the_farthest_with_a_clear_arc_within_the_lookahead(options, e
 @pytest.mark.parametrize("margin", [0.0, 0.6, 1.9])
 def test_without_a_clear_arc_the_target_is_the_nearest(margin):
     assert advice(*ONE_TARGET, margin=margin, turn=1) == pytest.approx(arc(1.5, 0.5, 1))
-
-
-def test_without_a_target_steering_is_kept_and_sharp_arcs_are_clamped():
-    assert advice([], [], 0.3) == pytest.approx(0.3)
-    assert advice([(2.0, 1.0), (4.0, 1.0)], [], -0.7) == pytest.approx(-0.7)
-    assert advice(*ONE_TARGET, turn=3.0) == pytest.approx(1)
+    assert advice(*ONE_TARGET, margin=margin, turn=3) == pytest.approx(1), "sharp arcs should be clamped"
+    assert advice([(2.0, 1.0), (4.0, 1.0)], [], -0.7) == pytest.approx(-0.7), "without a target steering is kept"
 
 
 def test_blocked_arcs_agree_with_geometry(steps):
@@ -97,18 +93,8 @@ def test_guide_keeps_the_contract_and_differs_from_the_safety_policy(steps):
     assert (action != SplineGuide()(steps.clone())["action"]).float().mean() > 0.9
 
 
-def test_advice_is_antisymmetric_and_independent_of_padding(steps):
-    cones, count, steering = (steps[key] for key in KEYS)
-    guide, mirror = RacingLineGuide().steer, torch.tensor([1.0, -1.0], dtype=torch.float64)
-    mirrored = guide(cones.double().flip(1) * mirror, count.flip(1), -steering.double())
-    torch.testing.assert_close(mirrored, -guide(cones.double(), count, steering.double()), rtol=0, atol=1e-9)
-    padding = torch.arange(cones.shape[2]) >= count.unsqueeze(-1)
-    other = torch.where(padding.unsqueeze(-1), torch.full_like(cones, 1.5), cones)
-    assert torch.equal(guide(other, count, steering), guide(cones, count, steering))
-
-
 def test_corners_are_cut(ring):
-    racing, safe = lap(ring, RacingLineGuide(), rate=12), lap(ring, SplineGuide(), rate=12)
+    racing, safe = lap(ring, RacingLineGuide(), rate=8), lap(ring, SplineGuide(), rate=8)
     assert racing["completed"]
     assert racing["lap_time"] < safe["lap_time"] - 0.3
     assert 0 < racing["clearance"] < safe["clearance"]
@@ -123,15 +109,3 @@ def test_laps_of_shipped_tracks_are_shorter_and_smoother_without_a_crash(number)
     assert racing["lap_time"] < safe["lap_time"]
     assert racing["smoothness"] < safe["smoothness"] / 3
     assert racing["reward"] > safe["reward"]
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [("margin", -0.1, "at least 0"), ("margin", 2.0, "less than car_length=2.0"),
-     ("turn", 0, "more than 0"), ("lookahead", math.inf, "more than 0"),
-     ("spacing", 0, "more than 0"), ("car_length", math.nan, "more than 0"), ("max_steering", 100, "at most 90"),
-     ("targets", 1, "at least 2")],
-)  # fmt: skip
-def test_a_value_out_of_range_is_rejected(name, value, message):
-    with pytest.raises(ValueError, match=f"{name}={value} .*{message}"):
-        RacingLineGuide(**{name: value})

@@ -1,3 +1,5 @@
+"""The spline guide, and properties that it shares with the racing line guide."""
+
 import math
 
 import pytest
@@ -5,14 +7,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from oracle import guide_action
-from tensordict import TensorDict
 from torch import Tensor
 
-from coil_rl.guides.spline import SplineGuide
+from coil_rl.guides import RacingLineGuide, SplineGuide
 
 SLOTS = 16
-seeds = st.integers(0, 2**31)
 both_splines = pytest.mark.parametrize("spline", ["cubic", "quadratic"])
+every_guide = pytest.mark.parametrize(
+    "guide", [SplineGuide(), SplineGuide("quadratic"), RacingLineGuide()], ids=["cubic", "quadratic", "racing line"]
+)
 Point = tuple[float, float]
 
 
@@ -113,17 +116,16 @@ def test_without_a_target_steering_is_kept(left: list[Point], right: list[Point]
         assert advice(left, right, steering, spline=spline) == steering
 
 
-@both_splines
-@given(seed=seeds)
-def test_advice_is_antisymmetric_and_independent_of_padding(spline: str, seed: int) -> None:
-    guide = SplineGuide(spline).steer
-    cones, count, steering = roads(seed, cars=40)
+@every_guide
+def test_advice_is_antisymmetric_and_independent_of_padding(guide: SplineGuide) -> None:
+    cones, count, steering = roads(7, cars=1000)
+    action = guide.steer(cones, count, steering)
     mirrored = cones.flip(1) * torch.tensor([1.0, -1.0])
-    assert torch.allclose(guide(mirrored, count.flip(1), -steering), -guide(cones, count, steering), rtol=0, atol=1e-9)
+    assert torch.allclose(guide.steer(mirrored, count.flip(1), -steering), -action, rtol=0, atol=1e-9)
     padding = torch.arange(SLOTS) >= count.unsqueeze(-1)
     shuffled = torch.where(padding.unsqueeze(-1), cones.flip(2) - 3, cones)
-    assert torch.equal(guide(shuffled, count, steering), guide(cones, count, steering))
-    assert torch.equal(guide(cones[:, :, :6], count, steering), guide(cones, count, steering))
+    assert torch.equal(guide.steer(shuffled, count, steering), action)
+    assert torch.equal(guide.steer(cones[:, :, :6], count, steering), action)
 
 
 @both_splines
@@ -136,50 +138,45 @@ def test_advice_equals_the_oracle(spline: str) -> None:
         assert ours[car].item() == pytest.approx(expected, abs=1e-6)
 
 
-@both_splines
+@every_guide
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_advice_is_batch_invariant(spline: str, dtype: torch.dtype) -> None:
-    guide = SplineGuide(spline).steer
+def test_advice_is_batch_invariant(guide: SplineGuide, dtype: torch.dtype) -> None:
     batch = roads(9, cars=1003, dtype=dtype)
-    together = guide(*batch)
-    for car in range(0, 1003, 17):
-        assert torch.equal(guide(*(value[car : car + 1] for value in batch)), together[car : car + 1])
+    together = guide.steer(*batch)
+    for car in range(0, 1003, 33):
+        assert torch.equal(guide.steer(*(value[car : car + 1] for value in batch)), together[car : car + 1])
 
 
 coordinates = st.sampled_from([0.0, 1.0, 1.0 + 1e-7, -1.0, 2.0, 5.0]) | st.floats(-7, 7, width=32)
 points = st.lists(st.tuples(coordinates, coordinates), max_size=SLOTS)
 
 
-@both_splines
-@given(left=points, right=points, again=st.booleans(), steering=st.floats(-1, 1, width=32))
+@every_guide
+@given(left=points, right=points, duplicated=st.booleans(), steering=st.floats(-1, 1, width=32))
 def test_advice_is_an_action_for_any_cones(
-    spline: str, left: list[Point], right: list[Point], again: bool, steering: float
+    guide: SplineGuide, left: list[Point], right: list[Point], duplicated: bool, steering: float
 ) -> None:
-    if again:
+    if duplicated:
         left, right = (left + left)[:SLOTS], (right + left)[:SLOTS]
     cones, count, current = inputs(left, right, steering)
     for dtype in (torch.float32, torch.float64):
-        action = SplineGuide(spline).steer(cones.to(dtype), count, current.to(dtype))
+        action = guide.steer(cones.to(dtype), count, current.to(dtype))
         assert (action.shape, action.dtype) == ((1, 1), dtype)
         assert action.abs() <= 1
 
 
-def test_keys_are_configurable_and_there_is_no_state() -> None:
-    cones, count, steering = roads(2, cars=5)
-    data = TensorDict({"seen": cones, "cone_count": count, "steering": steering}, 5)
-    guide = SplineGuide(in_keys=("seen", "cone_count", "steering"), out_key=("guide", "action"))
-    written = guide(data)
-    assert "action" not in written
-    assert torch.equal(written["guide", "action"], SplineGuide().steer(cones, count, steering))
-    assert not list(guide.parameters())
-    assert not guide.state_dict()
-
-
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("spline", "linear"), ("cones", 0), ("midpoints", 1), ("targets", 1), ("smoothing", -1), ("sharpness", math.nan),
-     ("max_steering", 0), ("gain", math.inf)],
+    ("guide", "values"),
+    [
+        (SplineGuide, {"spline": "linear", "cones": 0, "midpoints": 1, "targets": 1, "smoothing": -1,
+                       "sharpness": math.nan, "max_steering": 0, "gain": math.inf}),
+        (RacingLineGuide, {"margin": -0.1, "turn": 0, "lookahead": math.inf, "spacing": 0, "car_length": math.nan,
+                           "max_steering": 100, "targets": 1}),
+    ],
 )  # fmt: skip
-def test_a_value_out_of_range_is_rejected(name: str, value: float | str) -> None:
-    with pytest.raises(ValueError, match=f"{name}={value!r}"):
-        SplineGuide(**{name: value})  # type: ignore[arg-type]
+def test_values_out_of_range_are_refused(guide: type, values: dict) -> None:
+    for name, value in values.items():
+        with pytest.raises(ValueError, match=f"{name}={value!r}"):
+            guide(**{name: value})
+    with pytest.raises(ValueError, match=r"margin=2.0 .*less than car_length=2.0"):
+        RacingLineGuide(margin=2.0)

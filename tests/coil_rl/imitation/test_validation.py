@@ -6,7 +6,6 @@ from hypothesis import strategies as st
 from sklearn.linear_model import LinearRegression
 from sklearn.metrics import r2_score
 from sklearn.model_selection import LeaveOneGroupOut, cross_val_predict
-from sklearn.tree import DecisionTreeRegressor
 
 from coil_rl.errors import UserError
 from coil_rl.imitation import SklearnRegressor
@@ -39,18 +38,9 @@ def test_error_on_left_out_tracks_equals_that_of_scikit_learn():
     assert metrics["r2_by_track"] == pytest.approx(r2_score(y, predicted), rel=1e-4)
 
 
-def test_new_tracks_are_harder_than_samples_drawn_at_random():
-    # A random sample has a near copy in the training data, a sample of a new track has none.
-    metrics = cross_validate(SklearnRegressor(DecisionTreeRegressor()), *sines())
-    assert metrics["mse_random_split"] < 0.01
-    assert metrics["mse_by_track"] > 0.1
-
-
 def test_seed_changes_the_random_split_only():
-    one, other, again = (
-        cross_validate(SklearnRegressor(LinearRegression()), *sines(), seed=seed) for seed in (0, 1, 0)
-    )
-    assert one == again
+    one, other, same = (cross_validate(SklearnRegressor(LinearRegression()), *sines(), seed=seed) for seed in (0, 1, 0))
+    assert one == same
     assert one["mse_random_split"] != other["mse_random_split"]
     assert one["mse_by_track"] == other["mse_by_track"]
 

@@ -1,11 +1,8 @@
-import math
 from copy import deepcopy
 from functools import partial
 
 import pytest
 import torch
-import worlds
-from tensordict.nn import TensorDictModule
 from torchrl.envs import RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -48,14 +45,6 @@ def test_control_orders_have_one_kind_of_phase():
     assert phases(schedule(2, order="guide"), 4) == [(False, (0,)), (False, (1,)), (False, (0,)), (False, (1,))]
 
 
-def test_earlier_phases_are_counted_by_kind():
-    order, earlier = schedule(), []
-    for _ in range(9):
-        earlier.append(order.phase.earlier)
-        order.advance(20, reward=0.0)
-    assert earlier == [0, 0, 1, 1, 2, 2, 3, 3, 4]
-
-
 @pytest.mark.parametrize("choice", ["sequential", "stochastic"])
 def test_schedule_resumes_in_the_middle_of_a_phase(choice):
     whole, first, second = (schedule(choice=choice, seed=seed) for seed in (0, 0, 9))
@@ -64,36 +53,15 @@ def test_schedule_resumes_in_the_middle_of_a_phase(choice):
     assert before + phases(second, 35) == phases(whole, 60)
 
 
-def test_convergence_is_several_evaluations_without_improvement():
+def test_convergence_is_several_evaluations_without_improvement_within_a_phase():
     stop = AtConvergence(evaluations=2, improvement=0.1)
     assert not stop(100, [1.0, 2.0, 1.9])
     assert stop(100, [1.0, 2.0, 1.9, 2.05])
     assert not stop(100, [1.0, 2.0, 1.9, 2.2])
     assert not stop(100, [])
     assert AtConvergence(evaluations=5, frames=100)(100, [1.0])
-
-
-def test_rewards_of_earlier_phases_do_not_count_for_convergence():
     order = PhaseSchedule(1, agent_phase=AtConvergence(1), guide_phase=AtConvergence(1))
-    ended = [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)]
-    assert ended == [False, False, True, False, True]
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: PhaseSchedule(0), "guides=0 must be at least 1"),
-        (lambda: PhaseSchedule(2, order="both"), "order='both' must be one of alternate"),
-        (lambda: PhaseSchedule(2, choice="first"), "choice='first' must be one of sequential"),
-        (lambda: AfterFrames(0), "frames=0 must be at least 1"),
-        (lambda: AtConvergence(0), "evaluations=0 must be at least 1"),
-        (lambda: AtConvergence(improvement=-1), "improvement=-1 must be at least 0"),
-        (lambda: AtConvergence(frames=0), "frames=0 must be at least 1"),
-    ],
-)
-def test_phases_out_of_range_are_refused(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+    assert [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)] == [False, False, True, False, True]
 
 
 def cars():
@@ -144,30 +112,27 @@ def test_each_phase_changes_its_networks_only():
     assert [metrics["guides_changed"] for _, metrics in result] == [0, 1, 0, 1]
 
 
-@pytest.mark.parametrize(("critic_phases", "learns"), [("agent", [True, False]), ("guide", [False, True])])
-def test_critic_learns_in_its_phases(critic_phases, learns):
-    result = updates(make(env := cars(), critic_phases=critic_phases), env, 2)
-    assert [groups[1] for groups, _ in result] == learns
-
-
 @pytest.mark.parametrize(
-    ("order", "groups"),
-    [("joint", [True, True, True, True]), ("agent", [True, True, False, False]), ("guide", [False, True, True, False])],
+    ("options", "groups"),
+    [
+        ({"phases": {"order": "joint"}}, [True, True, True, True]),
+        ({"phases": {"order": "agent"}}, [True, True, False, False]),
+        ({"phases": {"order": "guide"}}, [False, True, True, False]),
+        ({"critic_phases": "agent"}, [True, True, False, False]),
+        ({"critic_phases": "guide"}, [True, False, False, False]),
+    ],
 )
-def test_control_orders_change_their_networks_only(order, groups):
-    assert updates(make(env := cars(), phases={"order": order}), env, 1)[0][0] == groups
+def test_orders_and_phases_of_the_critic_change_their_networks_only(options, groups):
+    ((changed_groups, metrics),) = updates(make(env := cars(), **options), env, 1)
+    assert changed_groups == groups
+    assert (metrics["moved_left"] > 0) == groups[2]
+    assert (metrics["moved_right"] > 0) == groups[3]
 
 
 def test_learning_rates_shrink_from_each_phase_to_the_next_of_its_kind():
-    result = updates(make(env := cars(), shrink=0.5), env, 6)
+    result = updates(make(env := cars(), shrink=0.5, epochs=1), env, 6)
     assert [metrics["learning_rate"] for _, metrics in result] == [1e-3, 0, 5e-4, 0, 2.5e-4, 0]
     assert [metrics["guide_learning_rate"] for _, metrics in result] == [0, 1e-3, 0, 5e-4, 0, 2.5e-4]
-
-
-def test_moved_is_the_change_of_the_action_of_a_guide():
-    (_, first), (_, second) = updates(make(env := cars(), phases={"order": "guide"}), env, 2)
-    assert first["moved_left"] > 0
-    assert first["moved_right"] == 0 < second["moved_right"]
 
 
 def test_dynamic_coil_with_frozen_guides_is_coil():
@@ -195,25 +160,10 @@ def test_state_resumes_in_the_middle_of_a_phase():
     assert changed(weights(first), weights(second)) == [False] * 4
 
 
-def test_unusable_guides_and_values_out_of_range_are_refused():
-    env = cars()
-    one = guide(env)
-    constant = TensorDictModule(lambda observation: observation[..., :1] * 0, ["observation"], ["action"])
-    with pytest.raises(ValueError, match="guide 'constant' has no parameters"):
-        DynamicCoil(env, guides={"constant": constant})
-    with pytest.raises(ValueError, match="two guides share parameters"):
-        DynamicCoil(env, guides={"one": one, "two": one})
-    with pytest.raises(ValueError, match="Dynamic COIL needs continuous actions"):
-        DynamicCoil(worlds.carts(), guides={"one": one})
-    for name, value in (("shrink", 0), ("critic_phases", "never"), ("guide_learning_rate", math.nan)):
-        with pytest.raises(ValueError, match=f"{name}=.* must be"):
-            DynamicCoil(env, guides={"one": one}, **{name: value})
-
-
 def test_guide_learns_to_steer_through_a_frozen_agent():
     """Steering left is rewarded. The guide can change it only through its advice to the agent."""
     env = cars()
-    learner = make(env, guides=("only",), phases={"order": "guide"}, gamma=0.0, epochs=8)
+    learner = make(env, guides=("only",), phases={"order": "guide"}, gamma=0.0, epochs=8, guide_learning_rate=3e-3)
     rollout = Rollout(env, learner.policy, 32, [*learner.keys])
     observed = rollout.collect().select("observation")
 
@@ -221,7 +171,7 @@ def test_guide_learns_to_steer_through_a_frozen_agent():
         return float(learner.policy.get_dist(observed.copy()).deterministic_sample.detach().mean())
 
     before = steering()
-    for _ in range(8):
+    for _ in range(3):
         batch = rollout.collect()
         batch["next", "reward"] = batch["action"].clone()
         learner.update(batch)

@@ -60,24 +60,8 @@ def flat(learner, batch):
     return batch.select(*learner.minibatch_keys).reshape(-1)
 
 
-def test_equation_67_with_a_baseline():
-    """G - b(s), where the return of an unfinished episode is bootstrapped."""
-    learner, batch = make(Reinforce, standardise=False)
-    learner.advantage(batch)
-    losses = learner.losses(flat(learner, batch))
-    returns, after = torch.zeros(3, 6), values(learner, batch["next"])
-    for car in range(3):
-        for t in range(6):
-            for k in range(t, 6):
-                returns[car, t] += GAMMA ** (k - t) * batch["next", "reward"][car, k, 0]
-                if batch["next", "done"][car, k, 0] or k == 5:
-                    continues = not batch["next", "terminated"][car, k, 0]
-                    returns[car, t] += GAMMA ** (k - t + 1) * after[car, k] * continues
-                    break
-    expected = -(log_probability(learner, batch) * (returns - values(learner, batch))).mean()
-    torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
-    error = ((returns - values(learner, batch)) ** 2).mean()
-    torch.testing.assert_close(losses["loss_critic"].detach(), error, rtol=1e-4, atol=1e-5)
+def close(one, other):
+    torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
 def test_equation_67_without_a_baseline():
@@ -92,22 +76,28 @@ def test_equation_67_without_a_baseline():
         total = reward[:, t] + GAMMA * total * ~done[:, t]
         returns.insert(0, total)
     expected = -(log_probability(learner, batch) * torch.stack(returns, 1)).mean()
-    torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
+    close(losses["loss_objective"].detach(), expected)
     assert losses["loss_critic"] == 0
 
 
-@pytest.mark.parametrize("standardise", [False, True])
-def test_equation_76(standardise):
-    learner, batch = make(A2C, gae_lambda=LAMBDA, standardise=standardise, critic=0.5)
+@pytest.mark.parametrize(
+    ("kind", "decay", "weight", "options"),
+    [
+        (Reinforce, 1.0, 1.0, {"standardise": False}),
+        (A2C, LAMBDA, 0.5, {"standardise": False, "gae_lambda": LAMBDA, "critic": 0.5}),
+        (A2C, LAMBDA, 0.5, {"standardise": True, "gae_lambda": LAMBDA, "critic": 0.5}),
+    ],
+)
+def test_equations_67_and_76(kind, decay, weight, options):
+    """The advantage of Reinforce is the bootstrapped return minus the baseline: lambda is 1."""
+    learner, batch = make(kind, **options)
     learner.advantage(batch)
     losses = learner.losses(flat(learner, batch))
-    advantage = backwards(learner, batch, GAMMA * LAMBDA)
-    error = 0.5 * (advantage**2).mean()
-    torch.testing.assert_close(losses["loss_critic"].detach(), error, rtol=1e-4, atol=1e-5)
-    if standardise:
+    advantage = backwards(learner, batch, GAMMA * decay)
+    close(losses["loss_critic"].detach(), weight * (advantage**2).mean())
+    if options["standardise"]:
         advantage = (advantage - advantage.mean()) / advantage.std()
-    expected = -(log_probability(learner, batch) * advantage).mean()
-    torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
+    close(losses["loss_objective"].detach(), -(log_probability(learner, batch) * advantage).mean())
 
 
 def test_equation_92():
@@ -120,7 +110,7 @@ def test_equation_92():
     ratio = (log_probability(learner, batch) - batch["action_log_prob"]).exp()
     assert ((ratio - 1).abs() > 0.2).any()
     expected = -torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage).mean()
-    torch.testing.assert_close(losses["loss_objective"].detach(), expected, rtol=1e-4, atol=1e-5)
+    close(losses["loss_objective"].detach(), expected)
 
 
 def test_equations_89_and_90():

@@ -1,9 +1,7 @@
-import math
-
 import pytest
 import torch
 import worlds
-from torch.distributions import Normal, kl_divergence
+from torch.distributions import AffineTransform, Normal, TanhTransform, TransformedDistribution
 
 from coil_rl.learners import PPO, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
@@ -44,26 +42,10 @@ def test_divergence_equals_its_estimate_from_samples():
         loss = KickstartLoss(kind="divergence", scale=0.3)(policy, minibatch)
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         base = Normal((minibatch["guide_action"][:, 0] / 2).clamp(EDGE - 1, 1 - EDGE).atanh(), 0.3)
-        guide = torch.distributions.TransformedDistribution(
-            base, [torch.distributions.TanhTransform(), torch.distributions.AffineTransform(0.0, 2.0)]
-        )
+        guide = TransformedDistribution(base, [TanhTransform(), AffineTransform(0.0, 2.0)])
         drawn = guide.sample((40_000,))
         sampled = (guide.log_prob(drawn).sum(-1) - distribution.log_prob(drawn)).mean()
     assert loss.item() == pytest.approx(sampled.item(), rel=0.02)
-
-
-def test_divergence_without_bounds_is_between_normal_distributions():
-    class Unbounded:
-        in_keys = ("observation",)
-
-        def get_dist(self, data):
-            base = Normal(data["observation"], math.e)
-            return torch.distributions.Independent(base, 1)
-
-    _, minibatch = make(worlds.cones())
-    minibatch["observation"] = torch.zeros(len(minibatch), 1)
-    expected = kl_divergence(Normal(minibatch["guide_action"][:, 0], 0.2), Normal(0.0, math.e)).mean()
-    torch.testing.assert_close(KickstartLoss(kind="divergence")(Unbounded(), minibatch), expected)
 
 
 @pytest.mark.parametrize("categorical", [True, False])
@@ -85,10 +67,3 @@ def test_coefficient_of_zero_changes_nothing():
         return torch.cat([p.detach().flatten() for p in ppo.parameters])
 
     torch.testing.assert_close(trained(), trained(KickstartLoss(Linear(1.0, 0.0))))
-
-
-def test_values_out_of_range_are_refused():
-    with pytest.raises(ValueError, match="kind='mse' must be one of likelihood, divergence"):
-        KickstartLoss(kind="mse")
-    with pytest.raises(ValueError, match="scale=0 must be more than 0"):
-        KickstartLoss(scale=0)

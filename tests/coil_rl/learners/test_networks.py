@@ -1,9 +1,8 @@
-import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.nn import Linear
-from torchrl.envs import GymEnv, PendulumEnv, TransformedEnv
+from torchrl.envs import PendulumEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -27,29 +26,6 @@ def test_advice_is_flattened_into_the_observation():
     data = value(policy(env.reset()))
     assert policy.module[0].module.network.layers[0].in_features == 22
     assert data["action"].shape == data["state_value"].shape == (4, 1)
-
-
-@pytest.mark.parametrize("categorical", [True, False])
-def test_discrete_actions_fit_the_env(categorical):
-    env = GymEnv("CartPole-v1", categorical_action_encoding=categorical)
-    policy = actor(env, ["observation"])
-    with set_exploration_type(ExplorationType.RANDOM):
-        rollout = env.rollout(5, policy)
-    assert env.action_spec.is_in(rollout["action"][0])
-
-
-def test_deterministic_action_is_the_squashed_mean():
-    env = ConeTrackEnv(shipped_tracks("test"), 3)
-    policy = actor(env, ["observation"])
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        data = policy(env.reset())
-    torch.testing.assert_close(data["action"], data["loc"].tanh())
-
-
-def test_unknown_entry_is_refused_with_the_available_ones():
-    env = ConeTrackEnv(shipped_tracks("test"), 3)
-    with pytest.raises(KeyError, match=r"no entry guide_action to observe; it has .*observation"):
-        actor(env, ["observation", "guide_action"])
 
 
 def test_fast_module_computes_what_a_tensordict_module_computes():

@@ -7,7 +7,6 @@ import worlds
 from coil_rl.learners import TRPO
 from coil_rl.learners.trpo import conjugate_gradients
 from coil_rl.train.rollout import Rollout
-from coil_rl.transforms import Takeover
 
 
 def weights(learner):
@@ -35,10 +34,7 @@ def test_conjugate_gradients_solve_a_linear_system(size):
     # Twice as many iterations as exact arithmetic needs; the superfluous ones change nothing.
     solution = conjugate_gradients(lambda vector: matrix @ vector, target, 2 * size)
     torch.testing.assert_close(solution, torch.linalg.solve(matrix, target), rtol=1e-3, atol=1e-4)
-
-
-def test_conjugate_gradients_of_zero_are_zero():
-    assert (conjugate_gradients(lambda vector: 2 * vector, torch.zeros(3), 5) == 0).all()
+    assert (conjugate_gradients(lambda vector: matrix @ vector, 0 * target, 5) == 0).all()
 
 
 def test_step_is_the_exact_natural_gradient_scaled_to_the_bound():
@@ -87,14 +83,4 @@ def test_step_is_not_taken_if_the_line_search_fails():
     before = weights(learner)
     report = learner.improve(rows)
     assert report["step"] == report["kl"] == 0
-    assert torch.equal(before, weights(learner))
-
-
-def test_policy_does_not_change_without_steps_of_the_agent():
-    torch.manual_seed(0)
-    env = worlds.cones(Takeover(1.0))
-    learner = TRPO(env, epochs=1, minibatches=2)
-    before = weights(learner)
-    metrics = learner.update(Rollout(env, learner.policy, 8, learner.keys).collect())
-    assert metrics["kl"] == metrics["step"] == 0 < metrics["loss_critic"]
     assert torch.equal(before, weights(learner))

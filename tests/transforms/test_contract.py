@@ -1,0 +1,138 @@
+"""Properties shared by the transforms: valid specs, resumable draws, and refusals."""
+
+import math
+
+import pytest
+import torch
+import worlds
+from tensordict import TensorDict
+from torchrl.envs import Compose, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import RandomGuide, SplineGuide, ZeroGuide
+from coil_rl.testing import check_env, check_transform
+from coil_rl.transforms import (
+    BiasedAdvice,
+    DelayedAdvice,
+    DiscreteActions,
+    GuideActions,
+    JumpStart,
+    NoisyAdvice,
+    PartialAdvice,
+    RandomAdvice,
+    RemovedAdvice,
+    ResidualAction,
+    RewardCoupling,
+    ScaledAdvice,
+    ShuffledAdvice,
+    Takeover,
+)
+from coil_rl.transforms.guide_actions import Guides
+
+TRANSFORMS = {
+    "advice only": Compose,
+    "biased": BiasedAdvice,
+    "delayed": lambda: DelayedAdvice(2),
+    "jump start": lambda: JumpStart(4, random=True),
+    "noisy": NoisyAdvice,
+    "partial": lambda: PartialAdvice("left"),
+    "random": RandomAdvice,
+    "removed": RemovedAdvice,
+    "reward coupling": lambda: RewardCoupling(0.5),
+    "scaled": lambda: ScaledAdvice(0.5),
+    "takeover": lambda: Takeover(0.5),
+}
+
+
+@pytest.mark.parametrize("name", TRANSFORMS)
+def test_specs_hold_in_every_env(name):
+    for env in worlds.everywhere(TRANSFORMS[name]):
+        check_env(env.train(), steps=4)
+
+
+@pytest.mark.parametrize("categorical", [True, False])
+def test_specs_hold_with_shuffled_discrete_advice(categorical):
+    check_env(worlds.carts(ShuffledAdvice(), categorical=categorical), steps=4)
+
+
+@pytest.mark.parametrize(
+    "transforms",
+    [[ResidualAction(0.5), RewardCoupling(0.1), Takeover(0.5)], [JumpStart(3), DelayedAdvice(3)], [RemovedAdvice()]],
+)
+def test_specs_hold_with_discrete_actions(transforms):
+    check_env(worlds.cones(*transforms, DiscreteActions(3)).train(), steps=5)
+    check_transform(ConeTrackEnv(shipped_tracks("test"), 3), DiscreteActions(7))
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        NoisyAdvice,
+        RandomAdvice,
+        ShuffledAdvice,
+        lambda seed: Takeover(0.5, seed=seed),
+        lambda seed: JumpStart(9, random=True, seed=seed),
+        lambda seed: GuideActions({"random": RandomGuide(seed=seed)}, out_key="other_advice"),
+    ],
+)
+def test_draws_continue_from_a_state_dict(transform):
+    def env(seed):
+        guide = GuideActions({"spline": SplineGuide()})
+        return TransformedEnv(ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))).train()
+
+    first, second = env(3), env(4)
+    first.rollout(3)
+    second.load_state_dict(first.state_dict())
+    rollouts = []
+    for each in (first, second):
+        torch.manual_seed(0)
+        rollouts.append(each.rollout(8))
+    assert (rollouts[0] == rollouts[1]).all()
+
+
+def degraded(transform):
+    return transform(TensorDict({"guide_action": torch.zeros(1, 1, 1)}, [1]))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Guides({}), "at least one guide"),
+        (lambda: Guides({"half": ZeroGuide()}), "'half' cannot be the name of a guide"),
+        (lambda: Guides({"a": ZeroGuide(out_key="b")}), r"'a' must write 'action'; it writes \['b'\]"),
+        (lambda: Guides({"zero": ZeroGuide()}, trainable=True), "guide 'zero' has no parameters"),
+        (lambda: RewardCoupling(0.5, "l3"), "norm='l3' must be one of l1, l2, linf"),
+        (lambda: RewardCoupling(0.5, guide=-1), "guide=-1 must be at least 0"),
+        (
+            lambda: worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1),
+            "RewardCoupling reads row 1 of guide_action, but there is advice of 1 guides",
+        ),
+        (lambda: worlds.carts(ResidualAction()).rollout(1), "needs continuous actions, but this env has 2 discrete"),
+        (lambda: worlds.carts(DiscreteActions(5)).reset(), "bounded number, but this env's action is Categorical"),
+        (lambda: DiscreteActions(1), "choices=1 must be at least 2"),
+        (lambda: DiscreteActions([0.5]), "must be at least two increasing numbers"),
+        (lambda: DiscreteActions([0.5, 0.5]), "must be at least two increasing numbers"),
+        (lambda: DiscreteActions([0.0, math.inf]), "must be finite"),
+        (
+            lambda: worlds.cones(DiscreteActions([0.0, 1.5])).reset(),
+            r"choices=\[0.0, 1.5\] must lie between the action's bounds -1.0 and 1.0",
+        ),
+        (lambda: NoisyAdvice(sigma=-1), "sigma=-1 must be a finite number of at least 0"),
+        (lambda: RandomAdvice(1.0, 0.5), r"low=1\.0 must be less than high=0\.5"),
+        (lambda: BiasedAdvice(math.nan), "offset=nan must be a finite number"),
+        (lambda: ScaledAdvice(math.inf), "gain=inf must be a finite number"),
+        (lambda: PartialAdvice("up"), "side='up' must be one of left, right"),
+        (lambda: DelayedAdvice(-1), "steps=-1 must be at least 0"),
+        (lambda: degraded(DelayedAdvice()), "DelayedAdvice needs the previous steps"),
+        (lambda: degraded(RemovedAdvice()), "RemovedAdvice needs the previous steps"),
+        (lambda: worlds.cones(ShuffledAdvice(), cars=1).reset(), "but the batch is one row; use more"),
+        (lambda: worlds.pendulum(ShuffledAdvice()).reset(), "but the batch is one row; use more"),
+        (
+            lambda: TransformedEnv(ConeTrackEnv(shipped_tracks("test"), 1), BiasedAdvice()).observation_spec,
+            "BiasedAdvice changes 'guide_action', but",
+        ),
+    ],
+)
+def test_invalid_arguments_and_envs_are_refused(make, message):
+    with pytest.raises((ValueError, RuntimeError, KeyError), match=message):
+        make()
