@@ -11,12 +11,7 @@ from coil_rl.envs.cone_track import SeededEnv
 class TabularEnv(SeededEnv):
     """B agents; `action` [B] and one-hot `observation` [B, S]; absorbing states without reward terminate.
 
-    Args:
-        P: [S, A, S], transition probabilities.
-        R: [S, A, S], rewards.
-        num_envs: B.
-        start: [S], probabilities of the first state, uniform by default.
-        max_steps: length of a truncated episode.
+    `P` and `R` [S, A, S] are probabilities and rewards, `start` [S] the probabilities of the first state (uniform).
     """
 
     def __init__(self, P, R, num_envs=64, start=None, max_steps=100, seed=0):

@@ -33,8 +33,3 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
-
-
-def everywhere(*transforms) -> list[TransformedEnv]:
-    """Return each of these envs with the transforms of some factories."""
-    return [world(*(make() for make in transforms)) for world in (cones, pendulum, carts)]

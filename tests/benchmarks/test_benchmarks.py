@@ -4,7 +4,7 @@ from argparse import Namespace
 
 import pytest
 
-from benchmarks.__main__ import PARTS, goals, main, page
+from benchmarks.__main__ import PARTS, main
 from benchmarks.timing import Stopwatch, measure, median_ratio
 
 
@@ -37,17 +37,6 @@ def test_stopwatch_counts_the_outer_of_two_methods():
     assert work.outer() == work.inner() == 7
     assert stopwatch.seconds["outer"] >= 0.04
     assert 0.02 <= stopwatch.seconds["inner"] < 0.04
-
-
-def test_goals_and_page():
-    results = {
-        "training": [{"batch": "8 x 4", "ppo / by hand": 0.95, "coil / by hand": 0.5}],
-        "processes": [{"cars": 64, "state per car (B)": 400.0}],
-        "sb3": [{"not measured": "it is not installed"}],
-    }
-    results["goals"] = goals(results)
-    assert [row["met"] for row in results["goals"]] == [True, False, True]
-    assert "| it is not installed |" in page(results)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, random_tracks
-from coil_rl.guides import ConstantGuide, SplineGuide, ZeroGuide
+from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env
 from coil_rl.transforms import (
     BiasedAdvice,
@@ -76,20 +76,11 @@ def test_files_compose_in_the_given_order_with_the_seed():
         with initialize_config_module("coil_rl.conf", version_base="1.3"):
             return compose(overrides=[f"+degrade=[{','.join(names)}]", "+seed=3"]).degrade
 
-    assert list(composed("delayed", "noisy")) == ["delayed", "noisy"]
     assert list(composed("noisy", "delayed")) == ["noisy", "delayed"]
     every = composed(*NAMES)
     assert list(every) == NAMES
     assert every.noisy.seed == every.shuffled.seed == 3
     check_env(worlds.cones(*(instantiate(node) for node in every.values())))
-
-
-def test_specs_hold_with_several_guides_and_another_key():
-    key, classes = ("advice", "middle"), (NoisyAdvice, ShuffledAdvice, DelayedAdvice, RemovedAdvice)
-    guides = GuideActions({"constant": ConstantGuide(0.5), "spline": SplineGuide()}, out_key=key)
-    env = TransformedEnv(WORLD, Compose(guides, *(make(key=key) for make in classes)))
-    check_env(env)
-    assert env.reset()[key].eq(0).all()
 
 
 @pytest.mark.parametrize(
@@ -116,9 +107,7 @@ def test_known_numbers_within_the_bounds_of_the_env_and_in_stored_data(transform
 
 
 def test_advice_stays_within_the_bounds_of_other_envs():
-    env = worlds.pendulum(BiasedAdvice(1.75))
-    assert env.observation_spec["guide_action"] == worlds.pendulum().observation_spec["guide_action"]
-    assert env.rollout(50)["guide_action"].max() == 2
+    assert worlds.pendulum(BiasedAdvice(1.75)).rollout(50)["guide_action"].max() == 2
     assert worlds.carts(BiasedAdvice(0.5)).reset()["guide_action"].le(1).all()
 
 
@@ -136,19 +125,6 @@ def test_noise_is_gaussian_and_random_advice_uniform():
     assert torch.equal(noise, drawn(NoisyAdvice(0.3, seed=1)))
     assert not torch.equal(noise, drawn(NoisyAdvice(0.3, seed=2)))
     assert torch.equal(advice, drawn(RandomAdvice(-0.5, 1.0, seed=1), number=0.7))
-
-
-@pytest.mark.parametrize("transform", [NoisyAdvice(0.1, seed=3), RandomAdvice(seed=3)], ids=["noisy", "random"])
-def test_every_step_and_every_partial_reset_has_its_own_draws(transform):
-    env = cone_env(transform, guide=ZeroGuide())
-    carrier = env.reset()
-    advice = [carrier["guide_action"]]
-    for _ in range(4):
-        carrier = steps(env, carrier, 1)
-        advice.append(carrier["guide_action"])
-        carrier = reset_rows(env, carrier, 2)
-        advice.append(carrier["guide_action"][2:3])
-    assert torch.cat(advice).unique().numel() == CARS + 4 * (CARS + 1)
 
 
 @pytest.mark.parametrize(
@@ -202,10 +178,8 @@ def test_delay_starts_again_with_each_episode():
 
 
 def test_shuffled_advice_is_a_shift_of_the_rows():
-    shuffled, plain = (
-        hundredths(counting_env(*parts).rollout(40, straight, break_when_any_done=False))
-        for parts in ([ShuffledAdvice(seed=1)], [])
-    )
+    envs = counting_env(ShuffledAdvice(seed=1)), counting_env()
+    shuffled, plain = (hundredths(env.rollout(40, straight, break_when_any_done=False)) for env in envs)
     assert torch.equal(shuffled.sort(0).values, plain.sort(0).values)
     assert (shuffled != plain).all()
     shifts = {tuple(column) for column in ((shuffled - torch.arange(40)) // 10).t().tolist()}

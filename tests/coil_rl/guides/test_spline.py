@@ -57,19 +57,6 @@ def equation_103(x: float, y: float, sharpness: float = 1.8) -> float:
 TWO_MIDPOINTS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])
 
 
-def test_plan_has_midpoints_nearest_first_and_targets_one_metre_apart() -> None:
-    cones, count, _ = inputs(*TWO_MIDPOINTS)
-    plan = SplineGuide().plan(cones, count)
-    points = torch.tensor([[2, 3], [0.5, 0.5]], dtype=torch.float64)
-    assert plan.midpoint_count.tolist() == [2]
-    assert torch.allclose(plan.midpoints[..., 0], points)
-    assert torch.allclose(plan.targets[:, :2, 0], points)
-    assert torch.allclose(plan.targets[:, 2:, 0], points[:, 1:])
-    assert plan.squared_distance[:, 0].tolist() == pytest.approx([4.25, 9.25, 9.25])
-    assert plan.excluded[:, 0].tolist() == [0, 0, 0]
-    assert torch.allclose(plan.nearest_target(), points[:, :1])
-
-
 @both_splines
 @pytest.mark.parametrize(
     ("left", "right", "target"),
