@@ -28,7 +28,7 @@ from coil_rl.envs.reward import (
     recent_mean,
     weighted_terms,
 )
-from coil_rl.envs.sight import SAMPLES, Frame, View, encode, view
+from coil_rl.envs.sight import SAMPLES, Frame, View, encode_samples, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 from coil_rl.envs.track import Track
 from coil_rl.envs.track_map import Location, TrackMap
@@ -285,7 +285,7 @@ class ConeTrackEnv(SeededEnv):
         local = self.fit(visible.cones, visible.count).equidistant(SAMPLES)
         samples = torch.lerp(samples, frame.to_world(local), fresh)
         sampled = torch.maximum(sampled, fresh)
-        return encode(torch.lerp(frame.to_car(samples), local, fresh), sampled), samples, sampled
+        return encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled), samples, sampled
 
     def _count_new_cones(self, visible: View, slots: Tensor, finished: Tensor) -> Tensor:
         """Mark newly visible cones as rewarded; return the number of sides with one [B]."""

@@ -77,7 +77,7 @@ def view(local: Tensor, limit: int) -> View:
     return View(cones, count, real, candidate, index)
 
 
-def encode(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
+def encode_samples(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
     """Return the paper's observation (4.1): distance and angle of each sample, scaled to [-1, 1].
 
     Args:

@@ -122,7 +122,7 @@ def _line_marker(top: dict[str, Any], side: str, points: Floats, opacity: float)
 
 
 def _boundaries(observation: Floats) -> Floats:
-    """Return the boundary samples of observations, [N, 2, 5, 2] m: the inverse of `sight.encode`."""
+    """Return the boundary samples of observations, [N, 2, 5, 2] m: the inverse of `sight.encode_samples`."""
     distance, angle = np.moveaxis(observation.reshape(len(observation), 2, SAMPLES, 2), -1, 0)
     distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
     return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)

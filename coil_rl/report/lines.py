@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from coil_rl.files import whole_file
 from coil_rl.report import style
-from coil_rl.report.track_map import TrackMap
+from coil_rl.report.track_plot import TrackPlot
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track
@@ -61,16 +61,16 @@ def draw_lines(
     driven, ended = _check_lines(tracks, lines, crashed)
     strokes = style.strokes(driven)
     handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label) for label, s in strokes.items()]
-    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)])
+    plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)])
     for z, (label, stroke) in enumerate(strokes.items()):
         for index, (track, line) in enumerate(zip(tracks, driven[label], strict=True)):
-            offset = track_map.offsets[index]
+            offset = plot.offsets[index]
             for lap in _split_laps(line, track):
                 xy = (lap + offset).T
-                track_map.axes.plot(*xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
+                plot.axes.plot(*xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
             if ended[label][index] and len(line):
-                track_map.axes.plot(*(line[-1] + offset), mfc=stroke.colour, zorder=5 + z / 100, **CRASH)
-    style.save(track_map.figure, path)
+                plot.axes.plot(*(line[-1] + offset), mfc=stroke.colour, zorder=5 + z / 100, **CRASH)
+    style.save(plot.figure, path)
 
 
 def animate_lines(
@@ -90,8 +90,8 @@ def animate_lines(
     driven, ended = _check_lines(tracks, lines, crashed)
     colours = {label: stroke.colour for label, stroke in style.strokes(driven).items()}
     handles = [Line2D([], [], mfc=colour, label=label, **CAR) for label, colour in colours.items()]
-    track_map = TrackMap(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
-    figure, axes, canvas = track_map.figure, track_map.axes, track_map.canvas
+    plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
+    figure, axes, canvas = plot.figure, plot.axes, plot.canvas
     with mpl.rc_context(style.LETTERS):
         clock = figure.text(
             1 - style.MARGIN / style.WIDTH, 14 / figure.bbox.height, "", size=8, ha="right", va="center"
@@ -100,7 +100,7 @@ def animate_lines(
         for label, index in itertools.product(driven, range(len(tracks))):
             (tail,) = axes.plot([], [], color=colours[label], lw=2.4, alpha=0.6)
             (head,) = axes.plot([], [], mfc=colours[label], **CAR)
-            cars.append((driven[label][index] + track_map.offsets[index], ended[label][index], tail, head))
+            cars.append((driven[label][index] + plot.offsets[index], ended[label][index], tail, head))
         canvas.draw()
     # Drawing the tracks in every frame would take three times as long.
     background = canvas.copy_from_bbox(figure.bbox)
@@ -174,21 +174,21 @@ def draw_listening_map(
     colours = ScalarMappable(Normalize(0, highest), MEASURE_COLOURS)
     panels = [(guide, index) for guide in measured for index in range(len(tracks))]
     titled = [replace(tracks[index], name=f"{guide}: {tracks[index].name}") for guide, index in panels]
-    track_map = TrackMap(titled, title=title, groups=len(measured))
+    plot = TrackPlot(titled, title=title, groups=len(measured))
     rim = [StrokeEffect(linewidth=5.2, foreground=style.BACKGROUND), Normal()]
     for panel, (guide, index) in enumerate(panels):
-        xy = driven[index] + track_map.offsets[panel]
+        xy = driven[index] + plot.offsets[panel]
         segments = np.stack([xy[:-1], xy[1:]], axis=1)
         segment_values = measured[guide][index][:-1]
         finite = np.isfinite(segment_values)
-        track_map.axes.add_collection(
+        plot.axes.add_collection(
             LineCollection(
                 list(segments[finite]), array=segment_values[finite], cmap=MEASURE_COLOURS, norm=colours.norm,
                 lw=4.0, capstyle="round", zorder=4, path_effects=rim,
             )
         )  # fmt: skip
-    _draw_colour_bar(track_map.figure, colours, label)
-    style.save(track_map.figure, path)
+    _draw_colour_bar(plot.figure, colours, label)
+    style.save(plot.figure, path)
 
 
 def _draw_colour_bar(figure: Figure, colours: ScalarMappable, label: str) -> None:

@@ -175,7 +175,7 @@ class Experiment:
     def _save(self) -> None:
         state = self.state_dict()
         with self._resume_hint():
-            check_weights(state["learner"], self.updates)
+            check_parameters(state["learner"], self.updates)
         self.metrics.flush()
         checkpoint.save_newest(state, self.folder)
 
@@ -231,11 +231,11 @@ def check_losses(values: Mapping[str, float], update: int) -> None:
             raise UserError(f"{name} is {value} in update {update}")
 
 
-def check_weights(state: Any, update: int, name: str = "learner") -> None:
+def check_parameters(state: Any, update: int, name: str = "learner") -> None:
     """Raise a `UserError` if a tensor of a nested state holds NaN; bounds may be infinite."""
     if isinstance(state, Mapping):
         for key, value in state.items():
-            check_weights(value, update, f"{name}/{key}")
+            check_parameters(value, update, f"{name}/{key}")
     elif isinstance(state, torch.Tensor) and state.is_floating_point() and state.isnan().any():
         raise UserError(f"{name} is nan after update {update}")
 

@@ -20,7 +20,7 @@ from torchrl.envs.utils import make_composite_from_td
 
 from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
-from coil_rl.envs.sight import SAMPLES, SIGHT, encode
+from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
 
 Array = NDArray[np.float64]
@@ -232,7 +232,7 @@ class BoundaryMemory(nn.Module):
         """Update the memory with the output of `estimate`; return what `forward` does."""
         self.samples = torch.where(valid, samples, self.samples)
         self.ever_valid = torch.where(valid, torch.ones_like(self.ever_valid), self.ever_valid)
-        return encode(self.samples, self.ever_valid, self.sight), valid.t()
+        return encode_samples(self.samples, self.ever_valid, self.sight), valid.t()
 
     def reset(self, mask: Tensor) -> None:
         """Clear the rows where mask [B] is true."""

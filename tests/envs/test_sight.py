@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from coil_rl.envs.sight import Frame, View, encode, view
+from coil_rl.envs.sight import Frame, View, encode_samples, view
 
 seeds = st.integers(0, 2**31)
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -96,13 +96,13 @@ def test_samples_are_encoded_as_distance_and_angle() -> None:
     samples[:, :, 0, 0], samples[:, :, 1, 0] = torch.tensor(left).t(), torch.tensor(right).t()
     expected = [1, 0, 0, 0.75, -1, 0, 2 / 7 - 1, 1, 1, 0.25, -0.5, -0.5, 0.5, -1, 1, -1, 0, 0, 1, -0.75]
     known = torch.ones(2, 1)
-    assert encode(samples, known).tolist()[0] == pytest.approx(expected, abs=1e-6)
+    assert encode_samples(samples, known).tolist()[0] == pytest.approx(expected, abs=1e-6)
 
 
 def test_unknown_side_is_encoded_as_zeros() -> None:
     samples = torch.full((2, 5, 2, 3), 2.0)
     known = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    observation = encode(samples, known)
+    observation = encode_samples(samples, known)
     assert observation[0, :10].ne(0).all()
     assert observation[0, 10:].eq(0).all()
     assert observation[1, :10].eq(0).all()
@@ -115,7 +115,7 @@ def test_observations_agree_with_hypot_and_atan2(dtype: torch.dtype) -> None:
     line = torch.tensor([-7.0, -1.0, -1e-6, -0.0, 0.0, 1e-6, 0.5, 3.0], dtype=dtype)
     x, y = torch.meshgrid(line, line, indexing="ij")
     samples = torch.stack([x, y]).view(2, 1, 1, -1).expand(2, 5, 2, -1)
-    distance, angle = encode(samples, torch.ones(2, 64, dtype=dtype)).view(64, 10, 2)[:, 7].unbind(-1)
+    distance, angle = encode_samples(samples, torch.ones(2, 64, dtype=dtype)).view(64, 10, 2)[:, 7].unbind(-1)
     known = torch.atan2(y, x).flatten() * (x != 0).logical_or(y != 0).flatten()
     assert torch.allclose(distance, (torch.hypot(x, y).flatten() * 2 / 7 - 1).clamp(-1, 1))
     # A sample straight behind the car is encoded as left of it.

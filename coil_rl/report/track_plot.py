@@ -29,7 +29,7 @@ TRACKS_PER_ROW = 3
 CONE_RADIUS = 0.24  # m
 
 
-class TrackMap:
+class TrackPlot:
     """A figure, 8 inches wide, with all tracks in one set of axes, in metres.
 
     Args:
