@@ -57,7 +57,7 @@ def test_results_md_collects_all_results_made_so_far():
     assert outcome("table=[1]", "figure=[6]", "budget=smoke")[0] == 0
     assert Path("outputs/reproduce/smoke/table_1.md").read_text() == first
     text = Path("outputs/reproduce/smoke/RESULTS.md").read_text()
-    assert text.count("This is a smoke test") == 1
+    assert text.count("Smoke test at the smallest budget") == 1
     assert text.index("## Table 1") < text.index("## Figure 6") < text.index("## Not made yet")
     assert "- `coil-reproduce table=4 budget=smoke`" in text.split("## Not made yet")[1]
 
