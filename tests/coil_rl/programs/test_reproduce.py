@@ -158,7 +158,7 @@ def test_a_figure_trains_its_runs_and_a_lost_run_again():
     pages = [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")]
     evaluated = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
     assert len(evaluated) == 4
-    assert "> **This is a smoke test" in pages[0]
+    assert "> **Smoke test at the smallest budget" in pages[0]
     lost = sorted(evaluated)[0]
     shutil.rmtree(lost.parent)
     program("reproduce", *arguments, cwd=Path())
