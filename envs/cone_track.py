@@ -165,7 +165,7 @@ class ConeTrackEnv(SeededEnv):
         self.action_spec, self.reward_spec = bounded((*self.batch_size, 1)), real((*self.batch_size, 1))
 
     def _register_state(self, cars: int) -> None:
-        """Register all state, the cars last."""
+        """Register all state as buffers; their last dimension is the cars."""
 
         def zeros(*shape: int, dtype: torch.dtype = self.dtype_) -> nn.Buffer:
             return nn.Buffer(torch.zeros((*shape, cars), dtype=dtype, device=self.device))
