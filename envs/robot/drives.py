@@ -1,8 +1,9 @@
 """Drives of simulated robots: scripted drives with the true cone of each range, and recordings of drives as MCAP.
 
-In a recording, a scan is stamped with the time of its first beam and logged at the time of its last one. A command
-follows each scan and takes effect during the next one. The odometry has the pose at the start of each scan and at the
-end. The metadata record `track` has the cones and the start, in the odometry's frame.
+In a recording, a scan is stamped with the time of its first measurement and logged at the time of its last one. As
+with rplidar_ros, the first measurement is the last range of the message (see `SimulatedLidar`). A command follows each
+scan and takes effect during the next one. The odometry has the pose at the start of each scan and at the end. The
+metadata record `track` has the cones and the start, in the odometry's frame.
 """
 
 from __future__ import annotations
@@ -125,6 +126,8 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
     starts = torch.from_numpy(recording.poses()).float().t().unsqueeze(-1)
     angles = torch.from_numpy(recording.angles(0)).float()
     phase = torch.arange(len(angles)) / len(angles)
+    if recording.angle_increment[0] > 0:
+        phase = phase.flip(0)  # the scanner turns clockwise
     poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * phase
     cones, radius = cones_of(track)
     true, hit = cast_beams(poses, angles, cones, radius)
@@ -151,7 +154,7 @@ def save_drive(drive: SimulatedDrive, path: Path) -> None:
     """Write the scans and the odometry of a drive as MCAP; the track is noted for a drive past both sides."""
     rate = float(1 / drive.seconds[1])
     notes = _notes({"drive": drive.name}, drive.track if drive.sides == "both" else None)
-    _write(path, rate, drive.angles, drive.ranges, drive.poses[..., 0].t(), None, notes)
+    _write(path, rate, drive.angles, drive.ranges, drive.poses[..., -1].t(), None, notes)
 
 
 def record_labelling_drives(

@@ -49,10 +49,11 @@ class SimulatedLidar:
             raise ValueError(f"no_return={no_return} and outliers={outliers} must be shares of all beams")
         self.beams, self.rate, self.quantum = beams, rate, quantum
         self.noise, self.noise_growth, self.no_return, self.outliers = noise, noise_growth, no_return, outliers
-        # As in the driver of the real sensor, a scan starts and ends behind the robot.
+        # As in rplidar_ros, a scan starts and ends behind the robot. The sensor turns clockwise but bearings ascend, so
+        # the last beam is measured first.
         self.angles = (torch.arange(1, beams + 1, dtype=torch.float64) * (2 * math.pi / beams) - math.pi).float()
         # Time of each beam as a share of the scan.
-        self.phase = torch.arange(beams) / beams
+        self.phase = torch.arange(beams - 1, -1, -1) / beams
 
     def measure(self, true: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Return noisy ranges [B, P] m of true distances, infinite without a return; and which are outliers [B, P].

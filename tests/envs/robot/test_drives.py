@@ -37,17 +37,19 @@ def test_drive_is_a_lap_along_the_middle_with_five_and_a_half_scans_per_second(b
     assert both.seconds[-1].item() == pytest.approx(6 / 0.15, abs=1)
     line = torch.from_numpy(middle_line(robot_track(), 0.01)).float()
     assert 0.03 < torch.cdist(both.poses[:2].flatten(1).t(), line).amin(1).max() < 0.05
-    speed = (both.poses[:2, 1:, 0] - both.poses[:2, :-1, 0]).norm(dim=0) * 5.5
+    speed = (both.poses[:2, 1:, -1] - both.poses[:2, :-1, -1]).norm(dim=0) * 5.5
     assert speed.median().item() == pytest.approx(0.15, rel=0.05)
 
 
 def test_heading_is_tangential_and_the_robot_moves_during_a_scan(both):
-    way = both.poses[:2, 1:, 0] - both.poses[:2, :-1, 0]
-    off = torch.remainder(torch.atan2(way[1], way[0]) - both.poses[2, :-1, 0] + torch.pi, 2 * torch.pi) - torch.pi
+    # The last beam is measured first.
+    starts, ends = both.poses[..., -1], both.poses[..., 0]
+    way = starts[:2, 1:] - starts[:2, :-1]
+    off = torch.remainder(torch.atan2(way[1], way[0]) - starts[2, :-1] + torch.pi, 2 * torch.pi) - torch.pi
     assert off.abs().max() < 0.05
-    gaps = both.poses[:, :-1, -1] - both.poses[:, 1:, 0]
+    gaps = ends[:, :-1] - starts[:, 1:]
     assert gaps[:2].norm(dim=0).max() < 0.001
-    assert (both.poses[:2, :, -1] - both.poses[:2, :, 0]).norm(dim=0).min() > 0.02
+    assert (ends[:2] - starts[:2]).norm(dim=0).min() > 0.02
 
 
 def test_ranges_end_at_the_surface_of_the_cone_they_hit(both):
@@ -87,7 +89,7 @@ def test_saved_drive_is_read_back_and_marked_as_simulated(tmp_path):
     assert np.array_equal(recording.ranges, drive.ranges.numpy())
     np.testing.assert_allclose(recording.angles(0), drive.angles, atol=1e-6)
     np.testing.assert_allclose(recording.seconds, drive.seconds, atol=1e-8)
-    np.testing.assert_allclose(recording.poses()[:, :2], drive.poses[:2, :, 0].t(), atol=1e-6)
+    np.testing.assert_allclose(recording.poses()[:, :2], drive.poses[:2, :, -1].t(), atol=1e-6)
     assert recording.notes["simulated"]["drive"] == "left_3"
     save_drive(drive, tmp_path / "again.mcap")
     assert (tmp_path / "again.mcap").read_bytes() == path.read_bytes()
