@@ -135,7 +135,7 @@ def _row(of: str, share: Share) -> dict[str, Any]:
 
 
 def _scans(recordings: Sequence[Recording]) -> list[Scans]:
-    return [(recording.ranges, recording.angles(0)) for recording in recordings]
+    return [(recording.ranges, recording.angles(slice(None))) for recording in recordings]
 
 
 def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:

@@ -27,7 +27,7 @@ from coil_rl.files import write_text
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
-Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and the bearings of their beams [P] radians
+Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
 
 FOLDS = 5
 EVERY = 4  # scans, as neighbouring scans are nearly equal
@@ -182,7 +182,8 @@ def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, I
     """Return the features [N, 3] m of all clusters within 1 m in one of `every` scans, and their drive [N]."""
     features = []
     for ranges, angles in drives:
-        points = points_of(ranges[::every], angles, RANGE_MIN, RANGE + MARGIN)
+        own_angles = np.broadcast_to(angles, ranges.shape)
+        points = points_of(ranges[::every], own_angles[::every], RANGE_MIN, RANGE + MARGIN)
         clusters = measure(points, single_linkage(points))
         features.append(clusters.features[np.hypot(*clusters.centroid.T) <= RANGE])
     return np.concatenate(features), np.repeat(np.arange(len(features)), [len(rows) for rows in features])

@@ -64,9 +64,10 @@ class Recording:
         clock = self.stamp if _ascending(self.stamp) else self.log_time
         return (clock - clock[0]) / 1e9
 
-    def angles(self, scan: int) -> Floats:
-        """Return the bearings of a scan's ranges, [P] radians."""
-        return self.angle_min[scan] + self.angle_increment[scan] * np.arange(self.ranges.shape[1])
+    def angles(self, scan: int | slice) -> Floats:
+        """Return the bearings of a scan's ranges, [P] radians, or of several scans, [N, P]."""
+        increment = self.angle_increment[scan][..., None]
+        return np.asarray(self.angle_min[scan][..., None] + increment * np.arange(self.ranges.shape[1]))
 
     def poses(self) -> Floats:
         """Return the pose at the start of each scan, [N, 3] m, m, radians.

@@ -56,24 +56,26 @@ class Clusters:
 def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float) -> Points:
     """Return the points between two ranges in m of scans [N, P] m; NaN and infinity are no points.
 
-    The beams have the bearings `angles` [P] radians, in any order.
+    The beams have the bearings `angles` radians, [P] or, where each scan has its own, [N, P], in any order.
 
     Raises:
         ValueError: if the shapes do not match or a bearing is not finite.
     """
     ranges, angles = np.asarray(ranges), np.asarray(angles, dtype=np.float64)
-    if ranges.ndim != 2 or angles.shape != ranges.shape[1:]:
+    if ranges.ndim != 2 or angles.shape not in (ranges.shape, ranges.shape[1:]):
         shapes = f"ranges {list(ranges.shape)} and angles {list(angles.shape)}"
-        raise ValueError(f"{shapes} must be [N, P] and [P], N scans of P beams")
+        raise ValueError(f"{shapes} must be [N, P] and [P] or [N, P], N scans of P beams")
     if not np.isfinite(angles).all():
         raise ValueError("angles contains a value that is not finite; give the bearing of each beam in radians")
     bearings = np.mod(angles, TWO_PI)
-    order = np.argsort(bearings, kind="stable")
-    scan, index = np.nonzero(((ranges >= range_min) & (ranges <= range_max))[:, order])
-    beam = order[index]
-    bearing, distance = bearings[beam], ranges[scan, beam].astype(np.float64)
-    x, y = distance * np.cos(bearings)[beam], distance * np.sin(bearings)[beam]
-    return Points(len(ranges), scan, beam, bearing, distance, x, y)
+    order = np.broadcast_to(np.argsort(bearings, kind="stable"), ranges.shape)
+    scan, index = np.nonzero(np.take_along_axis((ranges >= range_min) & (ranges <= range_max), order, axis=1))
+    beam = order[scan, index]
+    distance = ranges[scan, beam].astype(np.float64)
+    bearing, cos, sin = (
+        np.broadcast_to(values, ranges.shape)[scan, beam] for values in (bearings, np.cos(bearings), np.sin(bearings))
+    )
+    return Points(len(ranges), scan, beam, bearing, distance, distance * cos, distance * sin)
 
 
 def single_linkage(points: Points, gap: float = GAP) -> Integers:

@@ -46,10 +46,10 @@ class SimulatedDrive:
     Attributes:
         sides: of the track with cones.
         seconds: [T] start of each scan.
-        angles: [P] radians, bearings of the beams.
+        angles: [P] radians, bearings of the beams, or [T, P] if each scan has its own.
         ranges: [T, P] m, infinite without a return.
         hit: [T, P] index of the cone of each range, -1 for none.
-        poses: [3, T, P] sensor pose at the time of each beam (m, m, radians).
+        poses: [3, T, P] sensor pose at the time of each beam (m, m, radians), NaN for padding.
         cones, radius: [2, M] m, centres, and [M] m.
         visibility: [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams.
     """
@@ -112,7 +112,7 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
     The last scan is left out, as the pose at its end is unknown.
 
     Raises:
-        RecordingError: if the recording lacks a track, odometry or a second scan, or the bearings differ between scans.
+        RecordingError: if the recording lacks a track, odometry or a second scan.
     """
     path, scans = recording.path, recording.ranges
     if "track" not in recording.notes or recording.odometry is None or len(scans) < 2:
@@ -120,15 +120,10 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
             f"{path} lacks the positions of its cones: it needs a metadata record named track (left and right, each "
             "[[x, y], ...] m in the frame of the odometry), odometry, and at least two scans."
         )
-    if (np.diff(recording.points) != 0).any() or np.ptp(recording.angle_min) or np.ptp(recording.angle_increment):
-        raise RecordingError(f"{path} has scans with different bearings; record it with a scanner that keeps them.")
     track = track_of(recording)
     starts = torch.from_numpy(recording.poses()).float().t().unsqueeze(-1)
-    angles = torch.from_numpy(recording.angles(0)).float()
-    phase = torch.arange(len(angles)) / len(angles)
-    if recording.angle_increment[0] > 0:
-        phase = phase.flip(0)  # the scanner turns clockwise
-    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * phase
+    angles = torch.from_numpy(recording.angles(slice(-1))).float()
+    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * _phase(recording)
     cones, radius = cones_of(track)
     true, hit = cast_beams(poses, angles, cones, radius)
     ranges = torch.from_numpy(scans[:-1])
@@ -260,6 +255,14 @@ def _write(
             pose = {"pose": {"position": {"x": x, "y": y}, "orientation": orientation}}
             fields = {"header": header(time, "odom"), "child_frame_id": "base_link", "pose": pose}
             writer.add("/odom", ODOMETRY, time, fields)
+
+
+def _phase(recording: Recording) -> Tensor:
+    """Return the time of each range but those of the last scan as a share of its scan [N - 1, P], NaN for padding."""
+    beam, points = np.arange(recording.ranges.shape[1]), recording.points[:-1, None]
+    # The scanner turns clockwise.
+    order = np.where(recording.angle_increment[:-1, None] > 0, points - 1 - beam, beam)
+    return torch.from_numpy(np.where(beam < points, order / np.maximum(points, 1), np.nan)).float()
 
 
 def _visibility(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor) -> Tensor:

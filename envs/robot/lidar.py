@@ -75,7 +75,7 @@ def cast_beams(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor) -> 
 
     Args:
         poses: [3, B, P] (m, m, radians), sensor pose at the time of each beam.
-        angles: [P] radians, bearings of the beams.
+        angles: [P] radians, bearings of the beams, or [B, P] if each sensor has its own.
         cones: centres, [2, M] m, or [2, B, M] if each sensor has its own.
         radius: [M] or [B, M] m.
 

@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from reproduced_runs import read_csv
 
-from coil_rl.envs import RecordingError, read_recording, save_drive, simulated_drive
+from coil_rl.envs import RecordingError, SimulatedLidar, read_recording, save_drive, simulated_drive
+from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.errors import UserError
 from coil_rl.reproduce import Figure25
 from coil_rl.reproduce.classifier import draw_cone_features, principal_components
-from coil_rl.robot.classifier import accuracy, label_clusters, load_classifier
+from coil_rl.robot.classifier import accuracy, clusters_in_range, label_clusters, load_classifier
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +55,53 @@ def test_a_recorded_drive_has_the_ground_truth_of_the_simulated_one(tmp_path):
     assert (again.visibility - drive.visibility[:length]).abs().max() < 0.2
     assert (again.visibility - drive.visibility[:length]).abs().mean() < 1e-3
     assert np.array_equal(again.thick, drive.thick)
+
+
+def drive_with_varying_scans(path, sides, seed):
+    """Record a drive with 250 ranges in every second scan and 470 in the others."""
+    drives = [simulated_drive(sides, seed, lidar=SimulatedLidar(beams)) for beams in (250, 470)]
+    for number, drive in enumerate(drives):
+        save_drive(drive, path.with_suffix(f".{number}"))
+    contents = [read_messages(path.with_suffix(f".{n}"), {"/scan": SCAN, "/odom": ODOMETRY}) for n in (0, 1)]
+    with RecordingWriter(path) as writer:
+        for name, entries in contents[0].notes.items():
+            writer.describe(name, entries)
+        for index in range(len(drives[0].seconds)):
+            writer.copy(contents[index % 2].messages["/scan"][index])
+            writer.copy(contents[0].messages["/odom"][index])
+    return drives
+
+
+def test_each_scan_is_measured_by_its_own_bearings(tmp_path):
+    drives = drive_with_varying_scans(tmp_path / "both.mcap", "both", 7)
+    recording = read_recording(tmp_path / "both.mcap")
+    varying = labelled_drive(recording)
+    for number, drive in enumerate(drives):
+        scans, beams = slice(number, len(varying.ranges), 2), len(drive.angles)
+        assert np.array_equal(varying.ranges[scans, :beams], drive.ranges[scans][: len(varying.ranges[scans])])
+        assert (varying.hit[scans, :beams] == drive.hit[scans][: len(varying.ranges[scans])]).float().mean() > 0.999
+        assert (varying.hit[scans, beams:] == -1).all()
+        difference = varying.visibility[scans] - drive.visibility[scans][: len(varying.ranges[scans])]
+        assert difference.abs().mean() < 1e-3
+    every_second = [clusters_in_range([(drive.ranges[n::2].numpy(), drive.angles.numpy())])[0]
+                    for n, drive in enumerate(drives)]  # fmt: skip
+    features, _ = clusters_in_range([(recording.ranges, recording.angles(slice(None)))])
+    expected = np.concatenate(every_second)
+    np.testing.assert_allclose(np.sort(features, axis=0), np.sort(expected, axis=0), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_drives_with_varying_scans_train_and_test_the_classifier(tmp_path):
+    paths = {side: [] for side in ("left", "right", "both")}
+    for side, seeds in (("left", (0, 1)), ("right", (0, 1)), ("both", (100,))):
+        for seed in seeds:
+            paths[side].append(tmp_path / f"{side}_{seed}.mcap")
+            drive_with_varying_scans(paths[side][-1], side, seed)
+    Figure25(**paths).make(tmp_path / "figure_25")
+    (measured,) = (
+        row for row in read_csv(tmp_path / "figure_25.csv") if row["measure"] == "accuracy" and row["of"] == "all"
+    )
+    assert float(measured["share"]) > 0.96
 
 
 def clusters(count=300, seed=0):

@@ -127,8 +127,17 @@ def test_features_match_their_definition():
     assert sorted(found.label) == [n for n in np.unique(label) if (label == n).sum() >= 2]
 
 
+def test_each_scan_may_have_its_own_bearings():
+    (first, one), (second, other) = scans(1, 3), scans(3, 3)
+    together = points_of(np.concatenate([first, second]), np.repeat([one, other], 3, axis=0), 0.02, 1.15)
+    alone = [points_of(ranges, angles, 0.02, 1.15) for ranges, angles in ((first, one), (second, other))]
+    for name in ("beam", "bearing", "distance", "x", "y"):
+        assert np.array_equal(getattr(together, name), np.concatenate([getattr(points, name) for points in alone]))
+    assert np.array_equal(together.scan, np.concatenate([alone[0].scan, alone[1].scan + 3]))
+
+
 def test_shapes_that_do_not_match_are_refused():
-    with pytest.raises(ValueError, match=r"ranges \[3, 4\] and angles \[5\] must be \[N, P\] and \[P\]"):
+    with pytest.raises(ValueError, match=r"ranges \[3, 4\] and angles \[5\] must be \[N, P\] and \[P\] or \[N, P\]"):
         points_of(np.zeros((3, 4)), np.zeros(5), 0, 1)
     with pytest.raises(ValueError, match="not finite"):
         points_of(np.zeros((3, 2)), np.array([0, np.nan]), 0, 1)
