@@ -42,10 +42,10 @@ COLUMNS = {
 }  # fmt: skip
 
 NOTES = """
-Shares of clusters within 1 m. Cross-validation leaves out pairs of drives ({folds}). Accuracy: on drives past both
-sides, not used in training. Recall: cones within 1 m and hit by a beam, detected and classified correctly. The
-intervals (Wilson) assume independent clusters; those of neighbouring scans are correlated. The picture shows clusters
-of {kind} drives."""
+Shares of clusters within 1 m. Cross-validation leaves out pairs of drives ({folds}) and only tells thin cones from
+thick ones. Accuracy: on drives past both sides, not used in training; a cone classified as another object counts as
+wrong. Recall: cones within 1 m and hit by a beam, detected and classified correctly. The intervals (Wilson) assume
+independent clusters; those of neighbouring scans are correlated. The picture shows clusters of {kind} drives."""
 
 
 class Figure25(Result):
@@ -118,7 +118,7 @@ class Figure25(Result):
             thick = np.arange(len(features)) >= len(thin_features)
         kind = "test" if self.test_drives else "training"
         draw_cone_features(
-            features, thick, stem.with_suffix(".png"), wrong=classifier.thick(features) != thick,
+            features, thick, stem.with_suffix(".png"), wrong=classifier.classify(features) != thick,
             title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
         )  # fmt: skip
         rows = [{"measure": name, **_row(of, share)} for name in shares for of, share in shares[name].items()]

@@ -1,9 +1,9 @@
 """Draw one scan of the simulated robot's LiDAR: clusters, their classes, boundaries and the guide's steering.
 
 The robot faces up. Points closer than the perception's gap form a cluster; clusters in sight are classified as thin
-(left) or thick (right) cones. Discs are the true cones when the beam straight ahead was sent; the robot moves during a
-turn of the LiDAR. A disc without returns is hidden by a nearer cone, or nearer than the LiDAR measures. Boundaries and
-guide are those of the cone world at a seventh of its size.
+(left) cones, thick (right) cones or other objects. Discs are the true cones when the beam straight ahead was sent; the
+robot moves during a turn of the LiDAR. A disc without returns is hidden by a nearer cone, or nearer than the LiDAR
+measures. Boundaries and guide are those of the cone world at a seventh of its size.
 
     python docs/figures/scan.py [OUTPUT FOLDER]
 """
@@ -47,19 +47,19 @@ def draw_scan(axes: Axes, drive: SimulatedDrive, perception: Perception) -> None
     points = perception.points(ranges, angles)
     label = single_linkage(points, perception.gap)
     clusters = measure(points, label)
-    thick = perception.classifier.thick(clusters.features)
+    kinds = perception.classifier.classify(clusters.features)
     for kind, colour in enumerate(LINE_COLOURS):
-        own = np.isin(label, clusters.label[thick == kind])
+        own = np.isin(label, clusters.label[kinds == kind])
         axes.plot(*facing_up(np.stack([points.x[own], points.y[own]], 1)).T, ".", ms=5, color=colour, zorder=3.5)
 
     cone = majority(label, drive.hit[SCAN].numpy()[points.beam], len(drive.radius))[clusters.label]
-    wrong = (cone >= 0) & (thick != drive.thick.numpy()[cone])
+    wrong = (cone >= 0) & (kinds != drive.thick.numpy()[cone])
     centroids = facing_up(clusters.centroid)
     axes.plot(*centroids[wrong].T, "o", ms=19, mfc="none", mec=ERROR_COLOUR, mew=1.6, zorder=9)
     distance = np.hypot(*centroids.T)
     in_sight = np.flatnonzero(perception.in_sight(clusters))
     for number, index in enumerate(in_sight[np.argsort(distance[in_sight])], 1):
-        offset = centroids[index] / distance[index] * (26 if thick[index] or wrong[index] else 16)
+        offset = centroids[index] / distance[index] * (26 if kinds[index] == 1 or wrong[index] else 16)
         style_of_text = {"ha": "center", "va": "center", "size": 8.5, "zorder": 10}
         axes.annotate(str(number), centroids[index], offset, textcoords="offset points", **style_of_text)
 

@@ -33,26 +33,28 @@ MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of
 
 @dataclass(frozen=True, eq=False)
 class ConeClassifier:
-    """Support vector machine that separates thick from thin cones: a radial kernel on standardised features.
+    """Support vector machines that tell thin cones, thick cones and other clusters apart.
 
-    `coil_rl.robot` trains it with scikit-learn; the decision in NumPy is many times faster for a few clusters. F
-    features are standardised by `mean` and `scale` [F] and compared with the support vectors [S, F], of weights [S], by
-    the kernel exp(-gamma |a - b|^2).
+    The kernel is radial, on standardised features. `coil_rl.robot` trains the machines with scikit-learn; the decision
+    in NumPy is many times faster for a few clusters. F features are standardised by `mean` and `scale` [F] and compared
+    with the support vectors [S, F] by the kernel exp(-gamma |a - b|^2). The `weights` [2, S] and the `intercept` [2] of
+    the two machines turn the kernel into decision values: the first is positive for thick cones and negative for thin
+    ones; the second is negative for clusters unlike those of the training.
 
     Raises:
         ValueError: if shapes do not match, a value is not finite, or `scale` or `gamma` is not positive.
 
     Example:
         >>> from coil_rl.envs import simulated_cone_classifier
-        >>> simulated_cone_classifier().thick([[0.035, 0.01, 0.04], [0.085, 0.03, 0.10]])
-        array([False,  True])
+        >>> simulated_cone_classifier().classify([[0.035, 0.01, 0.04], [0.085, 0.03, 0.10], [0.6, 0.1, 0.7]])
+        array([ 0,  1, -1])
     """
 
     mean: Array
     scale: Array
     support: Array
     weights: Array
-    intercept: float
+    intercept: Array
     gamma: float
 
     def __post_init__(self) -> None:
@@ -62,9 +64,9 @@ class ConeClassifier:
                 raise ValueError(f"{field.name} of a cone classifier contains a value that is not finite")
             object.__setattr__(self, field.name, value)
         shapes = [list(getattr(self, field.name).shape) for field in fields(self)]
-        vectors, features = len(np.atleast_1d(self.weights)), len(np.atleast_1d(self.mean))
-        if shapes != [[features], [features], [vectors, features], [vectors], [], []]:
-            raise ValueError(f"shapes {shapes} of a cone classifier must be [F], [F], [S, F], [S], [], []")
+        vectors, features = len(np.atleast_1d(self.support)), len(np.atleast_1d(self.mean))
+        if shapes != [[features], [features], [vectors, features], [2, vectors], [2], []]:
+            raise ValueError(f"shapes {shapes} of a cone classifier must be [F], [F], [S, F], [2, S], [2], []")
         if not (self.scale > 0).all() or not self.gamma > 0:
             raise ValueError("scale and gamma of a cone classifier must be more than 0")
 
@@ -73,14 +75,15 @@ class ConeClassifier:
         return np.asarray((self.support * self.support).sum(1))
 
     def decision(self, features: NDArray[np.floating]) -> Array:
-        """Return the decision values [C] of features [C, F]: above 0 for thick cones, below 0 for thin ones."""
+        """Return the decision values of both machines [C, 2] for features [C, F]."""
         x = (np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean) / self.scale
         squared_distance = (x * x).sum(1)[:, None] + self._squared_norms - 2 * (x @ self.support.T)
-        return np.asarray(np.exp(-self.gamma * squared_distance) @ self.weights + self.intercept, dtype=np.float64)
+        return np.asarray(np.exp(-self.gamma * squared_distance) @ self.weights.T + self.intercept, dtype=np.float64)
 
-    def thick(self, features: NDArray[np.floating]) -> NDArray[np.bool_]:
-        """Return whether each cluster is a thick cone: [C, F] to [C]."""
-        return self.decision(features) > 0
+    def classify(self, features: NDArray[np.floating]) -> Integers:
+        """Return the class of each cluster: 0 for a thin cone, 1 for a thick one, -1 for no cone; [C, F] to [C]."""
+        thick, known = self.decision(features).T
+        return np.where(known < 0, -1, thick > 0)
 
 
 def simulated_cone_classifier() -> ConeClassifier:
@@ -90,12 +93,12 @@ def simulated_cone_classifier() -> ConeClassifier:
 
 
 class Perception:
-    """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep those in range.
+    """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep the cones in range.
 
     Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points.
 
     Args:
-        classifier: separates thick from thin cones.
+        classifier: tells thin cones, thick cones and other clusters apart.
         range_min, range_max: m, smaller ranges are no return, and range of view.
         bearing_max: degrees to either side of the heading.
         scale: factor from the robot's metres to those of the cone world.
@@ -110,7 +113,7 @@ class Perception:
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
         >>> ranges = np.full((1, 360), np.inf)
-        >>> ranges[0, 200:205] = 0.5
+        >>> ranges[0, 200:204] = 0.5
         >>> cones, count = Perception(simulated_cone_classifier())(ranges, np.radians(np.arange(360) - 180))
         >>> cones.shape, count
         ((1, 2, 16, 2), array([[1, 0]]))
@@ -153,7 +156,7 @@ class Perception:
         return np.concatenate(cones), np.concatenate(count)
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
-        """Return all clusters of at least two points, in the car's frame, unscaled."""
+        """Return all clusters of at least two points, in the car's frame, unscaled; arguments as in `points_of`."""
         points = self.points(ranges, angles)
         return measure(points, single_linkage(points, self.gap))
 
@@ -167,11 +170,18 @@ class Perception:
         x, y = clusters.centroid.T
         return (np.hypot(x, y) <= self.range_max) & (np.abs(np.arctan2(y, x)) <= self.bearing_max)
 
+    def rejected(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> float:
+        """Return the share of the clusters in sight that are no cones, 0 without any; arguments as in `points_of`."""
+        clusters = self.clusters(ranges, angles)
+        kinds = self.classifier.classify(clusters.features[self.in_sight(clusters)])
+        return float((kinds < 0).mean()) if len(kinds) else 0.0
+
     def _cones(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
         clusters = self.clusters(ranges, angles)
-        visible = self.in_sight(clusters)
-        position, scan = clusters.centroid[visible], clusters.scan[visible]
-        row = scan * 2 + self.classifier.thick(clusters.features[visible])
+        visible = np.flatnonzero(self.in_sight(clusters))
+        kind = self.classifier.classify(clusters.features[visible])
+        visible, kind = visible[kind >= 0], kind[kind >= 0]
+        position, row = clusters.centroid[visible], clusters.scan[visible] * 2 + kind
         order = np.lexsort((np.hypot(*position.T), row))
         position, row = position[order], row[order]
         count = np.bincount(row, minlength=2 * len(ranges))

@@ -1,5 +1,7 @@
 """The cone classifier, the cones in view, and the memory of the boundaries."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from coil_rl.envs import (
     ConeTrackEnv,
     Perception,
     SimulatedLidar,
+    read_recording,
     shipped_tracks,
     simulated_cone_classifier,
     simulated_drive,
@@ -18,6 +21,7 @@ from coil_rl.envs.robot.lidar import cast_beams
 from coil_rl.envs.robot.perception import BoundaryMemory
 from coil_rl.guides import SplineGuide
 
+RECORDINGS = Path(__file__).resolve().parents[4] / "shared" / "recordings"
 EXACT = SimulatedLidar(noise=0.0, noise_growth=0.0, no_return=0.0, outliers=0.0)
 
 
@@ -26,24 +30,33 @@ def test_clusters_are_classified_independently():
     classifier = simulated_cone_classifier()
     together = classifier.decision(features)
     np.testing.assert_allclose(together[[0, 450, 899]], classifier.decision(features[[0, 450, 899]]))
-    assert classifier.decision(features[:0]).shape == (0,)
-    assert classifier.thick([[0.03, 0.01, 0.035], [0.085, 0.03, 0.1]]).tolist() == [False, True]
+    assert classifier.decision(features[:0]).shape == (0, 2)
+    assert classifier.classify([[0.03, 0.01, 0.035], [0.085, 0.03, 0.1]]).tolist() == [0, 1]
+
+
+@pytest.mark.parametrize("feature", range(3))
+def test_clusters_larger_than_any_cone_are_no_cones(feature):
+    features = np.random.default_rng(1).uniform(0, 0.1, (500, 3))
+    features[:, feature] = np.linspace(0.3, 3, 500)
+    assert (simulated_cone_classifier().classify(features) == -1).all()
+    assert (simulated_cone_classifier().classify([[1e6, 1e6, 1e6], [0, 0, 1e9]]) == -1).all()
 
 
 @pytest.mark.parametrize(
     ("changed", "words"),
     [
-        ({"weights": [1.0, 2.0]}, "shapes"),
+        ({"weights": [[1.0], [2.0], [3.0]]}, "shapes"),
+        ({"intercept": -0.5}, "shapes"),
         ({"support": [1.0, 2.0]}, "shapes"),
         ({"gamma": -1.0}, "more than 0"),
         ({"scale": [1.0, 0.0]}, "more than 0"),
-        ({"intercept": np.nan}, "intercept of a cone classifier contains a value that is not finite"),
+        ({"intercept": [0.0, np.nan]}, "intercept of a cone classifier contains a value that is not finite"),
     ],
 )
 def test_invalid_classifiers_are_refused(changed, words):
-    numbers = {"mean": [0.0, 0], "scale": [0.01, 0.01], "support": [[3.0, 4]], "weights": [1.0], "intercept": -0.5}
+    machines = {"support": [[3.0, 4]], "weights": [[1.0], [0.5]], "intercept": [-0.5, -0.1], "gamma": 0.5}
     with pytest.raises(ValueError, match=words):
-        ConeClassifier(**{**numbers, "gamma": 0.5, **changed})
+        ConeClassifier(**{"mean": [0.0, 0], "scale": [0.01, 0.01], **machines, **changed})
 
 
 def scan_of(*cones: tuple[float, float, float]):
@@ -78,6 +91,31 @@ def test_range_and_bearing_are_those_of_the_centroid():
     # With the preset of the authors.
     (cone,) = perceive(far, range_max=1.25, bearing_max=120, scale=5.625)[1]
     assert 5.625 * 1.015 < cone[0] < 5.625 * 1.06
+
+
+def test_walls_are_no_cones():
+    assert [len(side) for side in perceive((1.3, 0, 0.8))] == [0, 0]
+    assert [len(side) for side in perceive((0.5, -30, THICK), (1.3, 30, 0.8))] == [0, 1]
+    perception = Perception(simulated_cone_classifier())
+    assert perception.rejected(*scan_of((0.5, -30, THICK), (1.3, 30, 0.8))) == 0.5
+    assert perception.rejected(*scan_of((3.0, 0, THICK))) == 0
+
+
+@pytest.mark.skipif(not RECORDINGS.is_dir(), reason="the recordings beside the repository are not there")
+@pytest.mark.parametrize(
+    ("name", "topic", "share"),
+    [
+        ("breezyslam_exp1_urg_odom", "/scan", 0.50),
+        ("rplidar_c1_lab446a", "/scan", 0.47),
+        ("urg04lx_obstacle_detector_demo", "/scan", 0.57),
+        ("urg04lx_obstacle_detector_demo", "/rear_scan", 0.14),
+        ("urg_legs_positive_7", "/scan", 0.85),
+    ],
+)
+def test_share_of_clusters_in_rooms_without_cones_that_are_rejected(name, topic, share):
+    recording = read_recording(RECORDINGS / f"{name}.mcap", topic, None, None)
+    rejected = Perception(simulated_cone_classifier()).rejected(recording.ranges, recording.angles(slice(None)))
+    assert rejected == pytest.approx(share, abs=0.02)
 
 
 def test_laser_yaw_rotates_the_view():
