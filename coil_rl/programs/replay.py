@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+import sys
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -30,7 +31,7 @@ def replay(config: DictConfig) -> None:
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
     from coil_rl.replay.open_loop import open_loop
-    from coil_rl.replay.report import describe, notes, outcome
+    from coil_rl.replay.report import caution, describe, notes, outcome
     from coil_rl.train.build import build
 
     torch.set_num_threads(config.threads)
@@ -52,11 +53,15 @@ def replay(config: DictConfig) -> None:
     for destination, result in zip(tqdm(folders, unit="recording", desc="write", leave=False), results, strict=True):
         _write(config, result, runs, destination)
     sources = [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
-    text = "\n\n".join([*map(describe, results), *sources, notes(env.max_steering)])
+    cautions = [text for result in results if (text := caution(result, env.perception))]
+    warned = [f"Warning: {text}." for text in cautions]
+    text = "\n\n".join([*map(describe, results), *warned, *sources, notes(env.max_steering)])
     write_text(folder / "replay.md", text)
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):
         print(f"{outcome(result)}; see {destination}")
+    for text in cautions:
+        print(f"replay: {text}", file=sys.stderr)
 
 
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:

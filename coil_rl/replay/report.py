@@ -11,8 +11,12 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from coil_rl.envs import Perception
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import markdown_table, style
+
+CHECKED_SCANS = 512  # of a recording at most, evenly spread
+MOST = 0.5  # share of the clusters
 
 NOTES = """
 Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
@@ -43,6 +47,22 @@ def extent(result: OpenLoop) -> str:
     scans, seconds = len(result.both_valid), result.recording.seconds[-1]
     cut = ", all that can be read of a file that is cut off" if result.recording.cut_off else ""
     return f"{scans} scans in {seconds:.1f} s{cut}; both boundaries valid in {result.both_valid.mean():.0%} of them"
+
+
+def caution(result: OpenLoop, perception: object) -> str:
+    """Return a sentence if no scan shows both boundaries or most clusters in sight are no cones, else nothing."""
+    problems, recording = [], result.recording
+    if not result.both_valid.any():
+        problems.append("no scan shows both boundaries")
+    if isinstance(perception, Perception):
+        some = slice(None, None, -(-len(recording.ranges) // CHECKED_SCANS))
+        rejected = perception.rejected(recording.ranges[some], recording.angles(some))
+        if rejected > MOST:
+            problems.append(f"{rejected:.0%} of the clusters in sight are unlike any cone of the training")
+    if not problems:
+        return ""
+    remedy = "check env.perception, or train the classifier on your own cones with coil-robot steps=[train]"
+    return f"{recording.path}: {' and '.join(problems)}, so the actions mean little; {remedy}"
 
 
 def notes(max_steering: float) -> str:

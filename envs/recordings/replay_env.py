@@ -102,6 +102,7 @@ class McapReplayEnv(EnvBase):
 
     def _load(self, perception: Perceive) -> None:
         """Perceive all scans; store them end to end, [T] scans per buffer."""
+        self.perception = perception
         cones, count = zip(*(_perceive(each, perception, self.kept_cones) for each in self.recordings), strict=True)
         self.cones, self.count = _joined(cones), _joined(count)
         self.pose = _joined([_from_start(each.poses()).astype(np.float32) for each in self.recordings])

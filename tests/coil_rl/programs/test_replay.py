@@ -8,6 +8,7 @@ import math
 import re
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from drives import drive, store, uncompressed
@@ -20,6 +21,8 @@ from rosbags.typesys import Stores, get_typestore
 from run_folders import make_untrained_run
 
 from coil_rl.envs import SimulatedRobotEnv, read_recording, record_drives
+from coil_rl.envs.recordings.mcap_files import RecordingWriter
+from coil_rl.envs.recordings.messages import SCAN
 from coil_rl.guides import SplineGuide
 from coil_rl.programs.replay import _first_repeated, _run_names, _topic_name
 
@@ -70,6 +73,8 @@ def test_files_and_printed_table(done):
     assert {path.name for path in folder.iterdir()} == FILES
     text = (folder / "replay.md").read_text()
     assert program.stdout.startswith(text)
+    assert "Warning" not in text
+    assert "replay: drive.mcap" not in program.stderr
     assert "coil_seed1 is coil_1 (last policy)." in text
     assert f"\ndrive.mcap: {SCANS} scans in 2.5 s; " in program.stdout
 
@@ -131,6 +136,20 @@ def test_each_of_several_recordings_has_a_folder(tmp_path):
         assert {path.name for path in (tmp_path / "results" / name).iterdir()} == FILES - {"replay.md"}
         assert len(read_recording(tmp_path / "results" / name / "annotated.mcap").ranges) == scans
     assert [line.split(":")[0] for line in out.splitlines()[-3:]] == ["a/drive.mcap", "c.mcap", "b/drive.mcap"]
+
+
+def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
+    scan = {"angle_min": -math.pi, "angle_increment": math.pi / 180, "range_max": 12.0}
+    with RecordingWriter(tmp_path / "room.mcap") as writer:
+        for time in range(3):
+            writer.add("/scan", SCAN, time * 10**8, {**scan, "ranges": np.full(360, 0.8)})
+    done = called("replay", "recording=room.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path)
+    sentence = done.stderr.splitlines()[-1]
+    assert sentence.startswith(
+        "replay: room.mcap: no scan shows both boundaries and 100% of the clusters in sight are unlike any cone of the "
+        "training, so the actions mean little; check env.perception, or train the classifier"
+    )
+    assert f"Warning: {sentence.removeprefix('replay: ')}." in (tmp_path / "results" / "replay.md").read_text()
 
 
 def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
