@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from coil_rl.train.load import load_policy_in_env as load_policy_in_env
     from coil_rl.train.rollout import Rollout as Rollout
     from coil_rl.train.run_folder import read_config as read_config
+    from coil_rl.train.trust import trust_packages as trust_packages
     from coil_rl.transforms import DiscreteActions as DiscreteActions
     from coil_rl.transforms import GuideActions as GuideActions
     from coil_rl.transforms import JumpStart as JumpStart
@@ -60,6 +61,7 @@ _NAMES = {
     "coil_rl.train.load": "load_policy load_policy_in_env",
     "coil_rl.train.rollout": "Rollout",
     "coil_rl.train.run_folder": "read_config",
+    "coil_rl.train.trust": "trust_packages",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -10,9 +13,13 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.errors import UserError
 from coil_rl.train.build import build_bare_env, build_transforms
 from coil_rl.train.load import load_policy
 from coil_rl.train.run_folder import read_config
+
+LONGEST_CHAIN = 4  # learned guides of learned guides
+_loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
 
 
 class LearnedGuide(TensorDictModuleBase):
@@ -24,19 +31,20 @@ class LearnedGuide(TensorDictModuleBase):
         device: device of the networks.
 
     Raises:
-        UserError: if the folder holds no finished run.
+        UserError: if the folder holds no finished run, or one that is its own guide.
         ValueError: if the run has no policy (method=guide).
     """
 
     def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
         super().__init__()
-        folder = Path(run).expanduser()
+        folder = Path(os.path.expanduser(run))
         config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
-        # The transforms need the specs of an env; some need at least two rows.
-        env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
-        self.policy, self.transforms = load_policy(folder, config, env, which), None
+        with _guarded(folder):
+            # The transforms need the specs of an env; some need at least two rows.
+            env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
+            self.policy, self.transforms = load_policy(folder, config, env, which), None
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
         if config.method.needs_guide or config.action:
             self.transforms = env.transform
@@ -56,3 +64,18 @@ class LearnedGuide(TensorDictModuleBase):
         if self.transforms is not None:
             data = self.transforms.inv(data)
         return tensordict.set("action", data["action"])
+
+
+@contextmanager
+def _guarded(folder: Path) -> Iterator[None]:
+    """Refuse a run that is already being loaded as a guide, and too long a chain of them."""
+    place = folder.resolve()
+    if place in _loading:
+        raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
+    if len(_loading) == LONGEST_CHAIN:
+        raise UserError(f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a shorter one")
+    _loading.append(place)
+    try:
+        yield
+    finally:
+        _loading.pop()

@@ -5,10 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Self
-from zipfile import BadZipFile
 
 import numpy as np
-import skops.io
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone, is_regressor
@@ -20,6 +18,7 @@ from torchrl.modules import MLP
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
+from coil_rl.imitation import archive
 from coil_rl.learners.networks import mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -176,19 +175,27 @@ class SklearnRegressor(Regressor):
     def get_extra_state(self) -> Tensor:
         """Return the fitted regressor as bytes, [n] uint8; empty before the first fit."""
         if self._archive is None:
-            content = skops.io.dumps(self.model)
-            _trusted_types(content)
-            self._archive = torch.frombuffer(bytearray(content), dtype=torch.uint8)
+            self._archive = torch.frombuffer(bytearray(archive.dump(self.model)), dtype=torch.uint8)
         return self._archive
 
     def set_extra_state(self, state: Tensor) -> None:
         """Restore a fitted regressor; raises a `UserError` if that could run code or if the bytes do not fit."""
-        archive = state.cpu()
-        self.model = _load(archive.numpy().tobytes()) if len(archive) else None
-        inputs = getattr(self.model, "n_features_in_", self.inputs)
+        content = state.cpu()
+        model = archive.load(content.numpy().tobytes()) if len(content) else None
+        inputs = getattr(model, "n_features_in_", self.inputs)
         if inputs != self.inputs:
             raise UserError(f"the state holds a regressor of {inputs} inputs, but there are {self.inputs} here")
-        self._archive = archive
+        if model is not None:
+            try:
+                prediction = _predict(model, np.zeros((1, self.inputs), np.float32))
+                usable = np.size(prediction) == self.outputs and np.isfinite(prediction).all()
+            except Exception as error:
+                raise UserError(f"the state holds a regressor that cannot predict ({type(error).__name__})") from error
+            if not usable:
+                raise UserError(
+                    f"the state holds a regressor that does not predict {self.outputs} numbers; train again"
+                )
+        self.model, self._archive = model, content
 
 
 def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floating]:
@@ -203,21 +210,3 @@ def _with_parameter(estimator: BaseEstimator, name: str, change: Callable[[objec
     """Change a parameter of an estimator and of the estimators inside it."""
     values = {key: value for key, value in estimator.get_params().items() if key.split("__")[-1] == name}
     return estimator.set_params(**{key: change(value) for key, value in values.items()})
-
-
-def _trusted_types(content: bytes) -> list[str]:
-    """Return the types of an archive that skops does not trust by default, all of which must be from scikit-learn."""
-    types: list[str] = skops.io.get_untrusted_types(data=content)
-    unknown = sorted(name for name in types if not name.startswith("sklearn."))
-    if unknown:
-        raise UserError(f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor")
-    return types
-
-
-def _load(content: bytes) -> BaseEstimator:
-    try:
-        return skops.io.loads(content, trusted=_trusted_types(content))
-    except (BadZipFile, KeyError, ValueError) as error:
-        raise UserError(
-            f"the state is not a regressor of scikit-learn ({type(error).__name__}); train again"
-        ) from error

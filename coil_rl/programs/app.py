@@ -32,6 +32,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.train  # noqa: F401  registers the root configurations
 from coil_rl.errors import UserError, sentence
+from coil_rl.train.trust import trust_packages
 
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 
@@ -80,6 +81,7 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
         try:
+            trust_packages(config.get("trust", []), config)
             check(config)
             return task(config)
         except (UserError, OmegaConfBaseException) as error:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.programs import app
+from coil_rl.train.config import TrainConfig
+from coil_rl.train.trust import trust_packages
 
 
 def train(config: DictConfig) -> float:
@@ -24,14 +26,20 @@ def resume(folder: Path) -> float:
     """Finish a run that was stopped, and return the same as `train`.
 
     Raises:
-        UserError: if the folder holds no run, or one that cannot be resumed.
+        UserError: if the folder holds no run, or one that cannot be resumed or would write outside of its folder.
     """
     from coil_rl.train.run import resume_run
     from coil_rl.train.run_folder import locked, read_config
 
     config = read_config(folder, "resume")
     folder = folder.absolute()
+    if link := next((path for path in folder.rglob("*") if path.is_symlink()), None):
+        raise UserError(
+            f"{link} is a link, so that the run could write outside of its folder; put the file in its place"
+        )
     config.run_dir = str(folder)
+    if config.proxy:
+        config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
     with locked(folder):
         return resume_run(config, folder)
 
@@ -45,9 +53,12 @@ def main() -> None:
         return
     # Without Hydra, which would compose another configuration and make another folder.
     with app.program("train"):
-        if len(arguments) > 1:
-            others = " ".join(argument for argument in arguments if argument != resumed)
-            raise UserError(f"{resumed} must be the only argument: the run has its own config.yaml; leave out {others}")
+        trust = [argument for argument in arguments if argument.startswith("trust=")]
+        if others := " ".join(argument for argument in arguments if argument not in (resumed, *trust)):
+            raise UserError(
+                f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml; leave out {others}"
+            )
+        trust_packages(OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(trust)).trust)
         resume(Path(resumed.removeprefix("resume=")).expanduser())
 
 

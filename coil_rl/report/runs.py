@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pandas as pd
 import yaml
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.errors import UserError
+from coil_rl.train.trust import read_yaml
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "track")
@@ -80,7 +81,7 @@ def _is_run(config: Path, folder: Path) -> bool:
 def _read_run(folder: Path) -> Run:
     path = folder / "config.yaml"
     try:
-        config = OmegaConf.load(path)
+        config = read_yaml(path)
         if not isinstance(config, DictConfig):
             raise ValueError("a list")
         run = Run(folder, str(config["label"]), int(config["seed"]), config["method"]["needs_guide"])

@@ -18,7 +18,7 @@ from pydantic_core import core_schema
 
 LARGEST = 2**63 - 1
 # Keys in which two runs with the same numbers may differ.
-IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults")
+IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust")
 
 
 def one_of(*choices: str) -> GetPydanticSchema:
@@ -104,6 +104,7 @@ class DrivingConfig(ProgramConfig):
     seed: Seed = 0
     device: str = "cpu"
     threads: Threads = 2
+    trust: list[str] = field(default_factory=list)
     run_dir: str = MISSING
 
 
@@ -164,6 +165,7 @@ class ReplayConfig(ProgramConfig):
     seed: Seed = 0
     device: str = "cpu"
     threads: Threads = 1
+    trust: list[str] = field(default_factory=list)
     run_dir: str = MISSING
 
 

@@ -26,8 +26,11 @@ def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "la
     """
     learner = build_learner(config, env, load_guides(folder, config) if trains_guides(config) else None)
     path = weights_file(folder, which)
+    state = checkpoint.load(path, config.device)
     try:
-        learner.policy.load_state_dict(checkpoint.load(path, config.device))
+        learner.policy.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
     except (RuntimeError, TypeError, AttributeError) as error:
         raise UserError(
             f"{path} does not fit the networks in {folder / 'config.yaml'}; one of them was changed after the run"
@@ -67,5 +70,7 @@ def load_guides(folder: Path, config: DictConfig) -> dict[str, TensorDictModuleB
         proxy = folder / PROXIES / name
         if proxy.exists():
             proxy_config = read_config(proxy, f"the proxy of guide.{name}", {"device": config.device})
+            if trains_guides(proxy_config):
+                raise UserError(f"{proxy} trains guides itself, but a proxy imitates one; train the run again")
             guides[name] = load_policy(proxy, proxy_config, build_env(proxy_config))
     return guides

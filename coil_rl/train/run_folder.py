@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from coil_rl.errors import UserError, sentence
 from coil_rl.files import remove_unfinished, whole_file, write_text
 from coil_rl.train.config import IGNORED_KEYS, TrainConfig
+from coil_rl.train.trust import check_config, read_yaml
 
 PACKAGES = (
     "coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "stable-baselines3", "numpy", "scipy",
@@ -51,7 +52,8 @@ def begin(config: DictConfig, folder: Path) -> None:
             "or choose another folder with hydra.run.dir=FOLDER"
         )
     write_text(folder / "versions.json", json.dumps(versions(), indent=2))
-    saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    saved: Any = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    saved.pop("trust", None)  # it holds for one command
     # Loggers write into `run_dir`, which may be another folder when the run is resumed.
     saved.logger = OmegaConf.to_container(config.logger) if config.logger else None
     with whole_file(folder / "config.yaml") as unfinished:
@@ -63,21 +65,24 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
 
     `key` is the key of the calling program that names the folder, for the message.
 
+    The folder may come from anybody; `trust_packages` names packages that it may use.
+
     Raises:
-        UserError: if the folder holds no run, or its configuration cannot be read.
+        UserError: if the folder holds no run, or its configuration cannot be read or could run code.
     """
     path = folder / "config.yaml"
     if not path.is_file():
         raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
     try:
-        saved = OmegaConf.load(path)
+        saved = read_yaml(path)
         if not isinstance(saved, DictConfig):
             raise UserError(f"{path} is not the configuration of a run, but a list")
+        check_config(saved, path)
         for name, value in (changes or {}).items():
             saved[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
         OmegaConf.to_container(config, throw_on_missing=True)
-    except (OmegaConfBaseException, yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
     return config
 

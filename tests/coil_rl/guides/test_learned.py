@@ -1,9 +1,13 @@
+import shutil
+
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 from run_folders import make_untrained_run
 
-from coil_rl.guides.learned import LearnedGuide
+from coil_rl.errors import UserError
+from coil_rl.guides.learned import LONGEST_CHAIN, LearnedGuide
 from coil_rl.programs.evaluate import restore
 from coil_rl.testing import check_guide
 from coil_rl.train.build import build_env, build_guides
@@ -48,3 +52,24 @@ def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
     with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):
         LearnedGuide(str(run))
+
+
+def guided_by(run, guide):
+    """Replace the guide of a run by the policy of another one."""
+    config = OmegaConf.load(run / "config.yaml")
+    guides = {"learned": {"_target_": "coil_rl.guides.learned.LearnedGuide", "run": str(guide)}}
+    config.guide = config.method.transforms.advice.guides = guides
+    OmegaConf.save(config, run / "config.yaml")
+
+
+@pytest.mark.parametrize("length", [1, 3, LONGEST_CHAIN + 1])
+def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
+    make_untrained_run(tmp_path / "0", *TINY, "method=coil")
+    for number in range(1, length):
+        shutil.copytree(tmp_path / "0", tmp_path / str(number))
+    for number in range(length):
+        guided_by(tmp_path / str(number), tmp_path / str((number + 1) % length))
+    message = "is its own guide" if length <= LONGEST_CHAIN else f"a chain of more than {LONGEST_CHAIN} learned guides"
+    for _ in range(2):  # the first refusal leaves nothing behind
+        with pytest.raises(UserError, match=message):
+            LearnedGuide(str(tmp_path / "0"))

@@ -158,7 +158,7 @@ def run(tmp_path_factory):
     """The folder of a run with an untrained policy."""
     folder = tmp_path_factory.mktemp("run")
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*TINY, f"run_dir={folder}"])
+        config = compose("train", [*TINY, "logger=none", f"run_dir={folder}"])
     policy = build_learner(config, build_env(config)).policy
     checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
     OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml")

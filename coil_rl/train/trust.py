@@ -1,0 +1,183 @@
+"""The gate for received run folders: what a `config.yaml` that somebody else may have written can name.
+
+Instantiating a configuration calls whatever its `_target_` keys name. So each of them must be on a list of full names
+before anything is imported:
+
+- what the shipped configuration names in the groups of a run, also as an alternative in a comment: a part that has its
+  YAML file is on the list;
+- the estimators of scikit-learn and the transforms and loggers of TorchRL that are named here;
+- what the configuration of the command itself names, because the command uses it anyway;
+- anything that is defined in a package that the user trusts.
+
+A constructor on the list may read a file that its arguments name, but must not write one. `docs/trust.md` has the trust
+model.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+import yaml
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from coil_rl.errors import UserError, did_you_mean
+from coil_rl.train.config import TrainConfig
+
+LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
+DEEPEST = 32  # levels
+ENTRY_POINTS = "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
+# Their functions run any code or write any file.
+NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
+    "coil_rl", "hydra", "joblib", "numpy", "omegaconf", "pandas", "scipy", "sympy", "tensordict", "torch",
+}  # fmt: skip
+
+ESTIMATORS = {
+    "compose": "TransformedTargetRegressor",
+    "cross_decomposition": "CCA PLSCanonical PLSRegression",
+    "dummy": "DummyRegressor",
+    "ensemble": "AdaBoostRegressor BaggingRegressor ExtraTreesRegressor GradientBoostingRegressor "
+    "HistGradientBoostingRegressor RandomForestRegressor StackingRegressor VotingRegressor",
+    "gaussian_process": "GaussianProcessRegressor",
+    "kernel_ridge": "KernelRidge",
+    "linear_model": "ARDRegression BayesianRidge ElasticNet ElasticNetCV GammaRegressor HuberRegressor Lars LarsCV "
+    "Lasso LassoCV LassoLars LassoLarsCV LassoLarsIC LinearRegression MultiTaskElasticNet MultiTaskElasticNetCV "
+    "MultiTaskLasso MultiTaskLassoCV OrthogonalMatchingPursuit OrthogonalMatchingPursuitCV PassiveAggressiveRegressor "
+    "PoissonRegressor QuantileRegressor RANSACRegressor Ridge RidgeCV SGDRegressor TheilSenRegressor TweedieRegressor",
+    "model_selection": "GridSearchCV GroupKFold KFold RandomizedSearchCV ShuffleSplit",
+    "multioutput": "MultiOutputRegressor RegressorChain",
+    "neighbors": "KNeighborsRegressor RadiusNeighborsRegressor",
+    "neural_network": "MLPRegressor",
+    "pipeline": "FeatureUnion Pipeline",
+    "preprocessing": "MaxAbsScaler MinMaxScaler Normalizer PolynomialFeatures PowerTransformer QuantileTransformer "
+    "RobustScaler SplineTransformer StandardScaler",
+    "svm": "LinearSVR NuSVR SVR",
+    "tree": "DecisionTreeRegressor ExtraTreeRegressor",
+}
+LOGGERS = "torchrl.record.loggers."
+NAMED = frozenset(
+    [f"sklearn.{module}.{name}" for module, names in ESTIMATORS.items() for name in names.split()]
+    + [f"torchrl.envs.{name}" for name in ("CatFrames", "ClipTransform", "DoubleToFloat", "ObservationNorm",
+       "RewardClipping", "RewardScaling", "StepCounter", "TimeMaxPool", "VecNorm")]
+    + [f"{LOGGERS}{name}" for name in ("CSVLogger", "TensorboardLogger")]
+)  # fmt: skip
+
+_packages: frozenset[str] = frozenset()  # of the option `trust`
+_own: frozenset[str] = frozenset()  # targets in the configuration of the command
+
+
+def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
+    """Trust packages in every folder that this process reads from here on, and only these.
+
+    Args:
+        packages: top-level names. The folder may call everything that is defined in them.
+        command: configuration that the user composed; the targets that it names are trusted too.
+
+    Raises:
+        UserError: for what is not the name of a package, or a package that is never trusted.
+    """
+    global _packages, _own
+    names = list(packages)
+    for name in names:
+        if not name.isidentifier():
+            raise UserError(f"trust=[{name}] must be a list of names of installed packages, such as trust=[my_package]")
+        if name in NEVER_TRUSTED:
+            raise UserError(f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part")
+    container = OmegaConf.to_container(command) if command is not None else None
+    _packages = frozenset(names)
+    _own = frozenset(value for _, _, key, value in _entries(container) if key == "_target_" and isinstance(value, str))
+
+
+def read_yaml(path: Path) -> DictConfig | ListConfig:
+    """Read a YAML file that stays as small in memory as on the disk.
+
+    Raises:
+        UserError: if it is larger or deeper than any configuration of a run, or refers to parts of itself.
+    """
+    if (size := path.stat().st_size) > LARGEST_FILE:
+        raise UserError(f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}")
+    depth = 0
+    for event in yaml.parse(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader):
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent):
+            raise UserError(f"{path} repeats a part of itself by *{event.anchor:.40}; write the part out")
+        if depth > DEEPEST:
+            raise UserError(f"{path} has more than {DEEPEST} levels; no configuration of a run has")
+    return OmegaConf.load(path)
+
+
+def check_config(config: DictConfig, path: Path) -> None:
+    """Raise a `UserError` for anything in the configuration of a folder that could run code or write elsewhere.
+
+    Nothing is resolved, and nothing is imported but packages that the user trusts.
+    """
+    for name, parent, key, value in _entries(OmegaConf.to_container(config)):
+        named = key if not name.startswith("defaults[") else ""  # Hydra's list names groups by paths
+        if re.search(r"[/\\]", str(value if name == "label" else named)):
+            raise UserError(f"{path}: {name:.100} must not contain / or \\, because files are named by it")
+        if key == "_target_":
+            _check_target(value, name, parent, path)
+        elif str(key).startswith("_") and key != "_partial_":
+            raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
+        if (key == "memory" or str(key).endswith("__memory")) and value is not None:
+            raise UserError(f"{path}: {name:.100} names a cache, whose files can run code; set it to null")
+        # Only the logger is saved with references, and none to itself, so that they cannot grow.
+        known = r"\$\{(?!logger\b)\w[\w.]*\}" if name.startswith("logger.") and key != "_target_" else r"(?!)"
+        if isinstance(value, str) and "${" in re.sub(known, "", value):
+            raise UserError(f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place")
+
+
+def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any], Any, Any]]:
+    """Yield full key, parent, key and value of each entry of nested mappings and lists."""
+    parent = node if isinstance(node, Mapping) else dict(enumerate(node)) if isinstance(node, list) else {}
+    for key, value in parent.items():
+        full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
+        yield full, parent, key, value
+        yield from _entries(value, full)
+
+
+def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
+    refusal = f"{path}: {name:.100} names {target!r:.100}"
+    package = target.partition(".")[0] if isinstance(target, str) else ""
+    if not package.isidentifier():
+        raise UserError(f"{refusal}, which is not the full name of a class; give one")
+    allowed = NAMED | _shipped_targets() | _own
+    if target in allowed and not target.startswith(LOGGERS):
+        return
+    if package not in NEVER_TRUSTED and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names:
+        try:
+            origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(".")[0]
+        except Exception as error:
+            raise UserError(f"{refusal}, which {package} does not have; check that the package is installed") from error
+        if origin != package:
+            raise UserError(f"{refusal}, which is defined elsewhere; name the package that defines it")
+    elif target in allowed:
+        plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
+        if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
+            raise UserError(
+                f"{refusal}, which may only be the logger, with log_dir: ${{run_dir}} and a plain exp_name, "
+                "because a run writes only into its own folder; trust=[torchrl] on the command line allows it"
+            )
+    elif package in NEVER_TRUSTED:
+        similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
+        raise UserError(f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}")
+    else:
+        raise UserError(
+            f"{refusal}, which could run code; if you know the folder and the package, "
+            f"allow it with trust=[{package:.100}] on the command line"
+        )
+
+
+@cache
+def _shipped_targets() -> frozenset[str]:
+    conf = resources.files("coil_rl.conf")
+    groups = [group for field in fields(TrainConfig) if (group := conf / field.name).is_dir()]
+    texts = [file.read_text(encoding="utf-8") for group in groups for file in group.iterdir() if ".yaml" in file.name]
+    return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))
