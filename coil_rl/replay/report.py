@@ -17,7 +17,7 @@ from coil_rl.report import markdown_table, style
 NOTES = """
 Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
 |omega|. from X: mean |a - x|. No policy controlled the drive: each action is the policy's choice at a scan of a drive
-that went another way. recorded: the recorded commands, as actions with the same turn rate."""
+that went another way. recorded: the steering that the last command before the next scan means at its speed."""
 
 
 def describe(result: OpenLoop) -> str:

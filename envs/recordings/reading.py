@@ -85,6 +85,31 @@ class Recording:
             return _integrate_commands(*self.commands, self.log_time)
         return np.zeros((len(self.log_time), 3))
 
+    def commands_of_scans(self, nominal_speed: float) -> Floats:
+        """Return the command of each scan, [N, 2] m/s, radians/s; NaN before the first command.
+
+        It is the last command before the next scan: a controller needs time for a scan, and a program that sends
+        commands at a higher rate repeats the old one meanwhile. The speed is the command's own, with which its turn
+        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s.
+
+        Raises:
+            ValueError: if the recording has no commands.
+        """
+        if self.commands is None:
+            raise ValueError(f"{self.path} has no commands; check that commands is not None")
+        commands, times = self.commands
+        last = np.searchsorted(times, np.append(self.log_time[1:], np.iinfo(np.int64).max)) - 1
+        rows = np.where(last[:, None] < 0, np.nan, commands[last])
+        if not commands[:, 0].any():
+            rows[:, 0] = nominal_speed if self.odometry is None else self._measured_speeds()
+        return rows
+
+    def _measured_speeds(self) -> Floats:
+        """Return the speed from each scan to the next one by odometry, [N] m/s."""
+        poses, seconds = self.poses(), self.seconds
+        path, time = np.hypot(*np.diff(poses[:, :2], axis=0).T), np.diff(seconds)
+        return np.append(np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0)
+
 
 def read_recording(
     path: str | os.PathLike[str],

@@ -92,7 +92,7 @@ class McapReplayEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
         self.kept_cones, self.scale, self.moves = kept_cones, scale, remembered == "moved"
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
-        self.turn_rate = speed / car_length
+        self.speed, self.car_length = speed, car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         self._load(perception)
         self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
@@ -175,7 +175,10 @@ class McapReplayEnv(EnvBase):
             "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {"steering": steering, "omega": (steering * self.max_steering).sin() * self.turn_rate}
+        entries |= {
+            "steering": steering,
+            "omega": (steering * self.max_steering).sin() * (self.speed / self.car_length),
+        }
         entries |= {"info": TensorDict(info, self.batch_size, device=self.device)}
         return TensorDict(entries, self.batch_size, device=self.device)
 

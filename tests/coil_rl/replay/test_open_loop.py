@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 
 from coil_rl.envs import McapReplayEnv, Recording
 from coil_rl.guides import ConstantGuide
-from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop
+from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop, recorded_steering
 from coil_rl.replay.report import describe, disagreement, extent, outcome
 
 TURN_RATE, MAX_STEERING = 0.15 / (2 / 7), math.radians(80)
@@ -50,12 +50,12 @@ def test_smoothness_and_omega_are_those_of_the_cone_world():
     [
         ([0, 100, 200, 300], [0.1, 0.2, 0.3, 0.4]),  # at the times of the scans
         ([30, 130, 230, 330], [0.1, 0.2, 0.3, 0.4]),  # a little later
-        ([30, 60, 230, 250], [0.1, 0.2, 0.3, 0.4]),  # the first after a scan, else the last before it
-        ([110, 120, 130, 140], [math.nan, 0.1, 0.4, 0.4]),  # unknown before the first
+        ([30, 60, 230, 250], [0.2, 0.2, 0.4, 0.4]),  # the last before the next scan
+        ([110, 120, 130, 140], [math.nan, 0.4, 0.4, 0.4]),  # unknown before the first
         ([-90, -80, -70, -60], [0.4, 0.4, 0.4, 0.4]),
     ],
 )
-def test_command_of_a_scan_is_the_first_one_until_the_next_scan(times, expected):
+def test_command_of_a_scan_is_the_last_one_before_the_next_scan(times, expected):
     [result] = run(recording([0.1, 0.2, 0.3, 0.4], times), ConstantGuide(0.0))
     np.testing.assert_array_equal(result.steering[RECORDED].omega, expected)
 
@@ -67,6 +67,17 @@ def test_recorded_action_has_the_recorded_turn_rate_or_is_the_maximum():
     [result] = run(recording(omegas, [0, 100, 200, 300]), ConstantGuide(0.0))
     np.testing.assert_allclose(result.steering[RECORDED].action, action, atol=1e-12)
     assert result.steering[RECORDED].omega[2] == 3.0
+
+
+def test_scans_before_the_first_command_are_left_out_and_a_stop_is_straight():
+    two, speeds = recording([0.15, 0.3], [110, 210], scans=5), np.array([[0.3, 0.15], [0.0, 0.15]])
+    vars(two)["commands"] = speeds, two.commands[1]
+    steering = recorded_steering(two, 0.15, 2 / 7, MAX_STEERING)
+    action = math.asin(0.15 / 0.3 * 2 / 7) / MAX_STEERING
+    np.testing.assert_allclose(steering.action, [math.nan, action, 0, 0, 0])
+    assert steering.smoothness[1] == steering.action[1]
+    with pytest.raises(ValueError, match="has no commands"):
+        recorded_steering(recording(), 0.15, 2 / 7, MAX_STEERING)
 
 
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
