@@ -39,10 +39,10 @@ def describe(result: OpenLoop) -> str:
 
 
 def extent(result: OpenLoop) -> str:
-    """Return the number of scans, their duration, and the share with both boundaries valid."""
+    """Return the number of scans, their duration, the share with both boundaries valid, and remarks on the file."""
     scans, seconds = len(result.both_valid), result.recording.seconds[-1]
-    cut = ", all that can be read of a file that is cut off" if result.recording.cut_off else ""
-    return f"{scans} scans in {seconds:.1f} s{cut}; both boundaries valid in {result.both_valid.mean():.0%} of them"
+    text = f"{scans} scans in {seconds:.1f} s; both boundaries valid in {result.both_valid.mean():.0%} of them"
+    return "; the file ".join([text, *result.recording.remarks])
 
 
 def notes(max_steering: float) -> str:

@@ -27,7 +27,7 @@ def recording(omegas=(), times=(), scans=4, period=100, **options):
     if len(omegas):
         options["commands"] = np.stack([np.full(len(omegas), 0.15), omegas], axis=1), np.array(times)
     ranges, points = np.ones((scans, 9), np.float32), ones.astype(int) * 9
-    return Recording(Path("drive.mcap"), False, scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
+    return Recording(Path("drive.mcap"), scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
 
 
 def run(recordings, *guides, **options):
@@ -92,12 +92,12 @@ def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     assert names == ["0"] * 4 + ["1"] * 4
 
 
-def result_of(cut_off=False, **actions):
+def result_of(remarks=(), **actions):
     """A result with given actions; both sides are valid in the first and the last of 4 scans."""
     steering = {name: Steering(a, a / 2, np.abs(a) / 4) for name, a in ((n, np.array(x)) for n, x in actions.items())}
     valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
     one = recording(period=10**9, notes={"simulated": {}})
-    vars(one)["cut_off"] = cut_off
+    vars(one)["remarks"] = remarks
     arrays = np.zeros((4, 2, 1, 2)), np.zeros((4, 2)), np.zeros((4, 20))
     return OpenLoop(one, *arrays, valid, steering, MAX_STEERING)
 
@@ -128,4 +128,4 @@ def test_table_has_a_row_and_a_column_per_policy(result):
         ["both", "0.250", "0.500", "1.000", "-", "1.167"],
         ["recorded", "0.042", "0.083", "0.833", "1.167", "-"],
     ]
-    assert "3.0 s, all that can be read of a file that is cut off" in extent(result_of(cut_off=True))
+    assert extent(result_of(["is cut off", "is odd"])).endswith("50% of them; the file is cut off; the file is odd")
