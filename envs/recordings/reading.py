@@ -196,23 +196,18 @@ def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remark
         scanner = message.header.frame_id, message.range_min, message.range_max
         if math.isnan(message.range_min + message.range_max):
             raise ValueError("its smallest or greatest range is not a number")
-        angles = message.angle_min, message.angle_increment
-        return stamp_of(message), scanner, angles, np.asarray(message.ranges, np.float32)
+        ranges = np.asarray(message.ranges, np.float32)
+        return stamp_of(message), scanner, (message.angle_min, message.angle_increment), ranges
 
     log_time, messages = _decoded(path, topic, contents, fields)
-    _check_finite(
-        path,
-        topic,
-        log_time,
-        np.array([row[2] for row in messages]),
-        "the angle of its first range, or between ranges,",
-    )
+    angles = np.array([row[2] for row in messages])
+    _check_finite(path, topic, log_time, angles, "the angle of its first range, or between ranges,")
     # Recordings that were converted from ROS 1 name the program that sent a message.
     senders = (dict(message.channel.metadata).get("callerid", "") for message in contents.messages[topic])
     scanners = [(*row[1], sender) for row, sender in zip(messages, senders, strict=True)]
     chosen = _choose_scanner(path, topic, scanners, frame, remarks)
     kept = [row for row, scanner in enumerate(scanners) if scanner == chosen]
-    stamps, _, angles, scans = zip(*(messages[row] for row in kept), strict=True)
+    stamps, _, _, scans = zip(*(messages[row] for row in kept), strict=True)
     points = np.array([len(scan) for scan in scans])
     if not points.any():
         raise RecordingError(
@@ -223,10 +218,9 @@ def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remark
         row[: len(scan)] = scan
     range_min, range_max = np.float32(chosen[1]), np.float32(chosen[2])
     ranges[~((ranges >= range_min) & (ranges <= range_max))] = np.inf
-    angle_min, angle_increment = np.array(angles).T
     return {
         "log_time": log_time[kept], "stamp": np.array(stamps), "ranges": ranges, "points": points,
-        "angle_min": angle_min, "angle_increment": angle_increment, "frame": chosen[0],
+        "angle_min": angles[kept, 0], "angle_increment": angles[kept, 1], "frame": chosen[0],
     }  # fmt: skip
 
 
@@ -235,12 +229,10 @@ def _choose_scanner(
 ) -> Scanner:
     """Return the first scanner, or the first one with this frame; add a remark if there are others to choose from."""
     scans = Counter(scanners)
-    frames = list(dict.fromkeys(scanner[0] for scanner in scans))
     candidates = [scanner for scanner in scans if frame in (None, scanner[0])]
     if not candidates:
-        raise RecordingError(
-            f"{path}, topic {topic} has no scan with the frame {frame}; give frame={' or '.join(frames)}."
-        )
+        frames = " or ".join(dict.fromkeys(scanner[0] for scanner in scans))
+        raise RecordingError(f"{path}, topic {topic} has no scan with the frame {frame}; give frame={frames}.")
     if len(candidates) > 1:
         names = ", ".join(
             f"{' of '.join(filter(None, (name, sender))) or 'no frame'} ({count} scans to {high:g} m)"
