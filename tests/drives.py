@@ -3,9 +3,11 @@
 import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
+from rosbags import rosbag2
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, twist
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, ros_types, twist
 
 PERIOD = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
@@ -49,6 +51,24 @@ def store(path, *messages, kind=SCAN, topic="/scan", **channel):
             data = message if isinstance(message, bytes) else encode(kind, message)
             writer.copy(RawMessage(Channel(topic, kind, **({"definition": standard} | channel)), time, time, data))
     return path
+
+
+def rosbag_of(folder, *messages, latched=()):
+    """A recording by the writer of rosbags: of messages with topic, type, time and fields; and with latched topics."""
+    transient = QosDurability.TRANSIENT_LOCAL
+    always = QosTime(2147483647, 4294967295)
+    qos = Qos(
+        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, transient, always, always,
+        QosLiveliness.AUTOMATIC, always, False,
+    )  # fmt: skip
+    topics = {}
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+        for topic, kind, time, fields in messages:
+            if topic not in topics:
+                profiles = [qos] if topic in latched else []
+                topics[topic] = writer.add_connection(topic, kind, typestore=ros_types(), offered_qos_profiles=profiles)
+            writer.write(topics[topic], time, encode(kind, fields))
+    return folder
 
 
 def uncompressed(path):

@@ -36,7 +36,7 @@ def replay(config: DictConfig) -> None:
 
     torch.set_num_threads(config.threads)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # the report mentions recordings that are cut off
+        warnings.simplefilter("ignore", UserWarning)  # the report has the remarks on the recordings
         env = build(config.env, "env", McapReplayEnv)
     _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
 from coil_rl.envs.recordings.messages import TWIST, header, twist
-from coil_rl.envs.recordings.reading import SIMULATED
 from coil_rl.envs.robot.course import THICK, THIN
 from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
 from coil_rl.envs.track import SIDES
@@ -28,6 +27,7 @@ DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
 CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
 FADED = 0.3  # opacity of a boundary from the memory
 
+ROSBAG2 = "rosbag2"  # metadata record with the numbers of messages in the original, which the copy does not have
 TRANSFORMS = ("/tf", "/tf_static")
 POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
 
@@ -48,8 +48,9 @@ def annotate(
     """Write a recording with the steering of each policy and the perceived cones and boundaries.
 
     Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue
-    right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers are in the
-    scanner's frame. A boundary from the memory is faded. Equal results make equal bytes.
+    right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers have the stamp
+    and the frame of the scan. A boundary from the memory is faded. Metadata and attachments are copied. Equal results
+    make equal bytes.
 
     Args:
         result: of one recording.
@@ -71,8 +72,12 @@ def annotate(
         for messages in contents.messages.values():
             for message in messages:
                 writer.copy(message)
-        if SIMULATED in contents.notes:
-            writer.describe(SIMULATED, contents.notes[SIMULATED])
+        for name, entries in contents.notes.items():
+            if name != ROSBAG2:
+                writer.describe(name, entries)
+        for name, attachment in contents.attachments.items():
+            created_and_logged = attachment.create_time, attachment.log_time
+            writer.attach(name, attachment.media_type, attachment.data, created_and_logged)
         for policy in result.policies:
             steering = result.steering[policy]
             angles = steering.action * result.max_steering
@@ -90,8 +95,9 @@ def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale
     to_laser = np.array([[cos, -sin], [sin, cos]]) / scale
     lines, cones = _boundaries(result.observation) @ to_laser, result.cones @ to_laser
     ever_valid = np.logical_or.accumulate(result.valid, axis=0)
-    for row, time in enumerate(result.recording.log_time.tolist()):
-        top = header(time, result.recording.frame)
+    recording = result.recording
+    for row, (time, stamp) in enumerate(zip(recording.log_time.tolist(), recording.stamp.tolist(), strict=True)):
+        top = header(stamp, recording.frame)
         cone_markers = [{"header": top, "action": DELETE_ALL}]
         line_markers = [{"header": top, "action": DELETE_ALL}]
         for side, name in enumerate(SIDES):
@@ -152,4 +158,5 @@ def _plot_lines(path: Mapping[str, Any], result: OpenLoop, command: str | None) 
         ]
     if command is None or RECORDED not in result.steering:
         return []
-    return [{**path, "value": path["value"].replace(COMMAND, command)}]
+    fields = f"{command}.twist" if result.recording.stamped_commands else command
+    return [{**path, "value": path["value"].replace(COMMAND, fields)}]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -24,7 +23,6 @@ STEERING_KEYS = (("next", "steering"), ("next", "omega"), ("next", "info", "smoo
 VIEW_KEYS = ("cones", "cone_count", "observation", ("info", "valid"))
 
 Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 # By name: the replay env with the transforms of the policy, and the policy. All share one replay env.
 Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 
@@ -50,7 +48,7 @@ class OpenLoop:
         cones, count: [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first; and [N, 2].
         observation: [N, 20].
         valid: [N, 2] whether each side is valid in the scan.
-        steering: by policy; `RECORDED` is last if the recording has commands, NaN before the first command.
+        steering: by policy; `recorded_steering` is last, as `RECORDED`, if the recording has commands.
         max_steering: radians of an action of 1.
     """
 
@@ -106,26 +104,26 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
         for name, step in steps.items()
     }
     if recording.commands is not None:
-        turn_rate = env.turn_rate
-        steering[RECORDED] = _recorded(*recording.commands, recording.log_time, turn_rate, env.max_steering)
+        steering[RECORDED] = recorded_steering(recording, env.speed, env.car_length, env.max_steering)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
     return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering)
 
 
-def _recorded(
-    commands: Floats, command_time: Times, scan_time: Times, turn_rate: float, max_steering: float
-) -> Steering:
-    """Return the recorded commands as the steering with the same turn rate at the speed of the replay.
+def recorded_steering(recording: Recording, speed: float, car_length: float, max_steering: float) -> Steering:
+    """Return the recorded commands as steering, NaN before the first command (equations 99 and 100).
 
-    The command of a scan is the first one until the next scan; without one, the last command still holds.
+    See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the steering is straight.
+
+    Args:
+        recording: with commands.
+        speed: m/s of the robot, for a recording without speeds.
+        car_length: m.
+        max_steering: radians of an action of 1.
     """
-    first = np.searchsorted(command_time, scan_time)
-    end = np.append(np.searchsorted(command_time, scan_time[1:]), len(command_time))
-    index = np.where(first < end, first, first - 1)
-    omega = np.where(index < 0, np.nan, commands[index, 1])
-    limit = math.sin(max_steering)
-    action = np.arcsin(np.clip(omega / turn_rate, -limit, limit)) / max_steering
-    before = np.concatenate([np.zeros(HISTORY), action[:-1]])
+    speeds, omega = recording.commands_of_scans(speed).T
+    sine = np.divide(omega * car_length, speeds, out=np.where(np.isnan(omega), np.nan, 0.0), where=speeds != 0)
+    action = (np.arcsin(sine.clip(-1, 1)) / max_steering).clip(-1, 1)
+    before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
     return Steering(action, omega, np.abs(action - recent_mean(torch.from_numpy(history)).numpy()))

@@ -21,7 +21,7 @@ MOST = 0.5  # share of the clusters
 NOTES = """
 Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
 |omega|. from X: mean |a - x|. No policy controlled the drive: each action is the policy's choice at a scan of a drive
-that went another way. recorded: the recorded commands, as actions with the same turn rate."""
+that went another way. recorded: the steering that the last command before the next scan means at its speed."""
 
 
 def describe(result: OpenLoop) -> str:
@@ -43,10 +43,10 @@ def describe(result: OpenLoop) -> str:
 
 
 def extent(result: OpenLoop) -> str:
-    """Return the number of scans, their duration, and the share with both boundaries valid."""
+    """Return the number of scans, their duration, the share with both boundaries valid, and remarks on the file."""
     scans, seconds = len(result.both_valid), result.recording.seconds[-1]
-    cut = ", all that can be read of a file that is cut off" if result.recording.cut_off else ""
-    return f"{scans} scans in {seconds:.1f} s{cut}; both boundaries valid in {result.both_valid.mean():.0%} of them"
+    text = f"{scans} scans in {seconds:.1f} s; both boundaries valid in {result.both_valid.mean():.0%} of them"
+    return "; the file ".join([text, *result.recording.remarks])
 
 
 def caution(result: OpenLoop, perception: object) -> str:

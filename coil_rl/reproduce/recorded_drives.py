@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from coil_rl.envs.recordings.reading import SIMULATED, Recording
-from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_line
-from coil_rl.envs.robot.drives import track_of
+from coil_rl.envs.robot.drives import SPEED, track_of
 from coil_rl.envs.track import Track
+from coil_rl.replay.open_loop import recorded_steering
 from coil_rl.report import style
 from coil_rl.report.style import picture
 
@@ -86,12 +87,8 @@ def smoothness(recording: Recording, car_length: float, max_steering: float) -> 
     """
     if recording.commands is None:
         return np.nan
-    actions = _actions(*recording.commands, recording.log_time, car_length, np.radians(max_steering))
-    history, steps = torch.zeros(HISTORY, 1), []
-    for action in torch.from_numpy(actions).split(1):
-        steps.append((action - recent_mean(history)).abs())
-        history = torch.cat([action.unsqueeze(0), history[:-1]])
-    return float(torch.cat(steps).double().mean())
+    steering = recorded_steering(recording, SPEED, car_length, math.radians(max_steering))
+    return float(np.nanmean(steering.smoothness))
 
 
 def means(rows: Sequence[Row]) -> dict[str, Any]:
@@ -144,19 +141,6 @@ def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], colour: str) -> Non
 
 def _dot(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=5, mfc=colour, mec=style.INK, mew=0.4, label=label)
-
-
-def _actions(
-    commands: Array, times: NDArray[np.int64], scan_times: NDArray[np.int64], car_length: float, max_steering: float
-) -> NDArray[np.float32]:
-    """Return the commanded steering after each scan, [N] as fractions of `max_steering` (equations 99 and 100)."""
-    # The last command before the next scan; the robot stands until the first one.
-    until = np.append(scan_times[1:], np.iinfo(np.int64).max)
-    last = np.searchsorted(times, until) - 1
-    speed, turn_rate = np.where(last[:, None] < 0, 0.0, commands[last]).T
-    sine = np.divide(turn_rate * car_length, speed, out=np.zeros(len(last)), where=speed != 0)
-    actions = np.arcsin(sine.clip(-1, 1)) / max_steering
-    return actions.clip(-1, 1).astype(np.float32)
 
 
 def _timed_poses(recording: Recording) -> tuple[Array, Array]:

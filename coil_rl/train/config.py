@@ -158,6 +158,7 @@ class ReplayConfig(ProgramConfig):
     recording: Any = MISSING
     runs: list[str] = field(default_factory=list)
     policy: WhichPolicy = "last"
+    frame: str | None = None
     strict: bool = False
     preset: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING

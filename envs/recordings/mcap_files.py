@@ -6,12 +6,15 @@ import hashlib
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple, Self
 
 from mcap import records
 from mcap.exceptions import RecordLengthLimitExceeded
-from mcap.stream_reader import StreamReader
+from mcap.reader import SeekingReader
+from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from coil_rl.envs.recordings.messages import definition, encode
@@ -40,13 +43,17 @@ class RecordingError(ValueError):
 
 
 class Channel(NamedTuple):
-    """A topic with its message type and the type's definition; the type is empty if the file has none."""
+    """A topic with its message type and the type's definition; the type is empty if the file has none.
+
+    The metadata are pairs of key and value, such as the quality of service that ROS 2 offers.
+    """
 
     topic: str
     message_type: str
     encoding: str = "cdr"
     language: str = "ros2msg"
     definition: bytes = b""
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class RawMessage(NamedTuple):
@@ -58,30 +65,47 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
-class Contents(NamedTuple):
-    """All channels of a recording, the messages by topic in order of log time, and the metadata records by name."""
+@dataclass
+class Contents:
+    """Contents of a recording.
 
-    channels: list[Channel]
+    Attributes:
+        messages: by topic, in order of log time.
+        channels: of all topics.
+        notes, attachments: metadata records and attachments by name.
+        cut_off: whether a file ends early.
+        damage: the damaged places that were skipped.
+        lost: number of messages that damage made unreadable, by topic; a topic is missing if the number is unknown.
+    """
+
     messages: dict[str, list[RawMessage]]
-    cut_off: bool
-    notes: dict[str, dict[str, str]]
+    channels: list[Channel] = field(default_factory=list)
+    notes: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, records.Attachment] = field(default_factory=dict)
+    cut_off: bool = False
+    damage: list[str] = field(default_factory=list)
+    lost: dict[str, int] = field(default_factory=dict)
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
     """Read a recording from start to end, with its checksums verified.
+
+    One that ends early is read as far as it goes, and damaged chunks are skipped.
 
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
         topics: topics to read; None for all. A missing one has no messages.
 
     Raises:
-        RecordingError: if this is not a recording, or a damaged one. One that ends early is read as far as it goes.
+        RecordingError: if this is not a recording, or one with damage outside of its chunks.
     """
-    contents = Contents([], {topic: [] for topic in topics or ()}, False, {})
-    cut_off = [_read_file(file, topics, contents) for file in _files(Path(path))]
+    contents = Contents({topic: [] for topic in topics or ()})
+    for file in _files(Path(path)):
+        _read_file(file, topics, contents)
     for messages in contents.messages.values():
         messages.sort(key=lambda message: message.log_time)
-    return contents._replace(channels=list(dict.fromkeys(contents.channels)), cut_off=any(cut_off))
+    contents.channels = list(dict.fromkeys(contents.channels))
+    return contents
 
 
 def digest(path: str | os.PathLike[str]) -> str:
@@ -108,7 +132,7 @@ class RecordingWriter:
         self.path = Path(path)
         self._messages: list[RawMessage] = []
         self._metadata: dict[str, dict[str, str]] = {}
-        self._attachments: dict[str, tuple[str, bytes]] = {}
+        self._attachments: dict[str, tuple[str, bytes, tuple[int, int] | None]] = {}
 
     def add(self, topic: str, message_type: str, time: int, fields: Mapping[str, Any]) -> None:
         """Add a message; the time in ns, the type and fields as in `messages.encode`.
@@ -127,9 +151,9 @@ class RecordingWriter:
         """Add a metadata record."""
         self._metadata[name] = dict(sorted(entries.items()))
 
-    def attach(self, name: str, media_type: str, data: bytes) -> None:
-        """Add an attachment, such as a configuration."""
-        self._attachments[name] = media_type, data
+    def attach(self, name: str, media_type: str, data: bytes, times: tuple[int, int] | None = None) -> None:
+        """Add an attachment, such as a configuration; ns of creation and logging, by default of the first message."""
+        self._attachments[name] = media_type, data, times
 
     def __enter__(self) -> Self:
         return self
@@ -153,8 +177,8 @@ class RecordingWriter:
         for name, entries in sorted(self._metadata.items()):
             writer.add_metadata(name, entries)
         start = min((message.log_time for message in self._messages), default=0)
-        for name, (media_type, data) in sorted(self._attachments.items()):
-            writer.add_attachment(start, start, name, media_type, data)
+        for name, (media_type, data, times) in sorted(self._attachments.items()):
+            writer.add_attachment(*(times or (start, start)), name, media_type, data)
 
         schemas: dict[tuple[str, str, bytes], int] = {}
         channels: dict[Channel, int] = {}
@@ -162,53 +186,107 @@ class RecordingWriter:
             schema = (channel.message_type, channel.language, channel.definition)
             if channel.message_type and schema not in schemas:
                 schemas[schema] = writer.register_schema(*schema)
-            channels[channel] = writer.register_channel(channel.topic, channel.encoding, schemas.get(schema, 0))
+            channels[channel] = writer.register_channel(
+                channel.topic, channel.encoding, schemas.get(schema, 0), dict(channel.metadata)
+            )
         for message in sorted(self._messages, key=lambda message: (message.log_time, message.channel)):
             writer.add_message(channels[message.channel], message.log_time, message.data, message.publish_time)
         writer.finish()
 
 
-def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -> bool:
-    """Add the contents of a file; return whether it ends early."""
+def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -> None:
+    """Add the contents of a file."""
     size, complete = _check_format(file)
     selected: dict[int, tuple[Channel, list[RawMessage]]] = {}
     schemas: dict[int, records.Schema] = {}
-    last = None
+    before, damage = {topic: len(messages) for topic, messages in contents.messages.items()}, len(contents.damage)
     with file.open("rb") as stream:
-        reader = StreamReader(stream, validate_crcs=True, record_size_limit=size)
+        for record in _records(file, stream, size, complete, contents):
+            if type(record) is records.Message:
+                if record.channel_id in selected:
+                    channel, messages = selected[record.channel_id]
+                    messages.append(RawMessage(channel, record.log_time, record.publish_time, record.data))
+            elif type(record) is records.Schema:
+                schemas[record.id] = record
+            elif type(record) is records.Channel:
+                channel = _channel(record, schemas)
+                contents.channels.append(channel)
+                if topics is None or channel.topic in topics:
+                    selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
+            elif type(record) is records.Metadata:
+                contents.notes[record.name] = dict(record.metadata)
+            elif type(record) is records.Attachment:
+                contents.attachments[record.name] = record
+        summary = _summary(stream) if len(contents.damage) > damage else Summary()
+    if summary.statistics:
+        written = summary.statistics.channel_message_counts
+        for topic, messages in contents.messages.items():
+            total = sum(
+                written.get(number, 0) for number, channel in summary.channels.items() if channel.topic == topic
+            )
+            read = len(messages) - before.get(topic, 0)
+            contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
+
+
+def _records(
+    file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents
+) -> Iterator[records.McapRecord]:
+    """Yield the records of a file, of its chunks too; skip damaged chunks, and note them and an early end."""
+    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records
+    while True:
+        start, record = stream.tell(), None
         try:
-            for record in reader.records:
-                if type(record) is records.Message:
-                    last = record
-                    if record.channel_id in selected:
-                        channel, messages = selected[record.channel_id]
-                        messages.append(RawMessage(channel, record.log_time, record.publish_time, record.data))
-                elif type(record) is records.Schema:
-                    schemas[record.id] = record
-                elif type(record) is records.Channel:
-                    channel = _channel(record, schemas)
-                    contents.channels.append(channel)
-                    if topics is None or channel.topic in topics:
-                        selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
-                elif type(record) is records.Metadata:
-                    contents.notes[record.name] = dict(record.metadata)
+            record = next(reader, None)
+            if record is None:
+                return
+            parts = breakup_chunk(record, validate_crc=True) if type(record) is records.Chunk else [record]
         except Exception as error:  # damaged bytes raise almost any exception in the libraries below
-            if not complete and (stream.tell() >= size or isinstance(error, RecordLengthLimitExceeded)):
-                return True
-            position = f"byte {stream.tell()}" + (f", after {last.log_time / 1e9:.3f} s" if last else "")
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise RecordingError(
-                f"{file} is damaged before {position} ({reason}); copy it again from where it was "
-                "recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
-            ) from None
-    return False
+            end = stream.tell()
+            if not complete and (end >= size or isinstance(error, RecordLengthLimitExceeded)):
+                contents.cut_off = True
+                return
+            summary = _summary(stream)
+            places = _places(summary)
+            following = [place for place in places if place > start] + ([end] if record else [])
+            # A wrong checksum of the whole file does not tell where the damage is.
+            whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
+            if whole or not (places or following):
+                reason = " ".join(str(error).split()) or type(error).__name__
+                raise RecordingError(
+                    f"{file} is damaged before byte {end} ({reason}); copy it again from where it was "
+                    "recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
+                ) from None
+            contents.damage.append(f"byte {start}")
+            if not following:
+                return
+            stream.seek(min(following))
+            reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=size).records
+            # The damage may hide the channels of the messages that follow.
+            parts = [*summary.schemas.values(), *summary.channels.values()]
+        yield from parts
+
+
+def _summary(stream: BinaryIO) -> Summary:
+    """Return the index at the end of a file, empty if it is missing or damaged."""
+    stream.seek(0)
+    try:
+        return SeekingReader(stream).get_summary() or Summary()
+    except Exception:  # its bytes may be anything
+        return Summary()
+
+
+def _places(summary: Summary) -> list[int]:
+    """Return the places of all chunks, metadata records and attachments in a file."""
+    places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+    places += [metadata.offset for metadata in summary.metadata_indexes]
+    return places + [attachment.offset for attachment in summary.attachment_indexes]
 
 
 def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:
-    if record.schema_id == 0:
-        return Channel(record.topic, "", record.message_encoding, "", b"")
-    schema = schemas[record.schema_id]
-    return Channel(record.topic, schema.name, record.message_encoding, schema.encoding, schema.data)
+    metadata, schema = tuple(record.metadata.items()), schemas.get(record.schema_id)
+    if schema is None:
+        return Channel(record.topic, "", record.message_encoding, "", b"", metadata)
+    return Channel(record.topic, schema.name, record.message_encoding, schema.encoding, schema.data, metadata)
 
 
 def _check_format(file: Path) -> tuple[int, bool]:

@@ -13,6 +13,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 SCAN, ODOMETRY, TWIST = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
 @cache
@@ -77,6 +78,12 @@ def pose_of(message: Any) -> tuple[float, float, float]:
     """Return the pose of an Odometry message in the plane: m, m, radians."""
     position, q = message.pose.pose.position, message.pose.pose.orientation
     return position.x, position.y, math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+
+
+def twist_of(message: Any) -> tuple[float, float]:
+    """Return forward speed in m/s and turn rate in radians/s of a Twist or TwistStamped message."""
+    twist = getattr(message, "twist", message)
+    return twist.linear.x, twist.angular.z
 
 
 @lru_cache(maxsize=16)

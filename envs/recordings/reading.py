@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import os
 import warnings
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,13 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, read_messages
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, decode, pose_of, stamp_of
+from coil_rl.envs.recordings.messages import (
+    ODOMETRY,
+    SCAN,
+    TWIST,
+    TWIST_STAMPED,
+    decode,
+    pose_of,
+    stamp_of,
+    twist_of,
+)
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 REMEDY = "record it again, or correct the program that sent it"
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
+Scanner = tuple[str, float, float, str]  # frame, smallest and greatest range, name of the program that sent its scans
 
 
 @dataclass(frozen=True)
@@ -28,7 +40,6 @@ class Recording:
 
     Attributes:
         path: of the file or folder.
-        cut_off: whether the file ends early.
         log_time: [N] ns, ascending.
         stamp: [N] ns, start of each scan by the scanner's clock.
         ranges: [N, P] m, float32; inf for values that are not finite or outside the scanner's range, and for padding.
@@ -37,11 +48,12 @@ class Recording:
         odometry: poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
         commands: [M, 2] m/s, radians/s, with their log times [M] ns; None without commands.
         frame: of the scanner.
+        stamped_commands: whether the commands are TwistStamped messages.
         notes: metadata records by name.
+        remarks: what the file has, or had, and the arrays lack: "is cut off: 160 scans can be read".
     """
 
     path: Path
-    cut_off: bool
     log_time: Times
     stamp: Times
     ranges: NDArray[np.float32]
@@ -51,7 +63,9 @@ class Recording:
     odometry: tuple[Floats, Times, Times] | None = None
     commands: tuple[Floats, Times] | None = None
     frame: str = "laser"
+    stamped_commands: bool = False
     notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
 
     @property
     def simulated(self) -> bool:
@@ -86,6 +100,31 @@ class Recording:
             return _integrate_commands(*self.commands, self.log_time)
         return np.zeros((len(self.log_time), 3))
 
+    def commands_of_scans(self, nominal_speed: float) -> Floats:
+        """Return the command of each scan, [N, 2] m/s, radians/s; NaN before the first command.
+
+        It is the last command before the next scan: a controller needs time for a scan, and a program that sends
+        commands at a higher rate repeats the old one meanwhile. The speed is the command's own, with which its turn
+        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s.
+
+        Raises:
+            ValueError: if the recording has no commands.
+        """
+        if self.commands is None:
+            raise ValueError(f"{self.path} has no commands; check that commands is not None")
+        commands, times = self.commands
+        last = np.searchsorted(times, np.append(self.log_time[1:], np.iinfo(np.int64).max)) - 1
+        rows = np.where(last[:, None] < 0, np.nan, commands[last])
+        if not commands[:, 0].any():
+            rows[:, 0] = nominal_speed if self.odometry is None else self._measured_speeds()
+        return rows
+
+    def _measured_speeds(self) -> Floats:
+        """Return the speed from each scan to the next one by odometry, [N] m/s."""
+        poses, seconds = self.poses(), self.seconds
+        path, time = np.hypot(*np.diff(poses[:, :2], axis=0).T), np.diff(seconds)
+        return np.append(np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0)
+
 
 def read_recording(
     path: str | os.PathLike[str],
@@ -93,16 +132,20 @@ def read_recording(
     odometry: str | None = "/odom",
     command: str | None = "/cmd_vel",
     *,
+    frame: str | None = None,
     strict: bool = False,
 ) -> Recording:
     """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
+
+    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners.
 
     Args:
         path: of the file or folder.
         scan: topic of the LiDAR.
         odometry: its topic, or None; ignored if the recording does not have it.
-        command: likewise, for the commands.
-        strict: raise for a recording that is cut off, instead of a warning with the number of scans.
+        command: likewise, for the commands, Twist or TwistStamped.
+        frame: of the scanner, if several send scans on one topic; None for the first one.
+        strict: raise for a recording that is cut off or damaged, instead of a warning with the number of scans.
 
     Raises:
         RecordingError: in one sentence, the problem and its remedy.
@@ -118,44 +161,55 @@ def read_recording(
         (3, 360)
     """
     path = Path(path)
-    topics = [(scan, SCAN), *((topic, kind) for topic, kind in ((odometry, ODOMETRY), (command, TWIST)) if topic)]
-    if len(dict(topics)) < len(topics):
+    types: dict[str, tuple[str, ...]] = {scan: (SCAN,)}
+    types |= ({odometry: (ODOMETRY,)} if odometry else {}) | ({command: (TWIST, TWIST_STAMPED)} if command else {})
+    if len(types) < 1 + bool(odometry) + bool(command):
         raise RecordingError(f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics.")
-    contents = read_messages(path, dict(topics))
-    for topic, message_type in topics:
-        _check_channels(path, topic, message_type, contents)
+    contents = read_messages(path, types)
+    remarks = _remarks_on_loss(contents, scan)
+    remarks += [remark for topic in types if (remark := _ignore_other_types(path, topic, types[topic], contents, scan))]
     if not contents.messages[scan]:
         raise _no_scans(path, scan, contents)
-    if contents.cut_off:
-        problem = f"{path} is cut off: {len(contents.messages[scan])} scans can be read"
-        if strict:
-            raise RecordingError(f"{problem}; copy it again from where it was recorded, or set strict=false.")
-        warnings.warn(problem, stacklevel=2)
+    if strict and (contents.cut_off or contents.damage):
+        raise RecordingError(f"{path} {remarks[0]}; copy it again from where it was recorded, or set strict=false.")
 
-    extra: dict[str, Any] = {"notes": contents.notes}
+    extra: dict[str, Any] = {"notes": contents.notes, "remarks": remarks}
     if odometry and contents.messages[odometry]:
         time, rows = _decoded(path, odometry, contents, lambda message: (stamp_of(message), pose_of(message)))
         poses = np.array([pose for _, pose in rows])
         _check_finite(path, odometry, time, poses, "the pose")
         extra["odometry"] = poses, time, np.array([stamp for stamp, _ in rows])
     if command and contents.messages[command]:
-        time, twists = _decoded(path, command, contents, lambda message: (message.linear.x, message.angular.z))
+        time, twists = _decoded(path, command, contents, twist_of)
         _check_finite(path, command, time, np.array(twists), "the command")
         extra["commands"] = np.array(twists), time
-    return Recording(path=path, cut_off=contents.cut_off, **_scans(path, scan, contents), **extra)
+        extra["stamped_commands"] = contents.messages[command][0].channel.message_type == TWIST_STAMPED
+    fields = _scans(path, scan, contents, frame, remarks)
+    for remark in remarks:
+        warnings.warn(f"{path} {remark}", stacklevel=2)
+    return Recording(path=path, **fields, **extra)
 
 
-def _scans(path: Path, topic: str, contents: Contents) -> dict[str, Any]:
-    """Return the fields of a `Recording` that come from the scans."""
+def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remarks: list[str]) -> dict[str, Any]:
+    """Return the fields of a `Recording` that come from the scans; add a remark if other scanners are left out."""
 
     def fields(message: Any) -> tuple[Any, ...]:
-        limits = (message.angle_min, message.angle_increment, message.range_min, message.range_max)
-        return stamp_of(message), message.header.frame_id, limits, np.asarray(message.ranges, np.float32)
+        scanner = message.header.frame_id, message.range_min, message.range_max
+        if math.isnan(message.range_min + message.range_max):
+            raise ValueError("its smallest or greatest range is not a number")
+        ranges = np.asarray(message.ranges, np.float32)
+        return stamp_of(message), scanner, (message.angle_min, message.angle_increment), ranges
 
     log_time, messages = _decoded(path, topic, contents, fields)
-    stamps, frames, limits_of_scans, scans = zip(*messages, strict=True)
-    limits, points = np.array(limits_of_scans), np.array([len(scan) for scan in scans])
-    _check_finite(path, topic, log_time, limits[:, :2], "the angle of its first range, or between ranges,")
+    angles = np.array([row[2] for row in messages])
+    _check_finite(path, topic, log_time, angles, "the angle of its first range, or between ranges,")
+    # Recordings that were converted from ROS 1 name the program that sent a message.
+    senders = (dict(message.channel.metadata).get("callerid", "") for message in contents.messages[topic])
+    scanners = [(*row[1], sender) for row, sender in zip(messages, senders, strict=True)]
+    chosen = _choose_scanner(path, topic, scanners, frame, remarks)
+    kept = [row for row, scanner in enumerate(scanners) if scanner == chosen]
+    stamps, _, _, scans = zip(*(messages[row] for row in kept), strict=True)
+    points = np.array([len(scan) for scan in scans])
     if not points.any():
         raise RecordingError(
             f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record again."
@@ -163,12 +217,33 @@ def _scans(path: Path, topic: str, contents: Contents) -> dict[str, Any]:
     ranges = np.full((len(scans), points.max()), np.inf, np.float32)
     for row, scan in zip(ranges, scans, strict=True):
         row[: len(scan)] = scan
-    range_min, range_max = limits[:, 2:3].astype(np.float32), limits[:, 3:4].astype(np.float32)
+    range_min, range_max = np.float32(chosen[1]), np.float32(chosen[2])
     ranges[~((ranges >= range_min) & (ranges <= range_max))] = np.inf
     return {
-        "log_time": log_time, "stamp": np.array(stamps), "ranges": ranges, "points": points,
-        "angle_min": limits[:, 0], "angle_increment": limits[:, 1], "frame": frames[0],
+        "log_time": log_time[kept], "stamp": np.array(stamps), "ranges": ranges, "points": points,
+        "angle_min": angles[kept, 0], "angle_increment": angles[kept, 1], "frame": chosen[0],
     }  # fmt: skip
+
+
+def _choose_scanner(
+    path: Path, topic: str, scanners: Sequence[Scanner], frame: str | None, remarks: list[str]
+) -> Scanner:
+    """Return the first scanner, or the first one with this frame; add a remark if there are others to choose from."""
+    scans = Counter(scanners)
+    candidates = [scanner for scanner in scans if frame in (None, scanner[0])]
+    if not candidates:
+        frames = " or ".join(dict.fromkeys(scanner[0] for scanner in scans))
+        raise RecordingError(f"{path}, topic {topic} has no scan with the frame {frame}; give frame={frames}.")
+    if len(candidates) > 1:
+        names = ", ".join(
+            f"{' of '.join(filter(None, (name, sender))) or 'no frame'} ({count} scans to {high:g} m)"
+            for (name, _, high, sender), count in scans.items()
+            if frame in (None, name)
+        )
+        same = len({scanner[0] for scanner in candidates}) < len(candidates)
+        remedy = "record each on a topic of its own" if same else "choose with frame=NAME"
+        remarks.append(f"has several scanners on topic {topic}, of which the first is read: {names}; {remedy}")
+    return candidates[0]
 
 
 def _integrate_commands(commands: Floats, command_time: Times, time: Times) -> Floats:
@@ -203,32 +278,50 @@ def _decoded(
     return np.array([message.log_time for message in contents.messages[topic]]), rows
 
 
-def _check_channels(path: Path, topic: str, message_type: str, contents: Contents) -> None:
-    """Raise if a topic has messages of another type or encoding."""
-    for channel in contents.channels:
-        if channel.topic == topic and (channel.message_type != message_type or channel.encoding != "cdr"):
-            given = f"{channel.message_type or 'no type'} in {channel.encoding or 'no encoding'}"
-            others = _topics(contents, message_type)
-            remedy = f"give the topic of such messages, here {others}" if others else "record it with ROS 2"
-            raise RecordingError(
-                f"{path}, topic {topic} has messages of {given}, not of {message_type} in cdr; {remedy}."
-            )
+def _remarks_on_loss(contents: Contents, topic: str) -> list[str]:
+    """Return remarks on an early end and on damage, with the number of scans."""
+    scans, lost = len(contents.messages[topic]), contents.lost.get(topic, "an unknown number")
+    remarks = [f"is cut off: {scans} scans can be read"] if contents.cut_off else []
+    if contents.damage:
+        remarks.append(f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost")
+    return remarks
+
+
+def _ignore_other_types(path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str) -> str | None:
+    """Remove the messages of other types or encodings of a topic; return a remark on them, if there are any.
+
+    Raises:
+        RecordingError: if only such messages are on the topic of the scans.
+    """
+    channels = [channel for channel in contents.channels if channel.topic == topic]
+    others = [channel for channel in channels if channel.message_type not in types or channel.encoding != "cdr"]
+    if not others:
+        return None
+    contents.messages[topic] = [message for message in contents.messages[topic] if message.channel not in others]
+    given = f"{others[0].message_type or 'no type'} in {others[0].encoding or 'no encoding'}"
+    problem = f"has messages of {given} on topic {topic}, not of {' or '.join(types)} in cdr"
+    found = _topics(contents, types) if len(others) == len(channels) else ""
+    remedy = f"; give the topic of such messages, here {found}" if found else ""
+    if topic == scan and len(others) == len(channels):
+        raise RecordingError(f"{path} {problem}{remedy or f'; record the scans as {SCAN} with ROS 2'}.")
+    return f"{problem}, and they are ignored{remedy}"
 
 
 def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
-    if contents.cut_off:
-        return RecordingError(f"{path} is cut off before its first scan; copy it again from where it was recorded.")
+    if contents.cut_off or contents.damage:
+        loss = "cut off" if contents.cut_off else "damaged"
+        return RecordingError(f"{path} is {loss} before its first scan; copy it again from where it was recorded.")
     if any(channel.topic == topic for channel in contents.channels):
         return RecordingError(f"{path}, topic {topic} has no message; check that the scanner ran, and record it again.")
-    if others := _topics(contents, SCAN):
+    if others := _topics(contents, (SCAN,)):
         return RecordingError(f"{path} has no topic {topic}; give the topic of the LiDAR, here {others}.")
     topics = ", ".join(sorted({channel.topic for channel in contents.channels})) or "none"
     return RecordingError(f"{path} has no scans of a LiDAR ({SCAN} in cdr), its topics are: {topics}; record one too.")
 
 
-def _topics(contents: Contents, message_type: str) -> str:
+def _topics(contents: Contents, types: Sequence[str]) -> str:
     channels = (channel for channel in contents.channels if channel.encoding == "cdr")
-    return " or ".join(sorted({channel.topic for channel in channels if channel.message_type == message_type}))
+    return " or ".join(sorted({channel.topic for channel in channels if channel.message_type in types}))
 
 
 def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str) -> None:

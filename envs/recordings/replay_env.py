@@ -42,7 +42,7 @@ class McapReplayEnv(EnvBase):
         perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to cones [N, 2, K, 2] in
             the car's frame, m times `scale`, left side first, nearest first; and their number [N, 2]. Called once for
             all scans of a recording with equal bearings.
-        scan, odometry, command, strict: as in `read_recording`.
+        scan, odometry, command, frame, strict: as in `read_recording`.
         remembered: memory of a side that is not valid. "held" keeps its last numbers, as for a robot without a pose;
             "moved" keeps its place on the ground, by odometry or commands (`Recording.poses`).
         spline, smoothing, kept_cones, max_steering: as in `ConeTrackEnv`.
@@ -65,6 +65,7 @@ class McapReplayEnv(EnvBase):
         scan: str = "/scan",
         odometry: str | None = "/odom",
         command: str | None = "/cmd_vel",
+        frame: str | None = None,
         strict: bool = False,
         remembered: Literal["held", "moved"] = "held",
         spline: Literal["cubic", "quadratic"] = "cubic",
@@ -86,13 +87,15 @@ class McapReplayEnv(EnvBase):
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
         self.recordings = [
-            source if isinstance(source, Recording) else read_recording(source, scan, odometry, command, strict=strict)
+            source
+            if isinstance(source, Recording)
+            else read_recording(source, scan, odometry, command, frame=frame, strict=strict)
             for source in sources
         ]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
         self.kept_cones, self.scale, self.moves = kept_cones, scale, remembered == "moved"
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
-        self.turn_rate = speed / car_length
+        self.speed, self.car_length = speed, car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         self._load(perception)
         self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
@@ -176,7 +179,10 @@ class McapReplayEnv(EnvBase):
             "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {"steering": steering, "omega": (steering * self.max_steering).sin() * self.turn_rate}
+        entries |= {
+            "steering": steering,
+            "omega": (steering * self.max_steering).sin() * (self.speed / self.car_length),
+        }
         entries |= {"info": TensorDict(info, self.batch_size, device=self.device)}
         return TensorDict(entries, self.batch_size, device=self.device)
 

@@ -11,7 +11,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from drives import drive, store, uncompressed
+from drives import PERIOD, START, drive, rosbag_of, scan, store, uncompressed
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -22,9 +22,10 @@ from run_folders import make_untrained_run
 
 from coil_rl.envs import SimulatedRobotEnv, read_recording, record_drives
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
-from coil_rl.envs.recordings.messages import SCAN
+from coil_rl.envs.recordings.messages import SCAN, TWIST_STAMPED, header, twist
 from coil_rl.guides import SplineGuide
 from coil_rl.programs.replay import _first_repeated, _run_names, _topic_name
+from coil_rl.reproduce import Table6
 
 SCANS = 15
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]
@@ -158,11 +159,34 @@ def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
     done = called("replay", "recording=cut.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path)
     scans = len(read_recording(tmp_path / "results" / "annotated.mcap").ranges)
     assert 60 < scans < 120
-    assert "all that can be read of a file that is cut off" in done.stdout
+    assert f"the file is cut off: {scans} scans can be read" in done.stdout
     assert "Warning" not in done.stderr
     refused = called("replay", "recording=cut.mcap", "strict=true", "hydra.run.dir=no", cwd=tmp_path, code=2)
     assert f"replay: env: cut.mcap is cut off: {scans} scans can be read; copy it again" in refused.stderr
     assert not (tmp_path / "no").exists()
+
+
+def test_recorded_steering_is_that_of_table_6(tmp_path):
+    """A robot at another speed than the replay's, with stamped commands between its scans, and two scanners."""
+    commands = [twist(0.3, 0.4 * math.sin(number)) for number in range(40)]
+    stamped = [{"header": header(START, "base_link"), "twist": each} for each in commands]
+    messages = [("/cmd_vel", TWIST_STAMPED, START + 60_000_000 * n, each) for n, each in enumerate(stamped)]
+    for number in range(12):
+        time = START + number * PERIOD
+        messages += [("/scan", SCAN, time + n, scan(number, header=header(time, f"laser_{n}"))) for n in (0, 1)]
+    messages += [("/odom", "geometry_msgs/msg/PoseStamped", START, {})]
+    rosbag_of(tmp_path / "drive", *messages)
+    arguments = "recording=drive guide=zero frame=laser_1 hydra.run.dir=results"
+    out = called("replay", *arguments.split(), cwd=tmp_path).stdout
+    assert "the file has messages of geometry_msgs/msg/PoseStamped in cdr on topic /odom" in out
+    assert "several scanners" not in out
+    [row] = [line.split("|") for line in out.splitlines() if line.startswith("| recorded")]
+    with pytest.warns(UserWarning, match="annotated.mcap has"):
+        Table6(recordings=[str(tmp_path / "results" / "annotated.mcap")]).make(tmp_path / "table")
+    [measured] = csv.DictReader((tmp_path / "table.csv").open(newline=""))
+    assert float(measured["smoothness"]) == pytest.approx(float(row[2]), abs=5e-4) != 0
+    panels = json.loads((tmp_path / "results" / "foxglove_layout.json").read_text())["configById"]
+    assert "/cmd_vel.twist.angular.z" in [path["value"] for path in panels["Plot!omega"]["paths"]]
 
 
 @given(st.text("aZ09_-. =,/日é", max_size=8))
@@ -189,6 +213,7 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
         ("recording=[drive.mcap,drive.mcap]", "drive.mcap twice; leave one out"),
         ("recording=text.mcap", "text.mcap is not an MCAP file"),
         ("recording=silent.mcap", "silent.mcap has no scans of a LiDAR"),
+        ("recording=drive.mcap frame=rear", "topic /scan has no scan with the frame rear; give frame=laser"),
         ("recording=drive.mcap env.scan=/lidar", "has no topic /lidar; give the topic of the LiDAR, here /scan"),
         ("recording=drive.mcap guide=[]", "there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]"),
         ("recording=drive.mcap guide=constant guide.constant.value=[1,2]", "its action has the shape [1, 2]"),

@@ -1,15 +1,18 @@
 """Annotated recordings, read by another library."""
 
+import itertools
 import math
 
 import numpy as np
 import pytest
-from drives import drive
+from drives import PERIOD, START, drive, rosbag_of, scan
+from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from coil_rl.envs import McapReplayEnv
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
+from coil_rl.envs.recordings.messages import SCAN, header
 from coil_rl.guides import SplineGuide
 from coil_rl.replay.annotation import annotate
 from coil_rl.replay.open_loop import open_loop
@@ -55,6 +58,50 @@ def by_another_library(path):
     return messages, times
 
 
+def test_markers_have_the_stamp_and_the_frame_of_the_scan(tmp_path):
+    messages = [
+        ("/scan", SCAN, START + number * PERIOD, scan(number, header=header(7 + number * PERIOD, "lidar")))
+        for number in range(SCANS)
+    ]
+    env = McapReplayEnv(rosbag_of(tmp_path / "drive", *messages), perception)
+    [result] = open_loop(env, {"spline": (env, SplineGuide())})
+    path = tmp_path / "annotated.mcap"
+    annotate(result, path, topics=["/scan"], speed=0.15, scale=7.0, about={}, attachments={})
+    messages, times = by_another_library(path)
+    for topic in ("/coil/cones", "/coil/boundary"):
+        assert times[topic] == times["/scan"]
+        for of_scan, message in zip(messages["/scan"], messages[topic], strict=True):
+            assert all(marker.header == of_scan.header for marker in message.markers)
+
+
+def test_copies_keep_the_qos_definitions_metadata_and_attachments(tmp_path):
+    scans = [("/scan", SCAN, START + number * PERIOD, scan(number)) for number in range(SCANS)]
+    transforms = [("/tf_static", "tf2_msgs/msg/TFMessage", START, {})]
+    source = next(rosbag_of(tmp_path / "drive", *scans, *transforms, latched=["/tf_static"]).glob("*.mcap"))
+    contents = read_messages(source)
+    with RecordingWriter(source) as writer:
+        for message in itertools.chain(*contents.messages.values()):
+            writer.copy(message)
+        writer.describe("provenance", {"sensor": "URG"})
+        writer.attach("calibration.yaml", "text/yaml", b"yaw: 0", (3, 5))
+    env = McapReplayEnv(source, perception)
+    [result] = open_loop(env, {"spline": (env, SplineGuide())})
+    options = {"topics": ["/scan"], "speed": 0.15, "scale": 7.0, "about": {}}
+    annotate(result, tmp_path / "annotated.mcap", **options, attachments={"config.yaml": b"seed: 0"})
+    with AnyReader([source]) as original, AnyReader([tmp_path / "annotated.mcap"]) as copy:
+        for topic in ("/scan", "/tf_static"):
+            [one], [other] = ([c for c in reader.connections if c.topic == topic] for reader in (original, copy))
+            assert (one.ext, one.msgdef, one.digest) == (other.ext, other.msgdef, other.digest)
+        assert other.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
+    with (tmp_path / "annotated.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        assert {"provenance", "coil"} == {record.name for record in reader.iter_metadata()}
+        attached = {record.name: record for record in reader.iter_attachments()}
+    assert set(attached) == {"calibration.yaml", "config.yaml"}
+    copied = attached["calibration.yaml"]
+    assert (copied.create_time, copied.log_time, copied.media_type, copied.data) == (3, 5, "text/yaml", b"yaw: 0")
+
+
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     return annotated(tmp_path_factory.mktemp("replay"), "annotated.mcap", notes=["simulated", "rosbag2"])
@@ -76,11 +123,11 @@ def test_messages_have_the_times_of_the_scans_and_recorded_topics_are_copied(mad
 
 
 def test_cones_are_at_their_positions_yellow_left_and_blue_right(read):
-    for scan, message in enumerate(read[0]["/coil/cones"]):
+    for number, message in enumerate(read[0]["/coil/cones"]):
         first, *cones = message.markers
         assert first.action == 3, "deletes the markers of the scan before"
         left, right = ([cone for cone in cones if cone.ns == side] for side in ("left", "right"))
-        assert (len(left), len(right)) == (0 if scan < 2 else 3, 1 if scan >= 4 else 3)
+        assert (len(left), len(right)) == (0 if number < 2 else 3, 1 if number >= 4 else 3)
         positions = [(cone.pose.position.x * 7, cone.pose.position.y * 7) for cone in right]
         np.testing.assert_allclose(positions, [(2, -1), (3, -1), (4, -1)][: len(right)], atol=1e-6)
         assert all(cone.color.r > cone.color.b and cone.color.g > cone.color.b for cone in left)
@@ -89,12 +136,12 @@ def test_cones_are_at_their_positions_yellow_left_and_blue_right(read):
 
 
 def test_remembered_boundary_is_faded_and_one_never_valid_is_missing(read):
-    for scan, message in enumerate(read[0]["/coil/boundary"]):
+    for number, message in enumerate(read[0]["/coil/boundary"]):
         lines = {line.ns: line for line in message.markers[1:]}
-        assert set(lines) == ({"right"} if scan < 2 else {"left", "right"})
+        assert set(lines) == ({"right"} if number < 2 else {"left", "right"})
         points = [(point.x * 7, point.y * 7) for point in lines["right"].points]
         np.testing.assert_allclose(points, [(x, -1) for x in (2, 2.5, 3, 3.5, 4)], atol=1e-5)
-        assert (lines["right"].color.a == 1) == (scan < 4)
+        assert (lines["right"].color.a == 1) == (number < 4)
     assert [message.data for message in read[0]["/coil/valid"]] == [False, False, True, True, False, False]
 
 

@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModule
 
 from coil_rl.envs import McapReplayEnv, Recording
 from coil_rl.guides import ConstantGuide
-from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop
+from coil_rl.replay.open_loop import RECORDED, OpenLoop, Steering, open_loop, recorded_steering
 from coil_rl.replay.report import describe, disagreement, extent, outcome
 
 TURN_RATE, MAX_STEERING = 0.15 / (2 / 7), math.radians(80)
@@ -27,7 +27,7 @@ def recording(omegas=(), times=(), scans=4, period=100, **options):
     if len(omegas):
         options["commands"] = np.stack([np.full(len(omegas), 0.15), omegas], axis=1), np.array(times)
     ranges, points = np.ones((scans, 9), np.float32), ones.astype(int) * 9
-    return Recording(Path("drive.mcap"), False, scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
+    return Recording(Path("drive.mcap"), scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
 
 
 def run(recordings, *guides, **options):
@@ -50,12 +50,12 @@ def test_smoothness_and_omega_are_those_of_the_cone_world():
     [
         ([0, 100, 200, 300], [0.1, 0.2, 0.3, 0.4]),  # at the times of the scans
         ([30, 130, 230, 330], [0.1, 0.2, 0.3, 0.4]),  # a little later
-        ([30, 60, 230, 250], [0.1, 0.2, 0.3, 0.4]),  # the first after a scan, else the last before it
-        ([110, 120, 130, 140], [math.nan, 0.1, 0.4, 0.4]),  # unknown before the first
+        ([30, 60, 230, 250], [0.2, 0.2, 0.4, 0.4]),  # the last before the next scan
+        ([110, 120, 130, 140], [math.nan, 0.4, 0.4, 0.4]),  # unknown before the first
         ([-90, -80, -70, -60], [0.4, 0.4, 0.4, 0.4]),
     ],
 )
-def test_command_of_a_scan_is_the_first_one_until_the_next_scan(times, expected):
+def test_command_of_a_scan_is_the_last_one_before_the_next_scan(times, expected):
     [result] = run(recording([0.1, 0.2, 0.3, 0.4], times), ConstantGuide(0.0))
     np.testing.assert_array_equal(result.steering[RECORDED].omega, expected)
 
@@ -67,6 +67,17 @@ def test_recorded_action_has_the_recorded_turn_rate_or_is_the_maximum():
     [result] = run(recording(omegas, [0, 100, 200, 300]), ConstantGuide(0.0))
     np.testing.assert_allclose(result.steering[RECORDED].action, action, atol=1e-12)
     assert result.steering[RECORDED].omega[2] == 3.0
+
+
+def test_scans_before_the_first_command_are_left_out_and_a_stop_is_straight():
+    two, speeds = recording([0.15, 0.3], [110, 210], scans=5), np.array([[0.3, 0.15], [0.0, 0.15]])
+    vars(two)["commands"] = speeds, two.commands[1]
+    steering = recorded_steering(two, 0.15, 2 / 7, MAX_STEERING)
+    action = math.asin(0.15 / 0.3 * 2 / 7) / MAX_STEERING
+    np.testing.assert_allclose(steering.action, [math.nan, action, 0, 0, 0])
+    assert steering.smoothness[1] == steering.action[1]
+    with pytest.raises(ValueError, match="has no commands"):
+        recorded_steering(recording(), 0.15, 2 / 7, MAX_STEERING)
 
 
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
@@ -81,12 +92,12 @@ def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     assert names == ["0"] * 4 + ["1"] * 4
 
 
-def result_of(cut_off=False, **actions):
+def result_of(remarks=(), **actions):
     """A result with given actions; both sides are valid in the first and the last of 4 scans."""
     steering = {name: Steering(a, a / 2, np.abs(a) / 4) for name, a in ((n, np.array(x)) for n, x in actions.items())}
     valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
     one = recording(period=10**9, notes={"simulated": {}})
-    vars(one)["cut_off"] = cut_off
+    vars(one)["remarks"] = remarks
     arrays = np.zeros((4, 2, 1, 2)), np.zeros((4, 2)), np.zeros((4, 20))
     return OpenLoop(one, *arrays, valid, steering, MAX_STEERING)
 
@@ -117,4 +128,4 @@ def test_table_has_a_row_and_a_column_per_policy(result):
         ["both", "0.250", "0.500", "1.000", "-", "1.167"],
         ["recorded", "0.042", "0.083", "0.833", "1.167", "-"],
     ]
-    assert "3.0 s, all that can be read of a file that is cut off" in extent(result_of(cut_off=True))
+    assert extent(result_of(["is cut off", "is odd"])).endswith("50% of them; the file is cut off; the file is odd")

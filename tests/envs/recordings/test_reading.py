@@ -8,15 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drives import PERIOD, START, drive, odometry_fields, scan, store, uncompressed
+from drives import PERIOD, START, drive, odometry_fields, rosbag_of, scan, store, uncompressed
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, IndexType, Writer
 from rosbags import rosbag1, rosbag2
 from rosbags.convert.cli import main as convert
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from coil_rl.envs.recordings.mcap_files import digest
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, twist
+from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter, digest
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, TWIST_STAMPED, definition, encode, header, twist
 from coil_rl.envs.recordings.reading import RecordingError, read_recording
 
 REAL = Path(__file__).parents[3] / "../shared/recordings"
@@ -68,7 +69,7 @@ def test_scans_are_read_as_one_array(whole):
     np.testing.assert_array_equal(recording.stamp, START + np.arange(300) * PERIOD)
     np.testing.assert_allclose(recording.angles(7), np.linspace(-3.1241, 3.1241, 360), atol=1e-4)
     np.testing.assert_allclose(recording.seconds, np.arange(300) * PERIOD / 1e9)
-    assert (recording.frame, recording.cut_off) == ("laser", False)
+    assert (recording.frame, recording.remarks) == ("laser", [])
 
 
 def test_missing_points_and_ranges_outside_the_scanners_limits_are_no_return(tmp_path):
@@ -204,8 +205,8 @@ def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
     path = copy(whole, tmp_path, 0.6)
     with pytest.warns(UserWarning, match=r"whole\.mcap is cut off: \d+ scans can be read"):
         recording = read_recording(path)
-    assert recording.cut_off
     scans = len(recording.ranges)
+    assert recording.remarks == [f"is cut off: {scans} scans can be read"]
     assert 120 < scans < 180
     np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in range(scans)])
     assert f"is cut off: {scans} scans can be read; copy it again" in refusal(path, strict=True)
@@ -222,17 +223,74 @@ def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
 
 
 @EITHER_COMPRESSION
-def test_damaged_chunk_is_refused(tmp_path, whole, compression):
+@pytest.mark.parametrize("place", ["content", "length", "end"])
+@pytest.mark.parametrize("damaged", [[0], [1], [-1], [0, 1, 2]], ids=str)
+def test_readable_chunks_of_a_damaged_recording_are_read(tmp_path, whole, compression, damaged, place):
     path = compression(copy(whole, tmp_path))
+    with path.open("rb") as stream:
+        index = make_reader(stream).get_summary().chunk_indexes
+    data, scans = bytearray(path.read_bytes()), set(range(300))
+    for chunk in (index[number] for number in damaged):
+        start, end = chunk.chunk_start_offset, chunk.chunk_start_offset + chunk.chunk_length
+        if place == "content":
+            data[(start + end) // 2] ^= 1
+        else:
+            at = start if place == "length" else end - 30
+            data[at : at + 60] = bytes(60)
+        scans -= {n for n in scans if chunk.message_start_time <= START + n * PERIOD <= chunk.message_end_time}
+    path.write_bytes(data)
+    lost = 300 - len(scans)
+    assert lost
+    with pytest.warns(
+        UserWarning, match=rf"whole\.mcap is damaged at byte \d+: {300 - lost} scans .*, {lost} are lost"
+    ):
+        recording = read_recording(path)
+    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in sorted(scans)])
+    assert f"{lost} are lost; copy it again from where it was recorded, or set strict=false" in refusal(
+        path, strict=True
+    )
+
+
+def test_number_of_lost_scans_is_unknown_without_an_index(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as stream:
+        options = {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False}
+        writer = Writer(stream, 4000, CompressionType.NONE, index_types=IndexType.NONE, **options)
+        writer.start("ros2")
+        channel = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN, "ros2msg", definition(SCAN)))
+        for number in range(9):
+            writer.add_message(channel, START + number * PERIOD, encode(SCAN, scan(number)), 0)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    data[data.find(encode(SCAN, scan(4))) + 100] ^= 1
+    path.write_bytes(data)
+    with pytest.warns(UserWarning, match=r"is damaged at byte \d+: \d scans can be read, an unknown number are lost"):
+        recording = read_recording(path)
+    kept = ((recording.stamp - START) // PERIOD).tolist()
+    assert {0, 8} < set(kept) < set(range(9)) - {4}
+    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in kept])
+
+
+def test_damage_that_no_chunk_explains_is_refused(tmp_path, whole):
+    path = copy(whole, tmp_path)
     with path.open("rb") as stream:
         chunk = make_reader(stream).get_summary().chunk_indexes[1]
     data = bytearray(path.read_bytes())
-    data[chunk.chunk_start_offset + chunk.chunk_length // 2] ^= 1
+    data[chunk.chunk_start_offset + chunk.chunk_length + 30] ^= 1  # the index after the chunk
     path.write_bytes(data)
-    assert re.search("is damaged before byte .*, after 17000000.*mcap recover", refusal(path))
-    data[9:17] = (2**40).to_bytes(8, "little")  # length of the header
-    path.write_bytes(data)
+    assert re.search("is damaged before byte .*crc validation failed.*mcap recover", refusal(path))
+    path.write_bytes(data[:8] + b"\1" + (2**40).to_bytes(8, "little") + data[17:-36] + bytes(28) + data[-8:])
     assert "is damaged before byte 17 (" in refusal(path)
+    assert "is damaged before its first scan" in refusal(scanless(tmp_path / "a.mcap"))
+
+
+def scanless(path):
+    """A recording whose only chunk is damaged."""
+    drive(path, scans=2)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    return path
 
 
 @EITHER_COMPRESSION
@@ -245,7 +303,9 @@ def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
         damaged[place] ^= 1 << draw.integers(8)
         path.write_bytes(damaged)
         try:
-            recording = read_recording(path, strict=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # a damaged index may name another type of a topic
+                recording = read_recording(path, strict=True)
         except RecordingError:
             continue
         np.testing.assert_array_equal(recording.ranges, expected.ranges)
@@ -258,9 +318,8 @@ def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
         ({"scan": "/front"}, "has no topic /front; give the topic of the LiDAR, here /scan"),
         (
             {"scan": "/odom", "odometry": None},
-            f"has messages of {ODOMETRY} in cdr, not of {SCAN} in cdr; give the topic",
+            f"has messages of {ODOMETRY} in cdr on topic /odom, not of {SCAN} in cdr; give the topic",
         ),
-        ({"command": "/odom", "odometry": None}, "give the topic of such messages, here /cmd_vel"),
         ({"scan": "/odom"}, "must be different topics"),
     ],
 )
@@ -283,7 +342,103 @@ def test_recording_without_scans_is_refused(tmp_path):
 def test_other_encodings_and_types_are_refused(tmp_path, channel):
     message = refusal(store(tmp_path / "a.mcap", json.dumps({"ranges": [1.0]}).encode(), **channel))
     kind, encoding = channel.get("kind", SCAN) or "no type", channel.get("encoding", "cdr") or "no encoding"
-    assert f"topic /scan has messages of {kind} in {encoding}, not of {SCAN} in cdr" in message
+    assert f"has messages of {kind} in {encoding} on topic /scan, not of {SCAN} in cdr; record the scans" in message
+
+
+OTHERS = {
+    ("/odom", "geometry_msgs/msg/PoseStamped"): f"not of {ODOMETRY} in cdr, and they are ignored",
+    (
+        "/odom",
+        TWIST_STAMPED,
+    ): f"not of {ODOMETRY} in cdr, and they are ignored; give the topic of such messages, here /o",
+    ("/cmd_vel", "geometry_msgs/msg/Vector3"): f"not of {TWIST} or {TWIST_STAMPED} in cdr, and they are ignored",
+}
+
+
+@pytest.mark.parametrize(("topic", "kind"), OTHERS)
+def test_other_types_of_odometry_or_commands_are_ignored_with_a_warning(tmp_path, topic, kind):
+    scans = [("/scan", SCAN, START + number * PERIOD, scan(number)) for number in range(3)]
+    other = [(topic, kind, START, {}), ("/o", ODOMETRY, START, {})][: 1 + (kind == TWIST_STAMPED)]
+    path = rosbag_of(tmp_path / "drive", *scans, *other)
+    words = f"drive has messages of {kind} in cdr on topic {topic}, {OTHERS[topic, kind]}"
+    with pytest.warns(UserWarning, match=re.escape(words) + "$") as caught:
+        recording = read_recording(path, strict=True)
+    assert len(caught) == 1
+    assert len(recording.ranges) == 3
+    assert (recording.odometry, recording.commands) == (None, None)
+
+
+@pytest.mark.parametrize("kind", [TWIST, TWIST_STAMPED])
+def test_commands_may_be_stamped(tmp_path, kind):
+    fields = [twist(0.3, 0.1 * number) for number in range(3)]
+    if kind == TWIST_STAMPED:
+        fields = [{"header": header(1, "base_link"), "twist": each} for each in fields]
+    commands = [("/cmd_vel", kind, START + number, each) for number, each in enumerate(fields)]
+    recording = read_recording(rosbag_of(tmp_path / "drive", ("/scan", SCAN, START, scan(0)), *commands))
+    np.testing.assert_array_equal(recording.commands[0], [[0.3, 0.0], [0.3, 0.1], [0.3, 0.2]])
+    assert recording.stamped_commands == (kind == TWIST_STAMPED)
+    assert recording.remarks == []
+
+
+def scanners(path, *, frames=("front", "rear"), ranges=(12.0, 12.0), senders=("", "")):
+    """Scans of two scanners in turn on one topic: in the even and odd places."""
+    with RecordingWriter(path) as writer:
+        for number in range(7):
+            of = number % 2
+            time = START + number * PERIOD
+            fields = scan(number, header=header(time, frames[of]), range_max=ranges[of])
+            channel = Channel("/scan", SCAN, definition=definition(SCAN), metadata=(("callerid", senders[of]),))
+            writer.copy(RawMessage(channel, time, time, encode(SCAN, fields)))
+    return path
+
+
+def test_of_several_scanners_on_a_topic_the_chosen_one_is_read(tmp_path):
+    path = scanners(tmp_path / "a.mcap")
+    words = r"several scanners on topic /scan, of which the first is read: front \(4 scans.*, rear \(3 .*frame=NAME$"
+    with pytest.warns(UserWarning, match=words):
+        first = read_recording(path)
+    assert (first.frame, len(first.ranges)) == ("front", 4)
+    for frame, odd in (("front", 0), ("rear", 1)):
+        recording = read_recording(path, frame=frame)
+        assert (recording.frame, recording.remarks) == (frame, [])
+        np.testing.assert_array_equal(recording.ranges, [scan(n)["ranges"] for n in range(odd, 7, 2)])
+        np.testing.assert_array_equal(recording.log_time, START + np.arange(odd, 7, 2) * PERIOD)
+    assert "has no scan with the frame left; give frame=front or rear." in refusal(path, frame="left")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"ranges": (12.0, 4.0)}, r"laser \(4 scans to 12 m\), laser \(3 scans to 4 m\)"),
+        ({"senders": ("/left", "/right")}, r"laser of /left \(4 scans.*, laser of /right \(3 scans"),
+    ],
+)
+def test_scanners_with_the_same_frame_are_distinguished_by_range_and_sender(tmp_path, options, words):
+    path = scanners(tmp_path / "a.mcap", frames=("laser", "laser"), **options)
+    with pytest.warns(UserWarning, match=words + ".*; record each on a topic of its own$"):
+        assert len(read_recording(path, frame="laser").ranges) == 4
+
+
+DRIVEN = [  # linear speed of the commands, whether there is odometry, the speed of the robot by it, and the result
+    (0.35, True, 0.2, 0.35),
+    (0.35, False, 0.2, 0.35),
+    (0.0, True, 0.2, 0.2),
+    (0.0, False, 0.2, 0.15),
+]
+
+
+@pytest.mark.parametrize(("commanded", "odometry", "measured", "expected"), DRIVEN)
+def test_speed_of_a_command_is_its_own_or_measured_or_nominal(tmp_path, commanded, odometry, measured, expected):
+    messages = []
+    for number in range(4):
+        time = START + number * 10**9
+        messages += [("/scan", SCAN, time, scan(0, header=header(time, "laser")))]
+        messages += [("/cmd_vel", TWIST, time + 1, twist(commanded, 0.1))]
+        messages += [("/odom", ODOMETRY, time, odometry_fields(time, measured * number, 0, 0))] * odometry
+    recording = read_recording(rosbag_of(tmp_path / "drive", *messages))
+    commands = recording.commands_of_scans(0.15)
+    np.testing.assert_allclose(commands[:3], [[expected, 0.1]] * 3, rtol=1e-6)
+    assert not recording.commands[0][:, 0].any() or (commands[3] == commands[0]).all()
 
 
 @pytest.mark.parametrize("size", [0, 10, 1483])
@@ -301,7 +456,7 @@ def test_truncated_and_infinite_messages_are_refused(tmp_path, size):
 
 SENSORS = {
     ("breezyslam_exp1_urg_odom", "/scan"): (756, 682),
-    ("rplidar_c1_lab446a", "/scan"): (10, 1440),
+    ("rplidar_c1_lab446a", "/scan"): (2, 1440),  # of the first of five scanners
     ("urg04lx_obstacle_detector_demo", "/rear_scan"): (330, 726),
     ("urg04lx_obstacle_detector_demo", "/scan"): (331, 726),
     ("urg_legs_positive_7", "/scan"): (510, 768),
@@ -313,7 +468,9 @@ def test_recordings_of_real_sensors_are_read_like_another_library_does(name, top
     path = REAL / f"{name}.mcap"
     if not path.is_file():
         pytest.skip("the recordings of real sensors are not part of the repository")
-    recording = read_recording(path, scan=topic, strict=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        recording = read_recording(path, scan=topic, strict=True)
     assert recording.ranges.shape == SENSORS[name, topic]
     assert np.isfinite(recording.poses()).all()
     assert (recording.odometry is not None) == ("odom" in name)
@@ -321,6 +478,7 @@ def test_recordings_of_real_sensors_are_read_like_another_library_does(name, top
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         channels = [channel for channel in reader.connections if channel.topic == topic]
         messages = [reader.deserialize(data, channel.msgtype) for channel, _, data in reader.messages(channels)]
+    messages = [message for message in messages if message.header.frame_id == recording.frame]
     for row, message in zip(recording.ranges, messages, strict=True):
         in_range = (message.ranges >= message.range_min) & (message.ranges <= message.range_max)
         np.testing.assert_array_equal(row, np.where(in_range, message.ranges, np.inf))

@@ -66,7 +66,7 @@ def test_moved_memory_and_guide_are_those_of_the_drive():
     for car, poses in enumerate(rollout["info", "pose"].double().numpy() / [SCALE, SCALE, 1]):
         # The only range of each scan encodes its index.
         ranges = (1 + np.arange(80, dtype=np.float32) + 1000 * car).reshape(-1, 1)
-        recordings.append(Recording(Path("drive"), False, times, times, ranges, *layout, (poses, times, times)))
+        recordings.append(Recording(Path("drive"), times, times, ranges, *layout, (poses, times, times)))
 
     def perception(ranges, angles):
         car, scan = np.divmod(ranges[:, 0].astype(int) - 1, 1000)
