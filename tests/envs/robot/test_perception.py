@@ -106,7 +106,7 @@ def test_walls_are_no_cones():
     ("name", "topic", "share"),
     [
         ("breezyslam_exp1_urg_odom", "/scan", 0.50),
-        ("rplidar_c1_lab446a", "/scan", 0.47),
+        ("rplidar_c1_lab446a", "/scan", 0.50),
         ("urg04lx_obstacle_detector_demo", "/scan", 0.57),
         ("urg04lx_obstacle_detector_demo", "/rear_scan", 0.14),
         ("urg_legs_positive_7", "/scan", 0.85),
