@@ -54,8 +54,8 @@ class ConcatObservations(nn.Module):
 def check_hidden(hidden: Sequence[int]) -> None:
     """Raise a `ValueError` for hidden layers that are empty, or too large for the memory of a typical machine."""
     check_range(0, 16, hidden_layers=len(hidden))
-    check_range(1, 4096, hidden=min(hidden, default=1))
-    check_range(1, 4096, hidden=max(hidden, default=1))
+    for width in hidden:
+        check_range(1, 4096, hidden=width)
 
 
 def mlp(

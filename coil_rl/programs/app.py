@@ -66,12 +66,7 @@ def _record(config: DictConfig, key: str) -> None:
 
 
 def check_used(used: Iterable[str], reason: str) -> None:
-    """Raise a `UserError` for an override of a key that is not among those that the program uses.
-
-    Args:
-        used: top-level keys.
-        reason: why another key has no effect, for the message.
-    """
+    """Raise a `UserError` for an override outside of the top-level keys `used`; `reason` is why it has no effect."""
     for override in HydraConfig.get().overrides.task:
         key = override.lstrip("+~").partition("=")[0].rpartition("@")[2]
         if re.split(r"[./]", key)[0] not in used:

@@ -56,10 +56,9 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    if config.run is None:
-        app.check_used(OF_GUIDES, "a guide is evaluated without an agent")
-    else:
-        app.check_used(OF_A_RUN, f"run={config.run} has its own configuration")
+    given = config.run is not None
+    reason = f"run={config.run} has its own configuration" if given else "a guide is evaluated without an agent"
+    app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
     app.check_run(config)
 
 

@@ -98,13 +98,11 @@ def _read_run(folder: Path) -> Run:
     with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
         evaluation = _read_evaluation(path)
     remedy = "restore the file, or remove the run from the folder"
-    path = folder / "metrics.csv"
-    with file_of_a_run(path, remedy):
+    with file_of_a_run(path := folder / "metrics.csv", remedy):
         curve = read_curve(path) if path.exists() else []
     numbers = {}
     for name in ("guide_return", "training_time"):
-        path = folder / f"{name}.json"
-        with file_of_a_run(path, remedy):
+        with file_of_a_run(path := folder / f"{name}.json", remedy):
             numbers[name] = _read_numbers(path)
     guide_returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
     return Run(folder, run.label, run.seed, run.needs_guide, evaluation, curve, guide_returns, seconds)

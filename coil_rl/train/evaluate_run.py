@@ -92,8 +92,7 @@ def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, in
 
 def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic agent, or else of its guide."""
-    path = folder / "evaluation.csv"
-    with file_of_a_run(path, "remove the file, and evaluate again"):
+    with file_of_a_run(path := folder / "evaluation.csv", "remove the file, and evaluate again"):
         with path.open(newline="") as file:
             rows = [row for row in csv.DictReader(file) if (row["track"], row["actions"]) == ("mean", "deterministic")]
         last = [row for row in rows if not row["advice"]][-1]

@@ -88,8 +88,8 @@ def holds(folder: Path, config: DictConfig) -> bool:
     """Return whether the folder holds a run; raise a `UserError` if that has another configuration."""
     if not (folder / "config.yaml").exists():
         return False
-    remedy = "choose another folder, or remove that one"
-    check_same(flat(read_config(folder, "run_dir")), flat(config), f"{folder} holds a run", remedy)
+    saved, remedy = read_config(folder, "run_dir"), "choose another folder, or remove that one"
+    check_same(flat(saved), flat(config), f"{folder} holds a run", remedy)
     return True
 
 
