@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import time
 from argparse import Namespace
 from collections.abc import Callable, Mapping, Sequence
@@ -16,11 +17,13 @@ from hydra.errors import HydraException
 from tabulate import tabulate
 from tqdm import tqdm
 
-from benchmarks.driving import measure_compiled, measure_driving, measure_robot, profile_operators
+from benchmarks.driving import measure_compiled, measure_driving, measure_robot, profile_operators, train_config
 from benchmarks.process import measure_processes
 from benchmarks.timing import Row
 from benchmarks.training import measure_one_car, measure_sb3, measure_shares, measure_training
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, sentence
+from coil_rl.programs.app import program
+from coil_rl.train.check import check_parts
 from coil_rl.train.run_folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
@@ -75,6 +78,16 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
     return args
 
 
+def check_configuration(args: Namespace) -> None:
+    """Raise a `UserError` for the first mistake in the overrides."""
+    if method := [override for override in args.overrides if re.match(r"[+~]*method(@\w*)?=", override)]:
+        raise UserError(f"{method[0]} has no effect: the methods ppo and coil are compared; leave it out")
+    try:
+        check_parts(train_config(args, "coil"))
+    except HydraException as error:
+        raise UserError(sentence(error)) from error
+
+
 def goals(results: Mapping[str, Any]) -> list[Row]:
     """Return the measured values beside the goals of the project."""
     rows: list[Row] = []
@@ -109,7 +122,12 @@ def _cell(value: Any) -> str:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Measure, print the page and write it, with every number as JSON."""
-    args = parse(argv)
+    with program("benchmark"):
+        _run(parse(argv))
+
+
+def _run(args: Namespace) -> None:
+    check_configuration(args)
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
     os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler prints its start and end otherwise
@@ -117,10 +135,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     settings = {key: value for key, value in vars(args).items() if key != "output"}
     results: dict[str, Any] = {"versions": versions(), "settings": settings, "goals": []}
     for part in tqdm(args.parts, unit="part", desc="benchmark"):
-        try:
-            results[part] = PARTS[part][1](args)
-        except (UserError, HydraException) as error:
-            raise SystemExit(f"benchmark: {error}") from error
+        results[part] = PARTS[part][1](args)
         results["goals"] = goals(results)
         # Written after each part, so that an interrupted run keeps its results.
         (args.output / "benchmark.json").write_text(json.dumps(results, indent=2) + "\n")

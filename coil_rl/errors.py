@@ -3,15 +3,40 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import errno
+import textwrap
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
+NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+LAUNCHERS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # and their extras
+
 
 class UserError(Exception):
     """A mistake in the input of the user. The message states what is wrong, what is expected and what to do."""
+
+
+def is_no_bug(error: BaseException) -> bool:
+    """Return whether an error has a cause outside of the program: the input, the configuration or a full disk."""
+    return isinstance(error, (UserError, OmegaConfBaseException)) or getattr(error, "errno", None) in NO_SPACE
+
+
+@contextmanager
+def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
+    """Turn the errors of a damaged file into a `UserError` that ends with a remedy."""
+    try:
+        yield
+    except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
+        if is_no_bug(error):
+            raise
+        missing = f"it lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
+        problem = textwrap.shorten(missing, 200, placeholder=" ...")
+        raise UserError(f"{path} is damaged ({problem}); {remedy}") from error
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
@@ -28,7 +53,12 @@ def sentence(error: BaseException) -> str:
     if isinstance(error, MissingConfigException):
         return _unknown_file(error)
     if isinstance(error, OSError):
-        return f"{error.filename} cannot be used ({error.strerror}); choose another folder with hydra.run.dir=FOLDER"
+        name, remedy = error.filename or "the output", "choose another folder with hydra.run.dir=FOLDER"
+        if error.errno == errno.ENAMETOOLONG:
+            name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
+        return f"{name} cannot be used ({error.strerror}); {remedy}"
+    if isinstance(error, AssertionError):  # of Hydra, for a choice of a group that is no text
+        return "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
     for key_error in (error, cause):
@@ -47,6 +77,8 @@ def _unknown_file(error: MissingConfigException) -> str:
     group, _, name = (error.missing_cfg_file or "").rpartition("/")
     if not group:
         return _first_paragraph(error)
+    if group == "hydra/launcher" and name in LAUNCHERS:
+        return f"hydra/launcher={name} is not installed: python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
     options = sorted(error.options or [])
     choices = f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
     return f"there is no {group}={name}{choices}"

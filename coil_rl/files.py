@@ -24,6 +24,9 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
         _to_disk(unfinished)
         unfinished.replace(path)
         folder_to_disk(path.parent)
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
     finally:
         unfinished.unlink(missing_ok=True)
 

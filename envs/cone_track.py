@@ -18,7 +18,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.envs.limits import LARGEST_COUNT, check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -122,10 +122,12 @@ class ConeTrackEnv(SeededEnv):
         check_choice(("cubic", "quadratic"), spline=spline)
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
         check_choice(("random", "cyclic"), assignment=assignment)
-        check_range(0, above=True, num_cars=num_cars, laps=laps, kept_cones=kept_cones, rate=rate)
-        check_range(0, above=True, time_limit=time_limit, speed=speed, car_length=car_length)
+        check_range(0, above=True, num_cars=num_cars, kept_cones=kept_cones, speed=speed, car_length=car_length)
+        check_range(0, 1000, above=True, rate=rate)
+        check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
-        check_range(0, held_steps=held_steps, seed=seed)
+        check_range(0, LARGEST_COUNT, held_steps=held_steps)
+        check_range(0, seed=seed)
         if round(time_limit * rate) < 1:
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
         check_weights("reward", reward or {}, RewardWeights._fields)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 LARGEST_SEED = 2**63 - 1
+LARGEST_COUNT = 10**6  # of laps, and of seconds or held steps of an episode
 
 
 def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:

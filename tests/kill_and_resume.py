@@ -18,6 +18,7 @@ import tempfile
 import time
 from bisect import bisect
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 # Started by its path, Python would take tests/coil_rl for the library.
@@ -37,14 +38,14 @@ STATES = ["policy_last.pt", "policy_best.pt", "checkpoint.pt"]
 TIMEOUT = 600  # s
 
 
-def start(folder: Path, overrides: list[str]) -> subprocess.Popen[bytes]:
-    """Start a process that begins the run in the folder or resumes it."""
+def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Popen[bytes]:
+    """Start a process that begins the run in the folder or resumes it; the options are those of `Popen`."""
     begun = (folder / "config.yaml").exists()
     arguments = [f"resume={folder}"] if begun else [*SMALL, *overrides, f"hydra.run.dir={folder}"]
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]
-        return subprocess.Popen(command, cwd=folder.parent, env=env, stdout=log, stderr=log)
+        return subprocess.Popen(command, cwd=folder.parent, env=env, **{"stdout": log, "stderr": log, **options})
 
 
 def marks(folder: Path) -> int:

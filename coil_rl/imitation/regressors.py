@@ -19,7 +19,7 @@ from torchrl.modules import MLP
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
 from coil_rl.imitation import archive
-from coil_rl.learners.networks import mlp
+from coil_rl.learners.networks import check_hidden, mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -73,7 +73,8 @@ class NetworkRegressor(Regressor):
     ) -> None:
         super().__init__()
         self.learning_rate = schedule(learning_rate)
-        check_range(1, hidden=min(hidden, default=1), epochs=epochs, minibatch=minibatch)
+        check_hidden(hidden)
+        check_range(1, epochs=epochs, minibatch=minibatch)
         check_range(0, above=True, learning_rate=self.learning_rate(0))
         check_range(0, LARGEST_SEED, seed=seed)
         self.hidden, self.epochs, self.minibatch, self.seed = tuple(hidden), epochs, minibatch, seed

@@ -51,6 +51,13 @@ class ConcatObservations(nn.Module):
         return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 
 
+def check_hidden(hidden: Sequence[int]) -> None:
+    """Raise a `ValueError` for hidden layers that are empty, or too large for the memory of a typical machine."""
+    check_range(0, 16, hidden_layers=len(hidden))
+    for width in hidden:
+        check_range(1, 4096, hidden=width)
+
+
 def mlp(
     inputs: int,
     outputs: int,
@@ -63,7 +70,7 @@ def mlp(
 
     `gain` scales the weights of the last layer.
     """
-    check_range(1, hidden=min(hidden, default=1))
+    check_hidden(hidden)
     layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=activation, device=device)
     if activation is nn.Tanh:
         linear = [layer for layer in layers if isinstance(layer, nn.Linear)]

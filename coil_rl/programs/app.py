@@ -14,10 +14,11 @@ from __future__ import annotations
 import functools
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,13 +26,15 @@ from typing import Any, NoReturn
 import hydra
 import yaml
 from hydra._internal.utils import get_args_parser
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import coil_rl.train  # noqa: F401  registers the root configurations
-from coil_rl.errors import UserError, sentence
+from coil_rl import programs
+from coil_rl.errors import UserError, is_no_bug, sentence
 from coil_rl.train.trust import trust_packages
 
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
@@ -60,7 +63,15 @@ def _record(config: DictConfig, key: str) -> None:
         folder = Path(str(OmegaConf.select(config, key))).absolute()
     except OmegaConfBaseException:
         return  # Hydra raises the same error next
-    _new_folders[:] = [place for place in (folder, *folder.parents) if not place.exists()]
+    _new_folders[:] = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
+
+
+def check_used(used: Iterable[str], reason: str) -> None:
+    """Raise a `UserError` for an override outside of the top-level keys `used`; `reason` is why it has no effect."""
+    for override in HydraConfig.get().overrides.task:
+        key = override.lstrip("+~").partition("=")[0].rpartition("@")[2]
+        if re.split(r"[./]", key)[0] not in used:
+            raise UserError(f"{override} has no effect: {reason}; what can be changed is {', '.join(used)}")
 
 
 def check_run(config: DictConfig) -> None:
@@ -75,7 +86,6 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     _new_folders.clear()
-    _check_options(config_name)
     bugs: list[Exception] = []
 
     @functools.wraps(task)
@@ -84,16 +94,17 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
             trust_packages(config.get("trust", []), config)
             check(config)
             return task(config)
-        except (UserError, OmegaConfBaseException) as error:
-            refuse(config_name, error)  # here, because Hydra prints a line of its own for an error of the task
         except Exception as error:
+            if is_no_bug(error):
+                refuse(config_name, error)  # here, because Hydra prints a line of its own for an error of the task
             bugs.append(error)
             raise
 
     with program(config_name):
+        _check_options(config_name)
         try:
             hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
-        except (HydraException, ValueError, OSError, yaml.YAMLError) as error:
+        except (HydraException, ValueError, OSError, yaml.YAMLError, AssertionError) as error:
             # Outside of the task these errors come from the command line and the configuration files.
             if error in bugs:
                 raise
@@ -106,11 +117,15 @@ def program(name: str) -> Iterator[None]:
 
     The exit code is 2 for a mistake of the user, and 130 for Ctrl-C and SIGTERM.
     """
+    if signal.getsignal(signal.SIGINT) is programs.interrupted:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     try:
         yield
-    except (UserError, OmegaConfBaseException) as error:
+    except Exception as error:
+        if not is_no_bug(error):
+            raise
         refuse(name, error)
     except KeyboardInterrupt as stop:
         print(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}", file=sys.stderr)
@@ -119,7 +134,7 @@ def program(name: str) -> Iterator[None]:
 
 def refuse(name: str, error: Exception) -> NoReturn:
     """End the program with one sentence and exit code 2, and remove new folders that hold no files of the task."""
-    for folder in _new_folders:
+    for folder in filter(os.path.exists, _new_folders):  # a name may be too long for one
         inside = [path for path in folder.rglob("*") if not path.is_dir()]
         if all(path.name == "multirun.yaml" or path.parent.name == ".hydra" for path in inside):
             shutil.rmtree(folder, ignore_errors=True)

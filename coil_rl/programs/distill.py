@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 from typing import Any
 
@@ -45,18 +44,29 @@ def distill(config: DictConfig) -> float:
 
 
 def _measures(folder: Path) -> dict[str, Any]:
-    with (folder / "metrics.csv").open(newline="") as file:
-        *_, last = csv.DictReader(file)
-    learned = {name: float(last[f"learner/{name}"]) for name in COLUMNS if f"learner/{name}" in last}
-    with (folder / "evaluation.csv").open(newline="") as file:
-        guide, proxy = (row for row in csv.DictReader(file) if row["track"] == "mean")
-    rewards = {"guide_reward": float(guide["reward"]), "completed": float(proxy["completed"])}
+    from coil_rl.report.runs import read_runs
+
+    (run,) = read_runs([folder])
+    learned = {name: run.curve[-1][f"learner/{name}"] for name in COLUMNS if f"learner/{name}" in run.curve[-1]}
+    means = run.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
+    rewards = {"guide_reward": float(means["reward"].iloc[0]), "completed": float(means["completed"].iloc[-1])}
     return learned | rewards | {"folder": str(folder)}
+
+
+def check(config: DictConfig) -> None:
+    """Raise a `UserError` for the first mistake in the configuration of the proxies, and make their folder."""
+    from coil_rl.train.check import check_proxies, check_values, make_folder
+
+    used = ("preset", "track", "env", "guide", "evaluation", "proxy", "seed", "device", "threads", "run_dir", "trust")
+    app.check_used(used, "a proxy is trained as the key proxy says")
+    check_values(config)
+    check_proxies(config, config.guide)
+    make_folder(Path(config.proxy.folder))
 
 
 def main() -> None:
     """Entry point."""
-    app.run(distill, "distill")
+    app.run(distill, "distill", check)
 
 
 if __name__ == "__main__":

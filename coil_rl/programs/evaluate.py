@@ -9,6 +9,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.programs import app
 
+# Keys that have an effect on the evaluation of a run, and on that of guides alone.
+OF_A_RUN = ("run", "track", "degrade", "evaluation", "seed", "device", "threads", "trust", "run_dir")
+OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
+
 if TYPE_CHECKING:
     from torch import nn
 
@@ -36,6 +40,7 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
         UserError: if the folder holds no complete run.
     """
     from coil_rl.train.build import build_env
+    from coil_rl.train.check import check_values
     from coil_rl.train.load import load_policy
     from coil_rl.train.run_folder import read_config
 
@@ -43,14 +48,23 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] |= resolved["degrade"]
     config = read_config(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
+    check_values(config)
     if config.method.observes is None:
         return config, None
     return config, load_policy(run, config, build_env(config), config.evaluation.policy)
 
 
+def check(config: DictConfig) -> None:
+    """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
+    given = config.run is not None
+    reason = f"run={config.run} has its own configuration" if given else "a guide is evaluated without an agent"
+    app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
+    app.check_run(config)
+
+
 def main() -> None:
     """Entry point."""
-    app.run(evaluate, "evaluate")
+    app.run(evaluate, "evaluate", check)
 
 
 if __name__ == "__main__":

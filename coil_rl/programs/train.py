@@ -28,8 +28,9 @@ def resume(folder: Path) -> float:
     Raises:
         UserError: if the folder holds no run, or one that cannot be resumed or would write outside of its folder.
     """
+    from coil_rl.train.check import check
     from coil_rl.train.run import resume_run
-    from coil_rl.train.run_folder import locked, read_config
+    from coil_rl.train.run_folder import is_evaluated, locked, read_config
 
     config = read_config(folder, "resume")
     folder = folder.absolute()
@@ -41,6 +42,11 @@ def resume(folder: Path) -> float:
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
     with locked(folder):
+        try:
+            if not is_evaluated(folder):
+                check(config)
+        except UserError as error:
+            raise UserError(f"{folder / 'config.yaml'}: {error}") from error
         return resume_run(config, folder)
 
 

@@ -6,13 +6,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import BinaryIO
 
+import numpy as np
 import pandas as pd
 import yaml
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.train.trust import read_yaml
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
@@ -94,20 +96,16 @@ def _read_run(folder: Path) -> Run:
     path = folder / "evaluation.csv"
     if not path.exists():
         return run
-    try:
+    with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
         evaluation = _read_evaluation(path)
-        path = folder / "metrics.csv"
-        curve = _read_csv(path).astype(float).to_dict("records") if path.exists() else []
-        path = folder / "guide_return.json"
-        guide_returns = _read_numbers(path)
-        path = folder / "training_time.json"
-        seconds = _read_numbers(path).get("seconds")
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
-        problem = " ".join(str(error.args[0] if isinstance(error, KeyError) else error).split())
-        remedy = "restore the file, or remove the run from the folder"
-        if path.name == "evaluation.csv":
-            remedy = f"remove the file and write it again by coil-train resume={folder}"
-        raise UserError(f"{path} is damaged ({problem}); {remedy}") from error
+    remedy = "restore the file, or remove the run from the folder"
+    with file_of_a_run(path := folder / "metrics.csv", remedy):
+        curve = read_curve(path) if path.exists() else []
+    numbers = {}
+    for name in ("guide_return", "training_time"):
+        with file_of_a_run(path := folder / f"{name}.json", remedy):
+            numbers[name] = _read_numbers(path)
+    guide_returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
     return Run(folder, run.label, run.seed, run.needs_guide, evaluation, curve, guide_returns, seconds)
 
 
@@ -121,7 +119,16 @@ def _read_evaluation(path: Path) -> pd.DataFrame:
     return frame
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
+def read_curve(file: Path | BinaryIO) -> list[dict[str, float]]:
+    """Return the rows of a `metrics.csv`; raise a `ValueError` if a cell is no number or `frames` is missing."""
+    frame = _read_csv(file).astype(float)
+    if not np.isfinite(frame.get("frames", np.nan)).all():
+        raise ValueError("not every row has its number of frames")
+    rows: list[dict[str, float]] = frame.to_dict("records")
+    return rows
+
+
+def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:
     """Read all cells as text: numbers keep every digit, and an empty cell is an error where a number is expected."""
     frame = pd.read_csv(path, dtype=str, keep_default_na=False)
     if not isinstance(frame.index, pd.RangeIndex):

@@ -34,7 +34,7 @@ from coil_rl.train.build import (
     trains_guides,
 )
 from coil_rl.train.config import TrainConfig
-from coil_rl.train.distillation import guides_with_untrained_proxies
+from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -47,6 +47,12 @@ LARGEST_BATCH = 2**28
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration of a program that drives, and perhaps trains."""
+    check_parts(config)
+    make_folder(Path(config.run_dir))
+
+
+def check_parts(config: DictConfig) -> None:
+    """Do the checks of `check` without making the folder of the run."""
     check_values(config)
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
@@ -67,7 +73,6 @@ def check(config: DictConfig) -> None:
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_drive(config, "test", tracks["test"], partial(build_env, advice=advice))
-    make_folder(Path(config.run_dir))
 
 
 def check_values(config: DictConfig) -> None:
@@ -81,9 +86,10 @@ def check_values(config: DictConfig) -> None:
             if detail["type"] == "unexpected_keyword_argument":
                 raise UserError(_unknown_key(config, *map(str, detail["loc"]))) from None
         raise UserError(validation_message(error, values)) from None
-    budget = config.get("budget")
-    if isinstance(budget, DictConfig) and (frames := budget.cars * budget.steps) > LARGEST_BATCH:
-        raise UserError(f"budget.cars x budget.steps={frames} must be at most {LARGEST_BATCH}")
+    for name in ("budget", "proxy.budget"):
+        budget = OmegaConf.select(config, name)
+        if isinstance(budget, DictConfig) and (frames := budget.cars * budget.steps) > LARGEST_BATCH:
+            raise UserError(f"{name}.cars x {name}.steps={frames} must be at most {LARGEST_BATCH}")
     for name in ("device", "env.device"):
         if isinstance(device := OmegaConf.select(config, name), str):
             _check_device(name, device)
@@ -153,7 +159,9 @@ def _check_training(config: DictConfig, tracks: int) -> None:
     env = build_env(config)
     if trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
-    learner = build_learner(config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None)
+    guides = build_guides(config) if trains_guides(config) else {}
+    check_proxies(config, guides_without_parameters(guides))
+    learner = build_learner(config, env, guides_with_untrained_proxies(config) if guides else None)
     frames = config.budget.cars * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)
     if 2 * minibatches > frames:
@@ -169,6 +177,15 @@ def _check_training(config: DictConfig, tracks: int) -> None:
     if config.logger:
         check_node(config.logger, "logger")
     _check_watch(config, env)
+
+
+def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
+    """Raise a `UserError` for the first mistake in the training of the proxies of guides."""
+    for name in guides:
+        try:
+            check_parts(proxy_config(config, name))
+        except UserError as error:
+            raise UserError(f"proxy of guide.{name}: {error}") from error
 
 
 def _check_watch(config: DictConfig, env: EnvBase) -> None:

@@ -75,6 +75,18 @@ class MethodConfig(NodeConfig):
 
 
 @dataclass
+class ProxyConfig(NodeConfig):
+    """Training of the networks that imitate guides without parameters."""
+
+    folder: str = MISSING
+    seed: Seed = 0
+    method: MethodConfig = field(default_factory=MethodConfig)
+    env: dict[str, Any] = field(default_factory=dict)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    learner: dict[str, Any] = MISSING
+
+
+@dataclass
 class ProgramConfig(NodeConfig):
     """Base of the root configurations: Hydra's help text and callback of this project."""
 
@@ -115,7 +127,7 @@ class TrainConfig(DrivingConfig):
     label: str = MISSING
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
-    proxy: dict[str, Any] = field(default_factory=dict)
+    proxy: ProxyConfig | None = None
     watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: Positive = 10
     existing: Annotated[str, one_of("refuse", "resume")] = "refuse"

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
+from coil_rl.errors import UserError
 from coil_rl.files import whole_folder
 from coil_rl.train import load
 from coil_rl.train.build import build_env, build_guides, build_learner
@@ -30,14 +31,18 @@ def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
 
 
 def proxy_config(config: DictConfig, name: str) -> DictConfig:
-    """Return the configuration of the run that trains the proxy of one guide of a training run."""
+    """Return the configuration of the run that trains the proxy of one guide of a training run.
+
+    Raises:
+        UserError: if the key `proxy` of the training run describes no network.
+    """
+    if config.proxy is None or not config.proxy.method.observes:
+        raise UserError("proxy.method.observes: a proxy needs observations; give proxy=network")
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     guide, proxy = {name: resolved["guide"][name]}, resolved["proxy"]
-    proxy["method"]["transforms"]["advice"]["guides"] = guide
     values = {
         **{key: resolved[key] for key in ("preset", "track", "device", "threads")},
         **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
-        "proxy": {},
         "env": resolved["env"] | proxy["env"],
         "guide": guide,
         "label": f"proxy of {name}",
@@ -45,6 +50,7 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
         "existing": "resume",
     }
     merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)
+    OmegaConf.update(merged, "method.transforms.advice.guides", guide, merge=False, force_add=True)
     merged.run_dir = f"{proxy['folder']}/{name}_{fingerprint(merged)}"
     return merged
 

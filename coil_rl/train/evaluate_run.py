@@ -13,6 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
 from tqdm import tqdm
 
+from coil_rl.errors import file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
 from coil_rl.report.runs import PER_STEP
@@ -91,11 +92,13 @@ def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, in
 
 def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic agent, or else of its guide."""
-    with (folder / "evaluation.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if (row["track"], row["actions"]) == ("mean", "deterministic")]
-    last = [row for row in rows if not row["advice"]][-1]
-    reward, completed = float(last["reward"]), float(last["completed"])
-    print((folder / "evaluation.md").read_text().rstrip())
+    with file_of_a_run(path := folder / "evaluation.csv", "remove the file, and evaluate again"):
+        with path.open(newline="") as file:
+            rows = [row for row in csv.DictReader(file) if (row["track"], row["actions"]) == ("mean", "deterministic")]
+        last = [row for row in rows if not row["advice"]][-1]
+        reward, completed = float(last["reward"]), float(last["completed"])
+        page = (folder / "evaluation.md").read_text().rstrip()
+    print(page)
     print(f"{last['driver']}: mean test reward {reward:.1f}, {completed:.0%} completed; see {folder}")
     return reward
 

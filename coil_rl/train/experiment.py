@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import os
 import sys
@@ -19,10 +20,12 @@ from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coil_rl.errors import UserError
+from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import whole_file
+from coil_rl.report.runs import read_curve
 from coil_rl.train import checkpoint
 from coil_rl.train.rollout import Rollout
+from coil_rl.train.run_folder import check_same
 
 
 class Learner(Protocol):
@@ -74,6 +77,7 @@ class Experiment:
             ("step").
         checkpoint_every: updates between two checkpoints.
         probe: see `Probe`.
+        identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
     """
 
     EPISODES = 100  # the return is the mean over this many finished episodes
@@ -89,10 +93,11 @@ class Experiment:
         watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
         checkpoint_every: int = 10,
         probe: Probe | None = None,
+        identity: Mapping[str, Any] | None = None,
     ) -> None:
         self.learner, self.rollout, self.frames, self.folder = learner, rollout, frames, folder
         self.metrics, self.checkpoint_every = Metrics(folder / "metrics.csv", logger), checkpoint_every
-        self.probe = probe
+        self.probe, self.identity = probe, dict(identity or {})
         watch = watch or {}
         self.watch_episode = {name: ("next", *key) for name, key in watch.get("episode", {}).items()}
         self.watch_step = {name: ("next", *key) for name, key in watch.get("step", {}).items()}
@@ -105,7 +110,11 @@ class Experiment:
         """Continue from the last intact checkpoint of the folder, or from the beginning if there is none yet."""
         state = checkpoint.load_newest(self.folder)
         if state is not None:
-            self.load_state_dict(state)
+            newest = self.folder / checkpoint.NEWEST
+            remedy = "put the files of the run back, or train again in another folder"
+            with file_of_a_run(newest, remedy):
+                check_same(state["identity"], self.identity, f"{newest} belongs to a run", remedy)
+                self.load_state_dict(state)
         self.rows = self.metrics.truncate(self.updates)
         where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
         print(f"{self.folder} continues {where}", file=sys.stderr)
@@ -199,6 +208,7 @@ class Experiment:
         return {
             "learner": self.learner.state_dict(),
             "rollout": self.rollout.state_dict(),
+            "identity": self.identity,
             "updates": self.updates,
             "best": self.best,
             "returns": list(self.returns),
@@ -282,10 +292,11 @@ class Metrics:
             )
         rows: list[dict[str, float]] = []
         if count:
+            kept = b"".join(lines[: count + 1])
+            with file_of_a_run(self.path, "put the whole file back, or train again in another folder"):
+                rows = read_curve(io.BytesIO(kept))
             with whole_file(self.path) as unfinished:
-                unfinished.write_bytes(b"".join(lines[: count + 1]))
-            with self.path.open(newline="") as file:
-                rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+                unfinished.write_bytes(kept)
         else:
             self.path.unlink(missing_ok=True)
         if self.logger is not None and self.tensorboard is not None:

@@ -11,15 +11,16 @@ import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
 
+from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.train import checkpoint, distillation
 from coil_rl.train.build import build, build_env, build_guides, build_learner, trains_guides
-from coil_rl.train.evaluate_run import drive_guides, evaluate_run, report_outcome
+from coil_rl.train.evaluate_run import drive_guides, driver_names, evaluate_run, report_outcome
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.load import PROXIES, load_guides, weights_file
 from coil_rl.train.rollout import Rollout
-from coil_rl.train.run_folder import begin, holds, is_evaluated, locked
+from coil_rl.train.run_folder import begin, flat, holds, is_evaluated, locked, report_changed_versions
 
 
 def run(config: DictConfig, *, wait: bool = False) -> float:
@@ -44,10 +45,19 @@ def resume_run(config: DictConfig, folder: Path) -> float:
 def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float:
     torch.set_num_threads(config.threads)
     try:
+        if resumed:
+            report_changed_versions(folder)
         agent = None if config.method.observes is None else _train(config, folder, resumed)
         evaluate_run(config, agent, folder, config.seed)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"continue with: coil-train resume={folder}") from None
+    except OSError as error:
+        if error.errno not in NO_SPACE:
+            raise
+        raise UserError(
+            f"{error.filename or folder} cannot be written ({error.strerror}); make room, and continue with "
+            f"coil-train resume={folder}"
+        ) from error
     return report_outcome(folder)
 
 
@@ -71,6 +81,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
         probe=GuideReturns(config, learner.guides) if improves_guides else None,
+        identity=flat(config),
     )
     if resumed:
         experiment.resume()
@@ -116,7 +127,9 @@ class GuideReturns:
 
 def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
     if file.exists():
-        return {name: float(value) for name, value in json.loads(file.read_text()).items()}
+        with file_of_a_run(file, "remove it, and the run measures it again"):
+            numbers = json.loads(file.read_text())
+            return {name: float(numbers[name]) for name in driver_names(config.guide)}
     returns = _guide_returns(config)
     _write_json(returns, file)
     return returns

@@ -6,6 +6,7 @@ import json
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from importlib import metadata
@@ -22,6 +23,7 @@ from coil_rl.files import remove_unfinished, whole_file, write_text
 from coil_rl.train.config import IGNORED_KEYS, TrainConfig
 from coil_rl.train.trust import check_config, read_yaml
 
+ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
     "coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "stable-baselines3", "numpy", "scipy",
     "matplotlib",
@@ -91,16 +93,22 @@ def holds(folder: Path, config: DictConfig) -> bool:
     """Return whether the folder holds a run; raise a `UserError` if that has another configuration."""
     if not (folder / "config.yaml").exists():
         return False
-    saved, requested = (
-        _flat(OmegaConf.to_container(each, resolve=True)) for each in (read_config(folder, "run_dir"), config)
-    )
-    for key in dict.fromkeys([*saved, *requested]):
-        if saved.get(key) != requested.get(key) and key.split(".")[0] not in IGNORED_KEYS:
-            raise UserError(
-                f"{folder} holds a run with {key}={saved.get(key)}, not {requested.get(key)}; "
-                "choose another folder, or remove that one"
-            )
+    saved, remedy = read_config(folder, "run_dir"), "choose another folder, or remove that one"
+    check_same(flat(saved), flat(config), f"{folder} holds a run", remedy)
     return True
+
+
+def check_same(saved: Mapping[str, Any], requested: Mapping[str, Any], holder: str, remedy: str) -> None:
+    """Raise a `UserError` if two results of `flat` differ; the message begins with the holder of the first one."""
+    for key in dict.fromkeys([*saved, *requested]):
+        if saved.get(key) != requested.get(key):
+            raise UserError(f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}")
+
+
+def flat(config: DictConfig) -> dict[str, Any]:
+    """Return the values on which the numbers of a run depend, by their full keys."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    return _flat({key: value for key, value in values.items() if key not in IGNORED_KEYS})
 
 
 def _flat(node: Any, name: str = "") -> dict[str, Any]:
@@ -115,6 +123,19 @@ def is_evaluated(folder: Path) -> bool:
     return (folder / "evaluation.csv").exists()
 
 
+def report_changed_versions(folder: Path) -> None:
+    """Print one line on standard error if a run was begun with other versions of Python or of the packages."""
+    try:
+        begun = dict(json.loads((folder / "versions.json").read_text()))
+    except (OSError, TypeError, ValueError):
+        begun = {}
+    present = versions()
+    names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]
+    if names:
+        changes = ", ".join(f"{name} {begun.get(name, 'unknown')} (here {present[name]})" for name in names)
+        print(f"{folder} was begun with {changes}; its numbers may differ from now on", file=sys.stderr)
+
+
 def versions() -> dict[str, str]:
     """Return the versions of Python and important packages, the commit, and the machine."""
     result = {"python": platform.python_version(), "platform": platform.platform()}
@@ -123,7 +144,8 @@ def versions() -> dict[str, str]:
             result[name] = metadata.version(name)
         except metadata.PackageNotFoundError:
             result[name] = "not installed"
-    git = ["git", "-C", str(Path(__file__).resolve().parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    # Not of a repository around this one, such as that of a project with an environment inside.
+    git = ["git", "-C", str(ROOT), "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]
     result["commit"] = _output(git) or "not a git checkout"
     result["cpus"] = str(os.cpu_count())
     result["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"

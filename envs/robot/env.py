@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
-from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.envs.limits import LARGEST_COUNT, check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -85,8 +85,8 @@ class SimulatedRobotEnv(SeededEnv):
         max_steering: float = 80.0,
         seed: int = 0,
     ) -> None:
-        check_range(0, above=True, num_cars=num_cars, laps=laps)
-        check_range(0, above=True, time_limit=time_limit, speed=speed, car_length=car_length)
+        check_range(0, above=True, num_cars=num_cars, speed=speed, car_length=car_length)
+        check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
         check_choice(("random", "cyclic"), assignment=assignment)
         if tracks is not None and not tracks:

@@ -62,3 +62,12 @@ def test_other_learners_are_measured_without_yardsticks(tmp_path):
     (row,) = results["training"]
     assert set(row["rounds"]) == {"ppo", "coil"}
     assert "not measured" in results["sb3"][0]
+
+
+@pytest.mark.parametrize("override", ["method=rfc has no effect", "learner.gamma='x' must be a valid number"])
+def test_mistake_is_one_sentence_and_leaves_no_folder(tmp_path, capsys, override):
+    with pytest.raises(SystemExit) as end:
+        main([override.split()[0].replace("'", ""), "--quick", "--output", str(tmp_path / "run")])
+    assert (end.value.code, list(tmp_path.iterdir())) == (2, [])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"benchmark: {override}")

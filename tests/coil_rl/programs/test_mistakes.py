@@ -1,5 +1,8 @@
 """Every mistake in the input of a program: one sentence, exit code 2, no traceback, no new files."""
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -9,7 +12,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from programs import called
+from programs import called, command, environment
 
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs import train
@@ -66,10 +69,17 @@ def refusal(name, *arguments):
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("learner.gamma=nan", "learner.gamma=nan must be a finite number"),
         ("learner.hidden=[64,a]", "learner.hidden[1]='a' must be a valid integer"),
+        ("proxy.method=x", "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig"),
         # values
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
         ("budget.cars=100000 budget.steps=10000", "budget.cars x budget.steps=1000000000 must be at most"),
         ("device=tpu", "device=tpu must be cpu, cuda, or one GPU such as cuda:0"),
+        ("preset.rate=1e23", "env: rate=1e+23 must be more than 0 and at most 1000"),
+        ("env.time_limit=1e300", "env: time_limit=1e+300 must be more than 0 and at most 1000000"),
+        ("env.laps=999999999999999999", "env: laps=999999999999999999 must be more than 0 and at most 1000000"),
+        ("learner.hidden=[99999999]", "learner: hidden=99999999 must be at least 1 and at most 4096"),
+        (f"learner.hidden={[8] * 17}".replace(" ", ""), "learner: hidden_layers=17 must be at least 0 and at most 16"),
+        ("proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
         ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
         ("track.train.count=0", "track.train: count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
@@ -85,12 +95,18 @@ def refusal(name, *arguments):
         ("guide=splin", "no guide=splin; guide can be centre_fast, constant, learned, random, spline, undertuned"),
         ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
         ("+experiment=nope", "no experiment=nope; experiment can be coil_vs_ppo"),
+        ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
+        ("+degrade=${pid:}", "the command line cannot be composed; give each group a name, GROUP=CHOICE"),
+        (f"method={'x' * 300}", "... cannot be used (File name too long); choose a shorter name"),
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
         ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
         ("method=coil degrade=[shuffled] track.train.count=2", "track.test has 1 tracks, with one car each: degrade: "),
         ("method=coil +degrade@evaluation.advice.other=shuffled", "one car each: method.transforms: ShuffledAdvice"),
         ("method=oil", "track.train gives one track, which cannot be left out to validate; set learner.group_key=null"),
+        ("method=dynamic_coil_joint proxy.learner.regressor.epochs=-1", "guide.spline: learner: epochs=-1 must"),
+        ("method=dynamic_coil_joint proxy.method.observes=[]", "proxy.method.observes: a proxy needs observations"),
+        ("method=dynamic_coil_joint ~proxy.method.transforms.advice", "guide.spline: method.transforms.advice="),
         ("guide=learned guide.learned.run=nowhere", "guide.learned: run=nowhere is not the folder of a run"),
         ("method=rfc +method.transforms.coupling.guide=1", "method.transforms: RewardCoupling reads row 1 of"),
         ("method=rfc ~method.transforms.advice", "but there is no advice; put GuideActions with"),
@@ -98,7 +114,7 @@ def refusal(name, *arguments):
 )  # fmt: skip
 def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, message):
     monkeypatch.chdir(tmp_path)
-    errors = (UserError, OmegaConfBaseException, HydraException, ValueError)
+    errors = (UserError, OmegaConfBaseException, HydraException, ValueError, OSError, AssertionError)
     with initialize_config_module("coil_rl.conf", version_base="1.3"), pytest.raises(errors) as caught:
         check(compose("train", [*TINY, "run_dir=run", *arguments.split()]))
     text = sentence(caught.value)
@@ -124,6 +140,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("--config-dir=nope", "nope' not found"),
         # folders
         ("hydra.run.dir=/dev/null/run", "/dev/null/run cannot be used (Not a directory)"),
+        (f"label={'x' * 300}", "cannot be used (File name too long); choose a shorter name"),
         ("run_dir=/dev/null", "the run's folder /dev/null cannot be used (File exists)"),
         # tracks and sweeps
         ("track=folder", "track.dir must be given: write track.dir=VALUE"),
@@ -176,13 +193,14 @@ def run(tmp_path_factory):
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
         ({"learner.gama": 1}, "learner: PPO takes no gama"),
         ({"learner.hidden": [8]}, "policy_last.pt does not fit the networks in"),
+        ({"budget.cars": -5}, "budget.cars=-5 must be greater than or equal to 1"),
     ],
 )
 def test_changed_run_folder_is_refused(started, run, tmp_path, change, message):
     (tmp_path / "policy_last.pt").write_bytes((run / "policy_last.pt").read_bytes())
     config = OmegaConf.load(run / "config.yaml")
     for key, value in change.items() if isinstance(change, dict) else ():
-        OmegaConf.update(config, key, value)
+        OmegaConf.update(config, key, value, merge=False)
     OmegaConf.save(config, tmp_path / "config.yaml")
     if isinstance(change, bytes):
         (tmp_path / "config.yaml").write_bytes(change)
@@ -190,6 +208,67 @@ def test_changed_run_folder_is_refused(started, run, tmp_path, change, message):
         assert called("evaluate", *TINY[2:], "run=.").stderr == ""
     else:
         assert message in refusal("evaluate", *TINY[2:], "run=.")
+
+
+def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path):
+    config = OmegaConf.load(run / "config.yaml")
+    del config.guide.spline["_target_"]
+    OmegaConf.save(config, tmp_path / "config.yaml")
+    (tmp_path / ".lock").touch()
+    assert "config.yaml: guide.spline={'spline': 'cubic', " in refusal("train", "resume=.")
+
+
+@pytest.mark.parametrize("name", ["evaluate", "listen"])
+@pytest.mark.parametrize("change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"])
+def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
+    sentence = refusal(name, *TINY[2:], f"run={run}", change)
+    assert f"{change} has no effect: run={run} has its own configuration; what can be changed is run, track" in sentence
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("evaluate", "method=ppo", "method=ppo has no effect: a guide is evaluated without an agent"),
+        ("robot", "method=ppo", "method=ppo has no effect: guides drive alone"),
+        ("distill", "degrade=[noisy]", "degrade=[noisy] has no effect: a proxy is trained as the key proxy says"),
+        ("distill", "proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
+        (
+            "distill",
+            "proxy.learner._target_=coil_rl.learners.PPO",
+            "proxy of guide.spline: method=proxy needs a learner",
+        ),
+    ],
+)
+def test_override_without_effect_or_out_of_range_is_refused(started, name, arguments, message):
+    assert message in refusal(name, arguments)
+
+
+@pytest.mark.slow
+def test_missing_extra_is_named(tmp_path):
+    (tmp_path / "conf" / "env").mkdir(parents=True)
+    (tmp_path / "conf" / "env" / "theirs.yaml").write_text("_target_: torchrl.envs.GymEnv\nenv_name: Pendulum-v1\n")
+    without = (
+        "import sys; sys.modules |= {'gym': None, 'gymnasium': None}; from coil_rl.programs.train import main; main()"
+    )
+    command = [sys.executable, "-c", without, "--config-dir=conf", "env=theirs"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.endswith("python -m pip install 'coil-rl[gym]' installs Gymnasium")
+
+
+# The first is imported before the program begins, the second by its check of the configuration.
+@pytest.mark.parametrize("module", [b"omegaconf.errors", pytest.param(b"torch.nn.functional", marks=pytest.mark.slow)])
+def test_interrupt_while_importing_is_one_line(tmp_path, module):
+    python, *arguments = command("train", *TINY)
+    verbose = [python, "-X", "importtime", *arguments]  # a line on standard error for each module
+    started = subprocess.Popen(verbose, cwd=tmp_path, env=environment(tmp_path), stderr=subprocess.PIPE)
+    next(line for line in started.stderr if module in line)
+    started.send_signal(signal.SIGINT)
+    _, error = started.communicate(timeout=60)
+    assert started.returncode == 130, error
+    assert error.splitlines()[-1] == b"train: interrupted"
+    assert b"Traceback" not in error
 
 
 def leaves(node, path=""):

@@ -92,6 +92,39 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
     assert contents(tmp_path / "stopped") == resumed
 
 
+def test_checkpoint_of_another_run_is_refused(tmp_path):
+    def resumed(**identity):
+        run = experiment(tmp_path, frames=16 * 8)
+        run.identity = identity
+        run.resume()
+
+    checkpoint.save_newest({"policy": 1}, tmp_path)
+    with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks identity\); put the files"):
+        resumed()
+    checkpoint.save_newest(experiment(tmp_path).state_dict() | {"identity": {"threads": 1}, "learner": {}}, tmp_path)
+    with pytest.raises(UserError, match=r"checkpoint\.pt belongs to a run with threads=1, not 2; put the files"):
+        resumed(threads=2)
+    with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks policy\)"):
+        resumed(threads=1)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text.replace(b"128,", b",", 1),
+        lambda text: text.replace(b"\n", b"\n\xff", 1),
+        lambda text: text.partition(b"\n")[2] * 2,
+    ],
+    ids=["empty cell", "bytes", "no header"],
+)
+def test_damaged_log_is_refused(tmp_path, damage):
+    experiment(tmp_path, frames=16 * 8 * 2).run()
+    log = tmp_path / "metrics.csv"
+    log.write_bytes(damage(log.read_bytes()))
+    with pytest.raises(UserError, match=r"metrics\.csv is damaged .*; put the whole file back"):
+        experiment(tmp_path).resume()
+
+
 class WriteNaN(Transform):
     """Write NaN into an entry of one car at one step of the run."""
 
