@@ -2,6 +2,7 @@ import os
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
@@ -76,6 +77,19 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
 def test_wheel_has_one_import_name(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
     assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
+
+
+@pytest.mark.slow
+def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
+    run(sys.executable, "-m", "build", "--sdist", "--no-isolation", "--outdir", "..", cwd=tree)
+    [sdist] = tree.parent.glob("*.tar.gz")
+    with tarfile.open(sdist) as file:
+        names = {name.partition("/")[2] for name in file.getnames()}
+    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "tests", "transforms"]
+    paths = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
+    needed = {path.relative_to(tree).as_posix() for path in paths} - {f"coil_rl/{name}" for name in LINKS}
+    files = {"CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"}
+    assert (needed | files | {"results/RESULTS.md"}) - names == set()
 
 
 @pytest.mark.slow

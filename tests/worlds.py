@@ -15,6 +15,13 @@ def cones(*transforms, cars=6) -> TransformedEnv:
     return TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), *transforms))
 
 
+def without_rate(**options) -> ConeTrackEnv:
+    """Return cars whose control rate is not known."""
+    env = ConeTrackEnv(**options)
+    del env.rate
+    return env
+
+
 def pendulum(*transforms) -> TransformedEnv:
     """Return one pendulum without a batch, torque in [-2, 2]; the guide damps it."""
     damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.programs import app
@@ -34,7 +36,9 @@ def evaluate(config: DictConfig) -> float:
 
 
 def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
-    """Return the configuration of a run with the requested tracks and evaluation, and its policy.
+    """Return the configuration of a run with the requested evaluation, and its policy.
+
+    The tracks are those of the run unless the command line gives others.
 
     Raises:
         UserError: if the folder holds no complete run.
@@ -44,6 +48,8 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
     from coil_rl.train.load import load_policy
     from coil_rl.train.run_folder import read_config
 
+    if HydraConfig.initialized() and not any(re.match(r"[+~]*track\b", o) for o in HydraConfig.get().overrides.task):
+        requested.track = read_config(run, "run").track
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] |= resolved["degrade"]

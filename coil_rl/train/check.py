@@ -35,6 +35,7 @@ from coil_rl.train.build import (
 )
 from coil_rl.train.config import TrainConfig
 from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
+from coil_rl.train.evaluation import INFO
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -123,8 +124,7 @@ def _check_learner_kind(config: DictConfig) -> None:
 
 
 def _check_guides(config: DictConfig, tracks: dict[str, int]) -> None:
-    check_node(config.env, "env")
-    env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
+    env = _evaluation_env(config)
     guides = build_guides(config)
     for name, guide in guides.items():
         check_guide_in_env(guide, env, f"guide.{name}")
@@ -132,6 +132,24 @@ def _check_guides(config: DictConfig, tracks: dict[str, int]) -> None:
     if config.degrade:
         for split, count in tracks.items():
             _check_drive(config, split, count, partial(build_guided_env, guides=guides))
+
+
+def _evaluation_env(config: DictConfig) -> EnvBase:
+    """Return the env with one car, or raise a `UserError` if drivers cannot be evaluated in it."""
+    name = config.env.get("_target_", "it")
+    # First, because methods and evaluation set further keys of envs with tracks.
+    if "tracks" not in config.env:
+        raise UserError(
+            f"env: {name} has no key tracks, so nothing can drive in it; choose another env "
+            "(for the steering of policies on a recording: coil-replay recording=FILE)"
+        )
+    check_node(config.env, "env")
+    env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
+    missing = [f"info.{key}" for key in INFO if ("info", key) not in env.observation_spec.keys(True)]
+    if missing or (config.evaluation.gif and not hasattr(env, "rate")):
+        needs = f"entries {', '.join(missing)}" if missing else "attribute rate (steps per second) for evaluation.gif"
+        raise UserError(f"env: {name} lacks the {needs}; the evaluation reads them")
+    return env
 
 
 def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:

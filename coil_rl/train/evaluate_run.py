@@ -74,7 +74,8 @@ def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder:
     crashed = {driver: [row["crashed"] for row in result.episodes] for driver, result in drives.items()}
     draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
     if config.evaluation.gif:
-        animate_lines(tracks, lines, folder / "lines.gif", rate=config.env.rate, crashed=crashed)
+        rate = next(iter(drives.values())).rate
+        animate_lines(tracks, lines, folder / "lines.gif", rate=rate, crashed=crashed)
     columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
     tasks = {key: key.removeprefix(PER_STEP) for key in table[0] if key.startswith(PER_STEP)}
     columns |= {key: (f"{task} (a step)", ".3f") for key, task in tasks.items()}

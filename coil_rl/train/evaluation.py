@@ -18,6 +18,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.report.runs import MEASURES, PER_STEP
 
+INFO = ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")  # entries of `info` that are evaluated
+
 
 @dataclass(frozen=True)
 class EvaluationResult:
@@ -29,11 +31,13 @@ class EvaluationResult:
             gives `reward` and `steps` only, one with tasks (`info`, `task`) also `steps_TASK` and `reward_TASK`.
         lines: positions of each car, [steps, 2] m.
         smoothness: |a - a_avg| of each car, [steps].
+        rate: control steps per second, the attribute `rate` of the env; NaN for an env without it.
     """
 
     episodes: list[dict[str, Any]]
     lines: list[NDArray[np.float64]]
     smoothness: list[NDArray[np.float64]]
+    rate: float
 
     @property
     def mean_reward(self) -> float:
@@ -47,7 +51,7 @@ class EvaluationResult:
 
     def __getitem__(self, cars: slice) -> EvaluationResult:
         """Return the episodes of some cars."""
-        return EvaluationResult(self.episodes[cars], self.lines[cars], self.smoothness[cars])
+        return EvaluationResult(self.episodes[cars], self.lines[cars], self.smoothness[cars], self.rate)
 
 
 @torch.no_grad()
@@ -82,7 +86,7 @@ def evaluate_policy(
         if tick is not None:
             tick()
     steps = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
-    return _measure(steps, names)
+    return _measure(steps, names, getattr(env, "rate", float("nan")))
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor) -> TensorDictBase:
@@ -98,14 +102,14 @@ def _record(after: TensorDictBase) -> dict[str, Tensor]:
     record = {"reward": after["reward"]}
     if "info" in after:
         info = after["info"]
-        record |= {key: info[key] for key in ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")}
+        record |= {key: info[key] for key in INFO}
         record["finished"] = after["terminated"] & ~info["crashed"]
         if "task" in info:
             record |= {f"steps_{name}": active for name, active in info["task"].items()}
     return record
 
 
-def _measure(steps: dict[str, NDArray[np.float64]], names: Sequence[str]) -> EvaluationResult:
+def _measure(steps: dict[str, NDArray[np.float64]], names: Sequence[str], rate: float) -> EvaluationResult:
     episodes, lines, smoothness = [], [], []
     for car, running in enumerate(steps["running"].astype(bool).T):
         own = {key: values[running, car] for key, values in steps.items()}
@@ -128,7 +132,7 @@ def _measure(steps: dict[str, NDArray[np.float64]], names: Sequence[str]) -> Eva
                 if key.startswith("steps_"):
                     row |= {key: int(active.sum()), f"reward_{key[6:]}": (active * own["reward"]).sum()}
         episodes.append(row)
-    return EvaluationResult(episodes, lines, smoothness)
+    return EvaluationResult(episodes, lines, smoothness, rate)
 
 
 def summarise(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:

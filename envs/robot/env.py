@@ -97,8 +97,9 @@ class SimulatedRobotEnv(SeededEnv):
         self.assignment = assignment
         self.perception = perception or Perception(simulated_cone_classifier())
         self.lidar = lidar or SimulatedLidar()
-        self.laps, self.max_steps = laps, round(time_limit * self.lidar.rate)
-        self.step_length, self.car_length = speed / self.lidar.rate, car_length
+        self.rate = self.lidar.rate
+        self.laps, self.max_steps = laps, round(time_limit * self.rate)
+        self.step_length, self.car_length = speed / self.rate, car_length
         self.max_steering = math.radians(max_steering)
         self.weights = {key: torch.tensor(float(x)) for key, x in RewardWeights(**(reward or {}))._asdict().items()}
         sight = self.perception.range_max * self.perception.scale
@@ -184,7 +185,7 @@ class SimulatedRobotEnv(SeededEnv):
         inside = (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
         entered = inside & ~self.in_finish
         finished = entered & (self.lap_start >= 0)
-        lap_time = (self.steps - self.lap_start) * finished / self.lidar.rate
+        lap_time = (self.steps - self.lap_start) * finished / self.rate
         self.in_finish, self.lap = inside, self.lap + finished
         self.lap_start = torch.where(entered, self.steps, self.lap_start)
         return lap_time, finished

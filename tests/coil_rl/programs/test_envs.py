@@ -1,0 +1,100 @@
+"""Every env of the configuration trains, is killed, resumes and is evaluated, by its guide and each kind of learner."""
+
+import signal
+import time
+from pathlib import Path
+
+import kill_and_resume
+import pytest
+from programs import called
+
+ENVS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
+REPLAYS = ["mcap_replay"]  # for coil-replay alone
+DRIVEN = [env for env in ENVS if env not in REPLAYS]
+TINY = ["env.laps=1", "env.time_limit=1", "evaluation.repeats=1", "logger=none", "checkpoint_every=1",
+        "budget.frames=256", "budget.cars=4", "budget.steps=16"]  # fmt: skip
+PPO = ["learner.epochs=2", "learner.minibatches=2"]
+REPLAY = ["learner.capacity=1000", "learner.starts=64", "learner.batch_size=32", "learner.ratio=1"]
+PROXY = ["proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16", "proxy.learner.regressor.epochs=1"]
+LEARNERS = {
+    "ppo": ["method=ppo", *PPO],
+    "guide": ["method=guide"],
+    "forest": ["method=oil", "learner=forest", "learner.regressor.estimator.n_estimators=5", "learner.validate=false"],
+    "linear": ["method=dagger", "learner=linear"],
+    "dynamic_coil": ["method=dynamic_coil_sequential", "guide=[spline,constant]", *PPO, *PROXY],
+    "dqn": ["method=coil", "learner=dqn", *REPLAY],
+    "sac": ["method=coil", "learner=sac", *REPLAY],
+}
+
+
+def kill(folder, overrides, mark):
+    """Start a run in a process of its own and kill it at a mark."""
+    process = kill_and_resume.start(folder, overrides)
+    began = time.monotonic()
+    while process.poll() is None and kill_and_resume.marks(folder) < mark:
+        assert time.monotonic() < began + kill_and_resume.TIMEOUT
+        time.sleep(0.002)
+    process.kill()
+    assert process.wait() == -signal.SIGKILL, "the run ended before it was killed"
+    assert not (folder / "evaluation.csv").exists()
+
+
+def trained(env, learner, folder):
+    """Train to the end, evaluate the run again, and return the arguments of the training."""
+    overrides = [f"env={env}", *LEARNERS[learner], *TINY]
+    called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
+    assert (folder / "lines.gif").exists()
+    called("evaluate", f"run={folder}", "evaluation.repeats=1", "hydra.run.dir=again", cwd=folder.parent)
+    again = folder.parent / "again" / "evaluation.csv"
+    assert again.read_bytes() == (folder / "evaluation.csv").read_bytes()
+    return overrides
+
+
+@pytest.mark.parametrize("env", DRIVEN)
+def test_env_trains_and_is_evaluated_on_its_own_tracks(env, tmp_path):
+    trained(env, "ppo", tmp_path / "run")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("env", DRIVEN)
+def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_path, monkeypatch):
+    monkeypatch.setattr(kill_and_resume, "SMALL", [])
+    whole, resumed = tmp_path / "whole", tmp_path / "resumed"
+    overrides = trained(env, learner, whole)
+    kill(resumed, overrides, kill_and_resume.marks(whole) // 2)
+    called("train", f"resume={resumed}", cwd=tmp_path)
+    logs = [name for name in kill_and_resume.LOGS if (whole / name).exists()]
+    assert len(logs) == (2 if learner == "guide" else 4)
+    for name in logs:
+        assert (resumed / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("env", REPLAYS)
+def test_env_without_tracks_is_refused_before_the_training(env, learner, tmp_path):
+    done = called("train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2)
+    assert "McapReplayEnv has no key tracks, so nothing can drive in it; choose another env" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (
+            ["+env.info=false", "~watch.episode", "~watch.step"],
+            "ConeTrackEnv lacks the entries info.track, info.lap_time",
+        ),
+        (
+            ["env._target_=worlds.without_rate"],
+            "without_rate lacks the attribute rate (steps per second) for evaluation.gif",
+        ),
+        (["env=simulated_robot", "method=oil"], "track.train gives one track, which cannot be left out to validate"),
+    ],
+)
+def test_env_that_cannot_be_evaluated_or_validated_is_refused(overrides, words, tmp_path):
+    done = called("train", *overrides, "hydra.run.dir=run", cwd=tmp_path, code=2)
+    assert words in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not any(tmp_path.iterdir())
