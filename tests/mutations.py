@@ -31,18 +31,21 @@ TREES: list[Any] = [None, [], [[]], [1, "a"], {}, {"a": 1}, {"_target_": "coil_r
 MARK = "touch ../outside/marker"
 BOMB = b"cos\nsystem\n(S'" + MARK.encode() + b"'\ntR."  # a pickle that runs a command
 # What a configuration from a stranger must not call: it writes outside of the run, or runs the pickle.
-CALLS = [
-    {"_target_": target, "_args_": arguments}
-    for target, *arguments in (
-        ("sympy.sympify", f"__import__('os').system({MARK!r})"), ("os.system", MARK),
-        ("builtins.eval", f"__import__('os').system({MARK!r})"),
-        ("subprocess.Popen", MARK.split()), ("distutils.spawn.spawn", MARK.split()),
-        ("torch.utils.collect_env.run", MARK), ("coil_rl.train.run_folder._output", MARK.split()),
-        ("joblib.load", "bomb.pkl"), ("pandas.read_pickle", "bomb.pkl"), ("torch.hub.load", ".", "x", "local"),
-        ("builtins.open", "../outside/marker", "w"), ("shutil.copyfile", "bomb.pkl", "../outside/marker"),
-        ("coil_rl.files.write_text", "../outside/marker", "x"),
-    )
-]  # fmt: skip
+CALLS: list[dict[str, Any]] = [
+    {"_target_": "sympy.sympify", "a": f"__import__('os').system({MARK!r})"},
+    {"_target_": "os.system", "command": MARK},
+    {"_target_": "subprocess.Popen", "args": MARK.split()},
+    {"_target_": "distutils.spawn.spawn", "cmd": MARK.split()},
+    {"_target_": "torch.utils.collect_env.run", "command": MARK},
+    {"_target_": "coil_rl.train.run_folder._output", "command": MARK.split()},
+    {"_target_": "joblib.load", "filename": "bomb.pkl"},
+    {"_target_": "torch.load", "f": "bomb.pkl", "weights_only": False},
+    {"_target_": "numpy.load", "file": "bomb.pkl", "allow_pickle": True},
+    {"_target_": "torch.hub.load", "repo_or_dir": ".", "model": "x", "source": "local"},
+    {"_target_": "builtins.open", "file": "../outside/marker", "mode": "w"},
+    {"_target_": "shutil.copyfile", "src": "bomb.pkl", "dst": "../outside/marker"},
+    {"_target_": "coil_rl.files.write_text", "path": "../outside/marker", "text": "x"},
+]
 BILLION = "\n".join(f"{b}: &{b} [{', '.join(9 * [f'*{a}'])}]" for a, b in zip("abcdefg", "bcdefgh", strict=True))
 YAML_LINES = [
     "a: &a [*a]", "seed: 1\nseed: 2", f"x: !!python/object/apply:os.system [{MARK!r}]", "\tx: 1", "%YAML 9.9",
@@ -136,7 +139,12 @@ def _yaml(path: Path, draw: random.Random) -> str:
         line = draw.choice(YAML_LINES)
         path.write_text(f"{path.read_text()}{line}\n")
         return f"append {line[:60]!r}"
-    tree, done = mutate(yaml.safe_load(path.read_text()), draw, "call call")
+    tree = yaml.safe_load(path.read_text())
+    if draw.random() < 0.1:  # where every program builds it
+        tree["method"]["transforms"]["extra"] = draw.choice(CALLS)
+        done = f"call {tree['method']['transforms']['extra']}"
+    else:
+        tree, done = mutate(tree, draw, "call call")
     path.write_text(yaml.safe_dump(tree))
     return done
 
