@@ -18,7 +18,7 @@ from pydantic_core import core_schema
 
 LARGEST = 2**63 - 1
 # Keys in which two runs with the same numbers may differ.
-IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust")
+IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust", "proxy.folder")
 
 
 def one_of(*choices: str) -> GetPydanticSchema:

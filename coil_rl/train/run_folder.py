@@ -108,7 +108,7 @@ def check_same(saved: Mapping[str, Any], requested: Mapping[str, Any], holder: s
 def flat(config: DictConfig) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys."""
     values: Any = OmegaConf.to_container(config, resolve=True)
-    return _flat({key: value for key, value in values.items() if key not in IGNORED_KEYS})
+    return {key: value for key, value in _flat(values).items() if not {key, key.split(".")[0]} & {*IGNORED_KEYS}}
 
 
 def _flat(node: Any, name: str = "") -> dict[str, Any]:
