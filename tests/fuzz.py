@@ -76,7 +76,7 @@ USES = {  # of a run
     "replay": "replay recording=drive.mcap runs=[RUN]",
     "resume": "train resume=RUN",
     "guide": f"train {TRACKS} {TRAIN} {ONCE} guide=learned guide.learned.run=RUN",
-    "distil": f"distill {TRACKS} {TRAIN} {PROXY} guide=learned guide.learned.run=RUN",
+    "distil": f"distill {TRACKS} {SHORT} {PROXY} guide=learned guide.learned.run=RUN",
     "report": "report resamples=20 folder=RUN",
     "reports": "report resamples=20 folder=runs actions=both",
     "robot": f"robot {SHORT} steps=[drive] runs=[RUN]",
@@ -102,7 +102,7 @@ CLASSIFIER = (
 OF_CLASSIFIER = [f"robot {SHORT} steps=[drive] {CLASSIFIER}", f"replay recording=drive.mcap {CLASSIFIER}"]
 COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "train": [f"train {TRACKS} {TRAIN} {ONCE} method=coil"],
-    "distill": [f"distill {TRACKS} {TRAIN} {PROXY}"],
+    "distill": [f"distill {TRACKS} {SHORT} {PROXY}"],
     "evaluate": [USES["evaluate"], f"evaluate {TRACKS} {SHORT}"],
     "listen": [USES["listen"]],
     "replay": [USES["replay"]],

@@ -20,6 +20,7 @@ from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
+from coil_rl.errors import UserError
 from coil_rl.learners import networks
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -188,7 +189,14 @@ class PPO:
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
-        losses: TensorDictBase = (self.compiled or self.loss)(minibatch)
+        try:
+            losses: TensorDictBase = (self.compiled or self.loss)(minibatch)
+        except RuntimeError as error:
+            if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+                raise UserError(
+                    "learner.compile=true: the loss cannot be compiled; install a C++ compiler, or leave it out"
+                ) from error
+            raise
         return losses
 
     def masked_losses(self, minibatch: TensorDictBase) -> TensorDictBase:

@@ -36,6 +36,8 @@ def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "la
             f"{path} does not fit the networks in {folder / 'config.yaml'}; one of them was changed after the run"
         ) from error
     policy: TensorDictModuleBase = learner.policy
+    if not all(parameter.isfinite().all() for parameter in policy.parameters()):
+        raise UserError(f"{path} holds weights that are NaN or infinite; train again or use another")
     return policy
 
 

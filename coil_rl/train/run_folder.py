@@ -38,8 +38,11 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
         UserError: if another process holds the lock, unless `wait` is set.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    lock = folder / ".lock"
+    if lock.is_dir():
+        raise UserError(f"{lock} is a folder, but must be a file that locks the run; remove it")
     try:
-        with FileLock(folder / ".lock", timeout=-1 if wait else 0):
+        with FileLock(lock, timeout=-1 if wait else 0):
             remove_unfinished(folder)
             yield
     except Timeout:

@@ -305,3 +305,10 @@ def test_any_value_is_accepted_or_refused_in_one_sentence(started, examples):
         assert files() == before
 
     change_one_value()
+
+
+def test_folder_in_place_of_the_lock_is_named(tmp_path):
+    lock = tmp_path / "run" / ".lock"
+    lock.mkdir(parents=True)
+    ended = called("train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY, cwd=tmp_path, code=2)
+    assert ended.stderr == f"train: {lock} is a folder, but must be a file that locks the run; remove it\n"

@@ -8,7 +8,7 @@ from run_folders import make_untrained_run
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
-from coil_rl.train import load
+from coil_rl.train import checkpoint, load
 from coil_rl.train.run_folder import read_config
 
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]
@@ -70,3 +70,12 @@ def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(replay, tmp_p
     with pytest.raises(UserError, match=words) as refusal:
         acts(run, replay)
     assert str(run) in str(refusal.value)
+
+
+def test_weights_that_are_not_finite_are_refused(replay, tmp_path):
+    run = make_untrained_run(tmp_path / "ppo", "method=ppo", *TRACK)
+    state = checkpoint.load(run / "policy_last.pt")
+    next(iter(state.values())).fill_(torch.nan)
+    checkpoint.save(state, run / "policy_last.pt")
+    with pytest.raises(UserError, match=r"policy_last\.pt holds weights that are NaN or infinite"):
+        acts(run, replay)
