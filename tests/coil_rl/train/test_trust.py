@@ -179,6 +179,7 @@ def package(tmp_path, monkeypatch):
     source = "import os\nfrom coil_rl.guides import ZeroGuide\n\nclass TheirGuide(ZeroGuide):\n    pass\n"
     (folder / "their_package" / "__init__.py").write_text(source)
     monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "their_package", raising=False)  # of another test
     yield folder
     sys.modules.pop("their_package", None)
 
