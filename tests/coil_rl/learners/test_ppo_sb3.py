@@ -122,16 +122,16 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
 
 @pytest.mark.slow
 def test_cart_pole_is_learned_as_fast_as_by_stable_baselines3():
-    """PPO("MlpPolicy", "CartPole-v1", seed=0, 1) of 2.9.2: 183 and 181 steps in the last 100 of 24,576 frames."""
+    """Its PPO("MlpPolicy", "CartPole-v1", seed=SEED) has mean lengths of 183, 181 and 177 for the seeds 0, 1 and 2."""
     lengths = []
     for seed in range(3):
         torch.manual_seed(seed)
         env = TransformedEnv(CartPoles(1, seed), RewardSum())
         learner = PPO(env, **OPTIONS, seed=seed)
         rollout, of_seed = Rollout(env, learner.policy, 2048, [*learner.keys, ("next", "episode_reward")]), []
-        for _ in range(12):
+        for _ in range(12):  # 24,576 frames; the last 100 episodes count
             batch = rollout.collect()
             learner.update(batch)
             of_seed += batch["next", "episode_reward"][batch["next", "done"]].tolist()
         lengths.append(sum(of_seed[-100:]) / 100)
-    assert sum(lengths) / 3 == pytest.approx(182, rel=0.1)
+    assert sum(lengths) / 3 == pytest.approx(180, rel=0.1)
