@@ -184,14 +184,18 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
 
 
 def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
-    """Return by tracks the rewards of the best guide that earns more than 0 on each without a crash.
+    """Return by tracks the rewards of the best guide; where it crashes or earns nothing, its mean over the others.
 
-    The result is empty if some run has driven tracks without such a guide: scores of all runs are to be alike.
+    The result is empty if a run drove tracks on which no guide earns anything: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
-        if (guide.table["reward"] > 0).all() and not (guide.table["crashed"] > 0).any():
-            references.setdefault(guide.tracks, guide.by_seed("reward").mean().to_numpy())
+        rewards = guide.by_seed("reward").mean()
+        earned = rewards[(rewards > 0) & ~(guide.by_seed("crashed") > 0).any()]
+        if len(earned):
+            references.setdefault(
+                guide.tracks, rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
+            )
     return references if all(tuple(run.evaluation["track"].unique()) in references for run in runs) else {}
 
 

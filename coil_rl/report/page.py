@@ -103,7 +103,10 @@ def notes(against: str | None, normalised: bool, sampled: bool) -> str:
         "Clopper-Pearson."
     )
     if normalised:
-        text += " Reward / guide's: each reward is divided by that of the best guide on the same track."
+        text += (
+            " Reward / guide's: each reward is divided by the best guide's on the same track (where it crashes or "
+            "earns nothing, by its mean over the others)."
+        )
     if against is not None:
         text += (
             f" Difference to {_other(against)}: of the same seed, p after Holm's correction for all rows (of sign "

@@ -40,12 +40,12 @@ CLAIMS = (
 
 NOTES = """
 Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. {score}:
-each reward is divided by the guide's on the same track, if the guide earns more than 0 on each without a crash.
-Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks of different
-methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over seeds, of seeds
-with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track: they also measure
-the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions, as imitations and
-the guide, are in both tables."""
+each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean over
+the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks of
+different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
+seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track:
+they also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions,
+as imitations and the guide, are in both tables."""
 
 
 class Table5(WorldsResult):

@@ -65,9 +65,15 @@ def test_completion_ranks_before_the_mean(tmp_path):
     assert list(table(tmp_path)) == [("guide", ""), ("safe", ""), ("fast", "")]
 
 
-@pytest.mark.parametrize("guide", [{"a": 500.0, "b": -1.0}, {"a": 500.0, "b": 0.0}])
-def test_scores_are_rewards_without_a_guide_that_earns_something_everywhere(guide, tmp_path):
-    make_run(tmp_path / "0", "agent", 0, driven("guide", guide) + driven("agent", TRACKS))
+@pytest.mark.parametrize("failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}])
+def test_where_the_guide_fails_its_mean_over_the_other_tracks_is_the_reference(failure, tmp_path):
+    guide = driven("guide", {"a": 500.0, "c": 300.0})[:2] + driven("guide", **failure)[:1]
+    make_run(tmp_path / "0", "agent", 0, guide + driven("agent", {"a": 500.0, "c": 600.0, "b": 200.0}))
+    assert compare(read_runs([tmp_path])).agents[0].scores.tolist() == [[1, 2, 0.5]]
+
+
+def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
+    make_run(tmp_path / "0", "agent", 0, driven("guide", {"a": -1.0, "b": 0.0}) + driven("agent", TRACKS))
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
     assert comparison.agents[0].score.mean == 550
