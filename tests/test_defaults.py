@@ -19,6 +19,7 @@ VARIATIONS = {
     "env/simulated_robot.yaml": ["reward", "lidar", "car_length"],  # rounded length
     "env/mcap_replay.yaml": ["car_length"],
     "guide/undertuned.yaml": ["gain"],
+    "learner/ppo_sb3.yaml": ["learner."],
     "proxy/network.yaml": ["method.transforms"],
     "reproduce/figure_22.yaml": ["labels"],
     "reproduce/table_4.yaml": ["worlds"],

@@ -210,12 +210,12 @@ class DynamicCoil(PPO):
         super().__init__(env, in_keys, **ppo)
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
+        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return the guides followed by the agent, and the critic."""
         shape = torch.Size([len(self.guides), *env.action_spec.shape[len(env.batch_size) :]])
         agent_keys = [*in_keys, *self.advice.out_keys]
-        agent = networks.actor(env, agent_keys, hidden, scale, gain, shapes={"guide_action": shape})
+        agent = networks.actor(env, agent_keys, hidden, shapes={"guide_action": shape}, **options)
         self.agent_parameters = list(agent.parameters())
         policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
         return policy, networks.critic(env, in_keys, hidden)

@@ -4,17 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, TensorDictModuleBase
+from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs import EnvBase
-from torchrl.modules import MLP, IndependentNormal, OneHotCategorical, ProbabilisticActor, TanhNormal
+from torchrl.modules import (
+    MLP,
+    IndependentNormal,
+    OneHotCategorical,
+    ProbabilisticActor,
+    SafeProbabilisticModule,
+    TanhNormal,
+)
 
 from coil_rl.envs.limits import check_range
+
+UNCLIPPED = "unclipped_action"
 
 
 class ConcatObservations(nn.Module):
@@ -151,6 +162,30 @@ class FastTensorDictModule(TensorDictModuleBase):
         return tensordict
 
 
+class ClippedNormal(SafeProbabilisticModule):
+    """Sample of a normal distribution, clipped to the bounds of an action.
+
+    It writes `unclipped_action`, the sample, with `action_log_prob`, and `action`, which the env executes.
+    """
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        super().__init__(
+            ["loc", "scale"], [UNCLIPPED], distribution_class=IndependentNormal, return_log_prob=True,
+            log_prob_key="action_log_prob",
+        )  # fmt: skip
+        self.low, self.high = low, high
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Entries that are written."""
+        return [*super().out_keys, "action"]
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
+        """Write the sample and the action."""
+        tensordict = super().forward(tensordict, *args, **options)
+        return tensordict.set("action", tensordict[UNCLIPPED].clamp(self.low, self.high))
+
+
 def actor(
     env: EnvBase,
     in_keys: Sequence[str],
@@ -160,11 +195,13 @@ def actor(
     *,
     shapes: Mapping[str, torch.Size] | None = None,
     state_dependent_scale: bool = False,
-) -> ProbabilisticActor:
+    squash: bool = True,
+) -> ProbabilisticTensorDictSequential:
     """Return a stochastic policy for the actions of an env.
 
-    Its distribution is a tanh-squashed normal for bounded actions, a normal for unbounded ones and a categorical for
-    discrete ones. Its deterministic action is the mode. It writes `action` and `action_log_prob`.
+    Its distribution is a tanh-squashed normal for bounded actions (without `squash` a normal whose samples are clipped,
+    see `ClippedNormal`), a normal for unbounded ones and a categorical for discrete ones. Its deterministic action is
+    the mode. It writes `action` and `action_log_prob`.
 
     The initial standard deviation before squashing is `scale`; with `state_dependent_scale` it is an output of the
     network, for continuous actions only. `gain` scales the initial weights of the last layer. `shapes` are as for
@@ -181,15 +218,16 @@ def actor(
     network = ObservationNetwork(env, in_keys, hidden, 2 * size if state_dependent_scale else size, gain, shapes)
     head = GaussianHead(network, scale) if state_dependent_scale else GlobalScaleHead(network, size, scale)
     module = FastTensorDictModule(head, in_keys, ["loc", "scale"])
-    return ProbabilisticActor(module, ["loc", "scale"], **_distribution(spec), **common)
-
-
-def _distribution(spec: TensorSpec) -> dict[str, object]:
     if not isinstance(spec, Bounded):
-        return {"distribution_class": IndependentNormal}
+        return ProbabilisticActor(module, ["loc", "scale"], distribution_class=IndependentNormal, **common)
     event = tuple(0 for _ in spec.shape[:-1])
-    bounds = {"low": spec.space.low[event], "high": spec.space.high[event]}
-    return {"distribution_class": TanhNormal, "distribution_kwargs": bounds | {"tanh_loc": False}}
+    low, high = spec.space.low[event], spec.space.high[event]
+    if not squash:
+        return ProbabilisticTensorDictSequential(module, ClippedNormal(low, high))
+    bounds = {"low": low, "high": high, "tanh_loc": False}
+    return ProbabilisticActor(
+        module, ["loc", "scale"], distribution_class=TanhNormal, distribution_kwargs=bounds, **common
+    )
 
 
 def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> FastTensorDictModule:

@@ -39,6 +39,7 @@ class PPO:
         hidden: widths of the hidden layers of both networks.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0 everywhere.
+        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds are clipped.
         learning_rate: of Adam, a number or a schedule.
         gamma: discount.
         gae_lambda: lambda of generalised advantage estimation.
@@ -81,6 +82,7 @@ class PPO:
         hidden: Sequence[int] = (64, 64),
         action_scale: float = 0.5,
         action_gain: float = 0.01,
+        squash: bool = True,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),
         gamma: float = 0.99,
         gae_lambda: float = 0.95,
@@ -102,7 +104,9 @@ class PPO:
         check_range(0, LARGEST_SEED, seed=seed)
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
         self.critic_coefficient, self.auxiliary = critic, list(auxiliary)
-        self.policy, self.critic = self.build_networks(env, in_keys, hidden, action_scale, action_gain)
+        self.policy, self.critic = self.build_networks(
+            env, in_keys, hidden, scale=action_scale, gain=action_gain, squash=squash
+        )
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss: LossModule = ClipPPOLoss(
             self.policy,
@@ -122,17 +126,18 @@ class PPO:
         self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
         self.guide_may_act = "agent_acts" in env.observation_spec
-        read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), "action", "action_log_prob"]
+        self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else "action"
+        read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), self.sample_key, "action_log_prob"]
         read += [key for auxiliary_loss in self.auxiliary for key in auxiliary_loss.keys]
         read += ["agent_acts"] if self.guide_may_act else []
         self.keys = [*read, *(("next", key) for key in (*in_keys, "reward", "done", "terminated"))]
         self.minibatch_keys = [*read, "advantage", "value_target"]
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
+        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
-        """Return policy and critic."""
-        return networks.actor(env, in_keys, hidden, scale, gain), networks.critic(env, in_keys, hidden)
+        """Return policy and critic; `options` are those of `networks.actor`."""
+        return networks.actor(env, in_keys, hidden, **options), networks.critic(env, in_keys, hidden)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
@@ -176,7 +181,9 @@ class PPO:
         if getattr(self.loss, "entropy_bonus", False):
             self.loss.entropy_coeff.fill_(self.entropy(progress))
         self.advantage(batch)
-        return batch.select(*self.minibatch_keys).reshape(-1)
+        rows = batch.select(*self.minibatch_keys).reshape(-1)
+        # Some losses of TorchRL read the sample of the policy, others `action`.
+        return rows.set("action", rows[self.sample_key])
 
     def draw_minibatches(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yield the minibatches of all passes over the rows, each pass in a random order."""

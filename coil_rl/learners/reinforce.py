@@ -55,12 +55,12 @@ class Reinforce(PPO):
         self.loss = ReinforceLoss(self.policy, self.critic, loss_critic_type="l2", functional=False)
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], scale: float, gain: float
+        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return policy and baseline."""
         if self.baseline == "critic":
-            return super().build_networks(env, in_keys, hidden, scale, gain)
-        return networks.actor(env, in_keys, hidden, scale, gain), ZeroCritic(in_keys)
+            return super().build_networks(env, in_keys, hidden, **options)
+        return networks.actor(env, in_keys, hidden, **options), ZeroCritic(in_keys)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N], with the names of its other losses."""

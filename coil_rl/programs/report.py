@@ -39,10 +39,12 @@ def report(config: DictConfig) -> None:
         )
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
-    tables = {kind: compared[kind].table(against, config.resamples, config.seed) for kind in compared}
+    tables = {kind: compared[kind].table(against) for kind in compared}
     parts = [page.section(f"{kind.capitalize()} actions", compared[kind], tables[kind], against) for kind in compared]
     parts += [*page.training(finished), *page.guide_training(finished)]
-    text = "\n\n".join([*parts, page.notes(config.resamples, against), page.progress(len(finished), len(runs))])
+    normalised = any(comparison.normalised for comparison in compared.values())
+    notes = page.notes(against, normalised, "sampled" in compared)
+    text = "\n\n".join([*parts, notes, page.progress(len(finished), len(runs))])
 
     folder = folders[0]
     write_text(folder / "report.md", text)
@@ -50,25 +52,24 @@ def report(config: DictConfig) -> None:
     for name, by_actions in {"report.csv": tables, "report_tracks.csv": tracks}.items():
         rows = [{"actions": actions} | row for actions, table in by_actions.items() for row in table]
         write_csv(rows, folder / name)
-    panels = {f"{kind} actions": _intervals(compared[kind], tables[kind]) for kind in compared}
-    draw_intervals(panels, folder / "report.png")
+    panels = {f"{kind} actions": _intervals(comparison) for kind, comparison in compared.items()}
+    draw_intervals(panels, folder / "report.png", measure="reward / guide's (mean)" if normalised else "reward (mean)")
     _draw_curves(finished, next(iter(compared.values())), folder / "report_curves.png")
     print(f"{text}\nreport: see {folder}")
 
 
-def _intervals(comparison: Comparison, rows: Sequence[Mapping[str, Any]]) -> list[Interval]:
+def _intervals(comparison: Comparison) -> list[Interval]:
     """Return the agents, each with its guide as a line; the guides if there is no agent."""
     from coil_rl.report import Interval
-    from coil_rl.report.statistics import iqm
 
-    intervals = []
-    for group, row in zip((*comparison.guides, *comparison.agents), rows, strict=True):
-        if not group.is_guide or not comparison.agents:
-            seeds = iqm(group.scores, axis=1).tolist() if len(group.scores) > 1 else []
-            guide = group.guide.iqm if group.guide else None
-            bar = (row["iqm"], row["low"], row["high"])
-            intervals.append(Interval(group.title, *bar, points=seeds, guide=guide, hollow=bool(group.advice)))
-    return intervals
+    return [
+        Interval(
+            group.title, group.score.mean, group.score.low, group.score.high,
+            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
+            guide=group.guide.score.mean if group.guide else None, hollow=bool(group.advice),
+        )
+        for group in comparison.agents or comparison.guides
+    ]  # fmt: skip
 
 
 def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> None:

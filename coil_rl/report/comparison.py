@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,8 +12,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
-from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, PER_STEP, Run
-from coil_rl.report.statistics import iqm, probability_of_improvement, stratified_bootstrap, wins
+from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, PER_STEP, TERM, Run
+from coil_rl.report.statistics import Estimate, count_of_seeds, estimate, holm, wins
 
 Array = NDArray[np.float64]
 
@@ -32,6 +32,7 @@ class Group:
         is_guide: whether the driver is a guide.
         guide: the best guide of an agent.
         needs_guide: whether the agent needs the guide during evaluation; None if that does not apply.
+        reference: rewards that scores are divided by, [tracks]; None: scores are rewards.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Group:
     is_guide: bool = False
     guide: Group | None = None
     needs_guide: bool | None = None
+    reference: Array | None = None
 
     @property
     def title(self) -> str:
@@ -59,18 +61,36 @@ class Group:
 
     @property
     def scores(self) -> Array:
-        """Rewards, [seeds, tracks]."""
-        return self.by_seed("reward").to_numpy()
+        """Rewards divided by those of the reference on the same track, [seeds, tracks]."""
+        return self.by_seed("score").to_numpy()
 
     def by_seed(self, measure: str) -> pd.DataFrame:
-        """Return one measure with seeds as rows and tracks as columns."""
-        index = self.table.index.unique("seed")
-        return pd.DataFrame(self.table[measure].to_numpy().reshape(len(index), -1), index, self.tracks)
+        """Return one of MEASURES, or "score", with seeds as rows and tracks as columns."""
+        index, score = self.table.index.unique("seed"), measure == "score"
+        values = self.table["reward" if score else measure].to_numpy().reshape(len(index), -1)
+        if score and self.reference is not None:
+            values = values / self.reference
+        return pd.DataFrame(values, index, self.tracks)
 
     @cached_property
-    def iqm(self) -> float:
-        """Interquartile mean of all rewards."""
-        return float(iqm(self.scores))
+    def score(self) -> Estimate:
+        """Mean score."""
+        return estimate(self.scores.mean(axis=1))
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """Sort key: the completed share, then the mean score, the best first."""
+        return -float(np.nan_to_num(self.table["completed"].mean())), -self.score.mean
+
+    @property
+    def crashes(self) -> str | None:
+        """Number of seeds that crashed on any track, with the interval of its share; tracks for a single guide."""
+        crashed = self.by_seed("crashed")
+        if crashed.isna().to_numpy().any():
+            return None
+        if self.seeds is None:
+            return f"{int((crashed > 0).to_numpy().sum())} of {len(self.tracks)} tracks"
+        return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
 
     def means(self, track: int | None = None) -> dict[str, float]:
         """Return the mean of each measure over seeds and tracks, or one track; the smallest for `clearance`."""
@@ -78,11 +98,10 @@ class Group:
         means = {measure: float(rows[measure].mean()) for measure in MEASURES}
         return means | {"clearance": float(rows["clearance"].min())}
 
-    @property
-    def per_step(self) -> dict[str, float]:
-        """Mean reward per step of each task, over the seeds and tracks with such a step; empty without tasks."""
-        columns = [column for column in self.table if column.startswith(PER_STEP)]
-        return {column.removeprefix(PER_STEP): float(self.table[column].mean()) for column in columns}
+    def parts(self, prefix: str) -> dict[str, float]:
+        """Return the mean of each column with a prefix, PER_STEP or TERM, over the seeds and tracks that have it."""
+        columns = [column for column in self.table if column.startswith(prefix)]
+        return {column: float(self.table[column].mean()) for column in columns}
 
 
 @dataclass(frozen=True)
@@ -92,21 +111,31 @@ class Comparison:
     guides: tuple[Group, ...]
     agents: tuple[Group, ...]
 
-    def table(self, against: str | None = None, resamples: int = 2000, seed: int = 0) -> list[dict[str, Any]]:
+    @property
+    def normalised(self) -> bool:
+        """Whether scores are fractions of a guide's reward; otherwise they are rewards."""
+        return any(group.reference is not None for group in (*self.guides, *self.agents))
+
+    def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per driver, guides first.
 
-        `improvement` is over the agent with the label `against`, or over the guide of each agent if it is "guide".
+        `difference` is the score of an agent minus that of the agent with the label `against`, or of its guide if
+        `against` is "guide", with the same seed; `p` is corrected for all rows.
         """
-        rows = []
+        rows: list[dict[str, Any]] = []
         for group in (*self.guides, *self.agents):
-            low, high = stratified_bootstrap(group.scores, resamples=resamples, seed=seed)
-            means = group.means()
+            means, pairs = group.means(), self._pairs(group, against)
+            difference = pairs.difference if pairs else Estimate(np.nan)
             rows.append({
                 "driver": group.name, "advice": group.advice, "guide": group.guide.name if group.guide else None,
-                "seeds": group.seeds, "iqm": group.iqm, "low": low, "high": high, "mean": means.pop("reward"),
-                **means, "improvement": self._improvement(group, against), "needs_guide": group.needs_guide,
-                **{PER_STEP + task: reward for task, reward in group.per_step.items()},
+                "seeds": group.seeds, "completed": means.pop("completed"), "crashes": group.crashes,
+                "score": group.score.mean, "low": group.score.low, "high": group.score.high, **means,
+                "difference": difference.mean, "difference_low": difference.low, "difference_high": difference.high,
+                "p": difference.p, "better": pairs.better if pairs else None, "needs_guide": group.needs_guide,
+                **group.parts(TERM), **group.parts(PER_STEP),
             })  # fmt: skip
+        for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
+            row["p"] = float(p)
         return rows
 
     def track_table(self) -> list[dict[str, Any]]:
@@ -117,12 +146,10 @@ class Comparison:
             for index, track in enumerate(group.tracks)
         ]
 
-    def _improvement(self, group: Group, against: str | None) -> float | None:
+    def _pairs(self, group: Group, against: str | None) -> Paired | None:
         agents = {agent.name: agent for agent in self.agents if not agent.advice}
         other = group.guide if against == GUIDE else agents.get(against or "")
-        if other is None or other is group or other.tracks != group.tracks:
-            return None
-        return probability_of_improvement(group.scores, other.scores)
+        return None if other is None or other is group or group.is_guide else paired(group, other)
 
 
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
@@ -136,6 +163,10 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     labels = {label: _join_runs([run for run in finished if run.label == label]) for label in names}
     is_guide = {label: frame["driver"].str.split().str[0] == GUIDE for label, frame in labels.items()}
     guides = _group_guides({label: frame[is_guide[label]] for label, frame in labels.items()})
+    references = _references([group for of_label in guides.values() for group in of_label], finished)
+    unique = dict.fromkeys(group for of_label in guides.values() for group in of_label)
+    normalised = {group: replace(group, reference=references.get(group.tracks)) for group in unique}
+    guides = {label: [normalised[group] for group in of_label] for label, of_label in guides.items()}
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
     for label, frame in labels.items():
@@ -145,11 +176,27 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
             Group(label, advice, _index(label, variant), False, guide, None if advice else needs_guide[label])
             for advice, variant in rows.groupby("advice", sort=False)
         ]
-        agents += sorted(variants, key=lambda group: (group.advice != "", -group.iqm))
-    best = {group.name: group.iqm for group in reversed(agents)}  # the first group of a label: unaltered advice
-    agents.sort(key=lambda group: (-best[group.name], group.name))
-    unique = dict.fromkeys(group for groups in guides.values() for group in groups)
-    return Comparison(tuple(sorted(unique, key=lambda group: -group.iqm)), tuple(agents))
+        variants = [replace(variant, reference=references.get(variant.tracks)) for variant in variants]
+        agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
+    best = {group.name: group.rank for group in reversed(agents)}  # the first group of a label: unaltered advice
+    agents.sort(key=lambda group: (best[group.name], group.name))
+    return Comparison(tuple(sorted(normalised.values(), key=lambda group: group.rank)), tuple(agents))
+
+
+def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
+    """Return by tracks the rewards of the best guide; where it crashes or earns nothing, its mean over the others.
+
+    The result is empty if a run drove tracks on which no guide earns anything: scores of all runs are to be alike.
+    """
+    references: dict[tuple[str, ...], Array] = {}
+    for guide in sorted(guides, key=lambda group: group.rank):
+        rewards = guide.by_seed("reward").mean()
+        earned = rewards[(rewards > 0) & ~(guide.by_seed("crashed") > 0).any()]
+        if len(earned):
+            references.setdefault(
+                guide.tracks, rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
+            )
+    return references if all(tuple(run.evaluation["track"].unique()) in references for run in runs) else {}
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
@@ -206,20 +253,19 @@ def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
         group = Group(name if names.count(name) == 1 else f"{name} ({listed})", "", table, is_guide=True)
         for label in shared_by:
             groups.setdefault(label, []).append(group)
-    return {label: sorted(of_label, key=lambda group: -group.iqm) for label, of_label in groups.items()}
+    return {label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()}
 
 
 @dataclass(frozen=True)
 class Paired:
-    """Difference between two drivers with the same seeds: values with the ends of their 95 % intervals."""
+    """Difference between two drivers with the same seeds."""
 
-    seeds: int  # number of common seeds
-    difference: tuple[float, float, float]  # mean difference of a measure
-    better: tuple[float, float, float]  # share of seeds and tracks with a higher value, ties counting half
+    difference: Estimate  # of a measure, mean over tracks
+    better: float  # share of seeds and tracks with a higher value, ties counting half
 
 
-def paired(group: Group, other: Group, measure: str = "reward", resamples: int = 2000, seed: int = 0) -> Paired | None:
-    """Compare two drivers seed by seed by one of MEASURES; a guide without random actions has one value for all seeds.
+def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
+    """Compare two drivers seed by seed by the score or by one of MEASURES; a single guide has one value for all seeds.
 
     The result is None without common tracks and seeds, or if the measure has NaN.
     """
@@ -232,8 +278,4 @@ def paired(group: Group, other: Group, measure: str = "reward", resamples: int =
     x, y = ours.to_numpy(), theirs.to_numpy()
     if not x.size or not np.isfinite(x).all() or not np.isfinite(y).all():
         return None
-
-    def with_interval(table: Array) -> tuple[float, float, float]:
-        return float(table.mean()), *stratified_bootstrap(table, np.mean, resamples=resamples, seed=seed)
-
-    return Paired(len(x), with_interval(x - y), with_interval(wins(x, y)))
+    return Paired(estimate((x - y).mean(axis=1)), float(wins(x, y).mean()))

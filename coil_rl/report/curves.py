@@ -16,12 +16,12 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from coil_rl.report import style
+from coil_rl.report.statistics import mean_interval
 
 Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, object]]
 
 TRAINING = "train/return"
-RESAMPLES = 2000
 UNITS = {1e6: "frames (millions)", 1e3: "frames (thousands)"}
 RETURN = "return (sum of rewards of an episode)"
 GRID_COLUMNS = 3
@@ -38,8 +38,8 @@ def draw_learning_curves(
 ) -> None:
     """Draw the return in training against frames, one curve per label.
 
-    Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 %
-    bootstrap interval of that mean as a band.
+    Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 % t
+    interval of that mean as a band.
 
     Args:
         runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with "frames" (env frames
@@ -167,7 +167,7 @@ def draw_phases(
 
 
 def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
-    """Return frames, mean over the runs and the 95 % interval (low, high) of the mean, each [P]; P = 0 without data."""
+    """Return frames, mean over the runs and its 95 % t interval (low, high), each [P]; P = 0 without data."""
     curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     if not curves:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0)
@@ -175,14 +175,9 @@ def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Arr
     frames = np.unique(np.concatenate([curve[:, 0] for curve in curves]))
     frames = frames[(frames >= start) & (frames <= end)]
     values = np.stack([np.interp(frames, *curve.T) for curve in curves])
-    mean = values.mean(axis=0)
     if len(curves) == 1:
-        return frames, mean, mean, mean
-    # The same resamples at every point: the band is as smooth as the curves.
-    resamples = np.random.default_rng(0).integers(len(curves), size=(RESAMPLES, len(curves)))
-    weights = (resamples[..., None] == np.arange(len(curves))).mean(axis=1)
-    low, high = np.percentile(weights @ values, [2.5, 97.5], axis=0)
-    return frames, mean, low, high
+        return frames, *values, *values, *values
+    return frames, *mean_interval(values)
 
 
 def points(run: Rows, key: str) -> Array:

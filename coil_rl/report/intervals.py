@@ -39,7 +39,7 @@ def draw_intervals(
     panels: Mapping[str, Sequence[Interval]],
     path: str | os.PathLike[str],
     *,
-    measure: str = "reward (interquartile mean)",
+    measure: str,
     title: str | None = None,
 ) -> None:
     """Draw one panel, or several side by side that share their rows; `panels` are at least one row by heading."""

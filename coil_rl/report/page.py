@@ -9,7 +9,8 @@ from typing import Any
 
 from coil_rl.report.comparison import Comparison
 from coil_rl.report.curves import TRAINING, points
-from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
+from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import markdown_table
 
 MAX_TRACKS = 8  # in a table
@@ -19,15 +20,16 @@ COLUMNS = {
     "driver": ("driver", ""),
     "advice": ("advice", ""),
     "seeds": ("seeds", ""),
-    "iqm": ("reward (IQM)", ".1f"),
-    "interval": ("95 % interval", ""),
-    "mean": ("mean", ".1f"),
     "completed": ("completed", ".0%"),
-    "crashed": ("crashed", ".0%"),
+    "crashes": ("seeds with a crash (95 %)", ""),
+    "score cell": ("{score} (95 %)", ""),
+    "difference cell": ("difference to {other} (95 %)", ""),
+    "p": ("p", ".3f"),
+    "better": ("better than {other}", ".0%"),
+    "reward": ("reward", ".1f"),
     "lap_time": ("lap (s)", ".2f"),
     "smoothness": ("smoothness", ".3f"),
     "clearance": ("smallest clearance (m)", ".2f"),
-    "improvement": ("better than {other}", ".0%"),
     "needs_guide": ("guide at test time", ""),
 }
 TRAINING_COLUMNS = {
@@ -43,13 +45,25 @@ TRAINING_COLUMNS = {
 
 def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
     """Return the section for one kind of actions; `rows` are `comparison.table(against)`."""
-    columns = {key: (text.format(other=_other(against)), spec) for key, (text, spec) in COLUMNS.items()}
-    if not any(row["advice"] for row in rows):
-        del columns["advice"]
-    if against is None:
-        del columns["improvement"]
-    rows = [{**row, "interval": _interval(row["low"], row["high"])} for row in rows]
-    return "\n\n".join([f"## {heading}", markdown_table(rows, columns), *_tasks(comparison), _tracks(comparison)])
+    score, spec = ("reward / guide's", ".3f") if comparison.normalised else ("reward", ".1f")
+    names = {"other": _other(against), "score": score}
+    hidden = {"advice"} if not any(row["advice"] for row in rows) else set()
+    hidden |= {"difference cell", "p", "better"} if against is None else set()
+    hidden |= set() if comparison.normalised else {"reward"}
+    columns = {key: (text.format(**names), spec) for key, (text, spec) in COLUMNS.items() if key not in hidden}
+    cells = [
+        {
+            "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
+            "difference cell": Estimate(*(row[f"difference{end}"] for end in ("", "_low", "_high"))).cell(f"+{spec}"),
+        }
+        for row in rows
+    ]
+    table = markdown_table([{**row, **cell} for row, cell in zip(rows, cells, strict=True)], columns)
+    parts = [
+        *_parts(comparison, TERM, "term of the reward", ".1f"),
+        *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
+    ]
+    return "\n\n".join([f"## {heading}", table, *parts, _tracks(comparison)])
 
 
 def guide_training(runs: Sequence[Run]) -> list[str]:
@@ -82,16 +96,24 @@ def training(runs: Sequence[Run]) -> list[str]:
     return [markdown_table(rows, TRAINING_COLUMNS)] if rows else []
 
 
-def notes(resamples: int, against: str | None) -> str:
+def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     """Return an explanation of the tables."""
     text = (
-        "IQM: the mean of the middle half of the rewards of all seeds on all tracks. Its interval: percentile "
-        f"bootstrap, {resamples} resamples of whole seeds; with few seeds it is too narrow (with five it contains the "
-        "mean in about 85 of 100 cases)."
+        "Drivers are ordered by the completed share, then by the mean. Intervals: t over seeds, of seeds with a crash "
+        "Clopper-Pearson."
     )
+    if normalised:
+        text += (
+            " Reward / guide's: each reward is divided by the best guide's on the same track (where it crashes or "
+            "earns nothing, by its mean over the others)."
+        )
     if against is not None:
-        text += f" Better than {_other(against)}: the probability of more reward on a track, any run against any run."
-    return text
+        text += (
+            f" Difference to {_other(against)}: of the same seed, p after Holm's correction for all rows (of sign "
+            f"flips from {SIGN_FLIP_SEEDS} seeds on, of a t test with fewer); better: the share of seeds and tracks "
+            "with more."
+        )
+    return text + " Sampled actions also measure the noise of exploration." * sampled
 
 
 def progress(finished: int, started: int) -> str:
@@ -111,15 +133,12 @@ def _other(against: str | None) -> str:
     return "its guide" if against == GUIDE else str(against)
 
 
-def _interval(low: float, high: float) -> str | None:
-    return None if math.isnan(low) else f"{low:.1f} to {high:.1f}"
-
-
-def _tasks(comparison: Comparison) -> list[str]:
-    """Return the table of rewards per step by task; no table without tasks."""
-    groups = {group.title: group.per_step for group in (*comparison.guides, *comparison.agents)}
-    rows = [{"driver": title} | tasks for title, tasks in groups.items() if tasks]
-    columns = {"driver": ("reward of a step", "")} | {task: (task, ".3f") for row in rows for task in list(row)[1:]}
+def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[str]:
+    """Return the table of the columns with a prefix, PER_STEP or TERM; no table without such columns."""
+    groups = {group.title: group.parts(prefix) for group in (*comparison.guides, *comparison.agents)}
+    rows = [{"driver": title} | parts for title, parts in groups.items() if parts]
+    names = dict.fromkeys(key for row in rows for key in list(row)[1:])
+    columns = {"driver": (heading, "")} | {name: (name.removeprefix(prefix), spec) for name in names}
     return [markdown_table(rows, columns)] if rows else []
 
 

@@ -21,6 +21,7 @@ GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "track")
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
 PER_STEP = "per_step_"  # prefix of the columns of tasks
+TERM = "reward_"  # prefix of the columns of the terms of the reward
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +35,8 @@ class Run:
         needs_guide: whether the agent needs the guide during evaluation; None without an agent.
         evaluation: one row per driver and track, empty until the run is finished: `driver` ("guide", "guide NAME" for
             one of several, or the label), `advice` (its modification, such as "zeroed"; empty for none), `actions`
-            ("deterministic" or "sampled"), `track`, MEASURES and, for each task, `per_step_TASK`.
+            ("deterministic" or "sampled"), `track`, MEASURES, for each task `per_step_TASK`, and for each term of the
+            reward `reward_TERM`.
         curve: rows of metrics.csv; empty if nothing was trained.
         guide_returns: mean return of each guide on the training tracks, if it was measured.
         seconds: duration of the training; None if unknown, as for an interrupted run.
@@ -111,7 +113,7 @@ def _read_run(folder: Path) -> Run:
 
 def _read_evaluation(path: Path) -> pd.DataFrame:
     frame = _read_csv(path)
-    numbers = [*MEASURES, *(column for column in frame if column.startswith(PER_STEP))]
+    numbers = [*MEASURES, *(column for column in frame if column.startswith((PER_STEP, TERM)))]
     frame = frame[[*DRIVER, *numbers]].astype(dict.fromkeys(numbers, float))
     frame = frame[frame["track"] != "mean"]
     if frame.empty:

@@ -6,12 +6,14 @@ import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from coil_rl.report import markdown_table
 from coil_rl.report.runs import Run
+from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate, holm
 
 CLAIMS_HEADING = "### What held up"
+SIGNIFICANT = 0.05
 FOOTER = "<sub>"  # begins the origin of a page
 
 INTRODUCTION = """
@@ -20,26 +22,28 @@ of the code. The paper's numbers are beside ours; its tracks and its robot are n
 order of the methods and the distances between them."""
 
 VERDICTS = """
-Each claim of the paper with our number and its 95 % interval: held up if the whole interval is on the paper's side, did
-not hold up if it is on the other side, undecided otherwise."""
+Each claim of the paper with our number, its 95 % t interval over seeds, and p after Holm's correction for all verdicts
+of its page: held up, or did not hold up, if p is below 0.05 and the number is on the paper's side, or on the other;
+undecided otherwise. p is that of sign flips from {seeds} seeds on, and of a t test with fewer. Of crashes, the number
+of seeds and the Clopper-Pearson interval of its share."""
 
 
-def with_interval(value: float, low: float, high: float, spec: str = ".1f") -> str | None:
-    """Format a number with its 95 % interval: None if the number is NaN, no interval if that is NaN."""
-    if math.isnan(value):
-        return None
-    return f"{value:{spec}}" if math.isnan(low) else f"{value:{spec}} ({low:{spec}} to {high:{spec}})"
+class Claim(NamedTuple):
+    """The claim that a number is positive, or negative for sign -1; `spec` is its format."""
 
+    estimate: Estimate
+    spec: str
+    sign: int = 1
 
-def verdict(value: float, low: float, high: float, spec: str = ".1f", sign: int = 1) -> str | None:
-    """Return the verdict on the claim that a number is positive (negative for sign -1), as a table cell.
-
-    `low` and `high` are its 95 % interval; without one (NaN) the claim is undecided. None if the number is NaN.
-    """
-    number = with_interval(value, low, high, spec)
-    lower, upper = sorted((sign * low, sign * high))
-    word = "held up" if lower > 0 else "did not hold up" if upper < 0 else "undecided"
-    return None if number is None else f"**{word}**: {number}"
+    def verdict(self, p: float) -> str | None:
+        """Return the verdict as a table cell, given the corrected p-value; None if the number is NaN."""
+        number = self.estimate.cell(self.spec)
+        if number is None:
+            return None
+        decided = p < SIGNIFICANT
+        word = "undecided" if not decided else "held up" if self.sign * self.estimate.mean > 0 else "did not hold up"
+        seeds = "1 seed" if self.estimate.seeds == 1 else f"{self.estimate.seeds} seeds"
+        return f"**{word}**: {number}, {seeds}" + ("" if math.isnan(p) else f", p {p:.3f}")
 
 
 def certain_verdict(holds: bool, details: str) -> str:
@@ -48,9 +52,17 @@ def certain_verdict(holds: bool, details: str) -> str:
 
 
 def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Return the last section of a page: rows with the paper's `claim`, and further columns by key with headings."""
+    """Return the last section of a page: rows with the paper's `claim`, and further columns by key with headings.
+
+    Cells that are a `Claim` become verdicts; they are one family of tests.
+    """
     headings = {key: (heading, "") for key, heading in {"claim": "claim of the paper", **columns}.items()}
-    return f"{CLAIMS_HEADING}\n\n{markdown_table(claims, headings)}"
+    corrected = iter(holm([cell.estimate.p for row in claims for cell in row.values() if isinstance(cell, Claim)]))
+    rows = [
+        {key: cell.verdict(float(next(corrected))) if isinstance(cell, Claim) else cell for key, cell in row.items()}
+        for row in claims
+    ]
+    return f"{CLAIMS_HEADING}\n\n{markdown_table(rows, headings)}"
 
 
 def world_heading(world: str) -> list[str]:
@@ -104,7 +116,7 @@ def all_results(
     split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), INTRODUCTION.strip().format(command=command)]
     if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:
-        parts += ["## What held up, and what did not", VERDICTS.strip(), *claims]
+        parts += ["## What held up, and what did not", VERDICTS.strip().format(seeds=SIGN_FLIP_SEEDS), *claims]
     parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
     if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(missing)]

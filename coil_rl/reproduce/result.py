@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.report.runs import Run
-from coil_rl.report.statistics import stratified_bootstrap
-from coil_rl.reproduce.pages import with_interval
 
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
@@ -46,8 +38,6 @@ class WorldsResult(Result):
         experiments: experiments in the main world.
         worlds: experiment by the name of each variant.
         against: label of the runs to compare the others with.
-        resamples: number of bootstrap resamples.
-        seed: seed of the bootstrap.
     """
 
     def __init__(
@@ -55,27 +45,11 @@ class WorldsResult(Result):
         experiments: Sequence[str],
         worlds: Mapping[str, str] | None = None,
         against: str = "ppo",
-        resamples: int = 2000,
-        seed: int = 0,
     ) -> None:
-        check_range(1, resamples=resamples)
         # The main world has no name.
         self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}
         self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]
-        self.against, self.resamples, self.seed = against, resamples, seed
-
-    def estimate(self, name: str, scores: NDArray[np.float64], statistic: Any, spec: str = ".1f") -> dict[str, Any]:
-        """Return a statistic of scores [seeds, tracks], the ends of its 95 % interval, and the table cell of all."""
-        value = low = high = math.nan
-        if scores.size and np.isfinite(scores).all():
-            value = float(statistic(scores))
-            low, high = stratified_bootstrap(scores, statistic, resamples=self.resamples, seed=self.seed)
-        return {
-            name: value,
-            f"{name}_low": low,
-            f"{name}_high": high,
-            f"{name} cell": with_interval(value, low, high, spec),
-        }
+        self.against = against
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:

@@ -16,7 +16,7 @@ from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
-from coil_rl.report.statistics import stratified_bootstrap
+from coil_rl.report.statistics import count_of_seeds, estimate
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
@@ -61,8 +61,8 @@ cone or its centre crossed the line between two. The paper's robot drove on anot
 with each other. Each drive is a row of the CSV."""
 CLAIM_NOTES = """
 Differences are of the same seed, each the mean over its drives (the minimum of the clearance); seeds: how many of them,
-as drivers without a complete lap are compared by clearance only. Intervals: percentile bootstrap of seeds, {resamples}
-resamples; a single seed has none and decides nothing."""
+as drivers without a complete lap are compared by clearance only. Intervals: t over seeds, of seeds with a crash
+Clopper-Pearson; a single seed has none and decides nothing."""
 
 
 class Table6(Result):
@@ -82,8 +82,7 @@ class Table6(Result):
         command: topic of the robot's commands, or of another policy's, such as a replay's.
         car_length: L of the robot, m.
         max_steering: degrees of an action of 1.
-        resamples: number of bootstrap resamples.
-        seed: of the bootstrap and of the LiDAR.
+        seed: of the LiDAR.
 
     Raises:
         UserError: if there are neither recordings nor experiments.
@@ -103,10 +102,9 @@ class Table6(Result):
         command: str | None = "/cmd_vel",
         car_length: float = 2 / 7,
         max_steering: float = 80.0,
-        resamples: int = 2000,
         seed: int = 0,
     ) -> None:
-        check_range(1, repeats=repeats, laps=laps, resamples=resamples)
+        check_range(1, repeats=repeats, laps=laps)
         if not labels:
             raise ValueError("labels=[] leaves the guide alone; give at least one")
         by_name = recordings if isinstance(recordings, Mapping) else {"": recordings}
@@ -119,7 +117,7 @@ class Table6(Result):
         if not files and not experiments:
             raise UserError("recordings=[] and experiments=[] give no driver; give one of them")
         self.experiments = [] if files else list(experiments)
-        self.labels, self.repeats, self.laps, self.seed, self.resamples = list(labels), repeats, laps, seed, resamples
+        self.labels, self.repeats, self.laps, self.seed = list(labels), repeats, laps, seed
         self.car_length, self.max_steering = car_length, max_steering
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -135,7 +133,7 @@ class Table6(Result):
         write_csv(rows, stem.with_suffix(".csv"))
         suffix = " (simulated)" if any(recording.simulated for recording in self.recordings) else ""
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
-        return robot_page(rows, suffix, self.max_steering, self.resamples, self.seed)
+        return robot_page(rows, suffix, self.max_steering)
 
     def _record(self, runs: Runs, folder: Path) -> list[Recording]:
         robot = f"{self.car_length:g} m, {self.max_steering:g} degrees"
@@ -159,7 +157,7 @@ class Table6(Result):
             yield agent_driver(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
 
 
-def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples: int, seed: int) -> str:
+def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     """Return the page of Tables 6 and 7, given the measures of the drives and a suffix of the headings."""
     by_method: dict[str, dict[str | None, list[Row]]] = {}
     for row in rows:
@@ -174,22 +172,21 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float, resamples:
     parts += [f"### Table 7, measured{suffix}", markdown_table(table, TABLE_7)]
     notes = NOTES.format(max_steering=max_steering).strip()
     of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
-    verdicts = [_claim(of_seeds, *claim, resamples=resamples, seed=seed) for claim in CLAIMS]
+    verdicts = [_claim(of_seeds, *claim) for claim in CLAIMS]
     claims = [claim for claim in verdicts if claim is not None]
     if not claims:
         return "\n\n".join([*parts, notes])
     crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
-    details = ", ".join(f"{line['method']} {line['crashes']} of {line['drives']} drives" for line in crashes)
+    details = ", ".join(f"{line['method']} {_crashes(line, of_seeds[line['method']])}" for line in crashes)
     ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
     claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
     section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
-    return "\n\n".join([*parts, notes + CLAIM_NOTES.format(resamples=resamples), section])
+    return "\n\n".join([*parts, notes + CLAIM_NOTES, section])
 
 
 def _claim(
-    by_method: Mapping[str, Mapping[str | None, Row]], claim: str, key: str, driver: str, other: str, sign: int,
-    *, resamples: int, seed: int,
-) -> dict[str, Any] | None:  # fmt: skip
+    by_method: Mapping[str, Mapping[str | None, Row]], claim: str, key: str, driver: str, other: str, sign: int
+) -> dict[str, Any] | None:
     """Return the verdict on a claim; None if a driver is missing, or they have no seed in common."""
     if driver not in by_method or other not in by_method:
         return None
@@ -208,9 +205,15 @@ def _claim(
     if key in ("smoothness", "lap_time"):
         line["paper"] = f"{PAPER_ROBOT[driver][key] - PAPER_ROBOT[other][key]:{spec}}"
     if len(differences):
-        ends = stratified_bootstrap(differences[:, None], np.mean, resamples=resamples, seed=seed)
-        line["ours"] = pages.verdict(float(differences.mean()), *ends, spec, sign)
+        line["ours"] = pages.Claim(estimate(differences), spec, sign)
     return line
+
+
+def _crashes(line: Row, by_seed: Mapping[str | None, Row]) -> str:
+    """Return the number of seeds with a crash; of drives for a driver without seeds."""
+    if line["seeds"] is None:
+        return f"{line['crashes']} of {line['drives']} drives"
+    return f"{count_of_seeds(sum(row['crashes'] > 0 for row in by_seed.values()), len(by_seed))} seeds"
 
 
 def _files(path: Path) -> list[Path]:

@@ -12,7 +12,7 @@ import numpy as np
 from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
 from coil_rl.report.curves import TRAINING, mean_curve, points
 from coil_rl.report.runs import GUIDE, Run
-from coil_rl.report.statistics import iqm, wins
+from coil_rl.report.statistics import Estimate, estimate, wins
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, WorldsResult, runs_by_label
 
@@ -25,12 +25,12 @@ TABLE_4_NOTES = """
 The return of a run is the mean over its last 100 finished episodes on the training tracks, actions sampled; best: the
 highest during training, as in the paper; final: the last one. The highest point of a noisy curve is above the policy's
 mean return, the more so the longer the run. Differences to {against} are of the same seed; better: the share of seeds
-with a higher best. Intervals: percentile bootstrap of whole seeds, {resamples} resamples; with five seeds they contain
-the mean in about 85 of 100 cases. Its guide: the guide alone on the training tracks, degraded as the agent's was."""
+with a higher best. Intervals: t over the runs. Its guide: the guide alone on the training tracks, degraded as the
+agent's was."""
 
 FIGURE_22_NOTES = """
 The return is the mean over the last 100 finished episodes on the training tracks, actions sampled; the curve is the
-mean of the runs, the band the 95 % bootstrap interval of that mean. The guide alone earns {guide} there. Up to the
+mean of the runs, the band its 95 % t interval. The guide alone earns {guide} there. Up to the
 guide: the number of frames after which the mean of the runs first reaches that. The paper draws three curves of each
 method and prints no numbers."""
 
@@ -49,22 +49,21 @@ class Table4(WorldsResult):
         _draw_returns(rows[""], tables[""], self.against, stem.with_suffix(".png"))
         columns = {
             "label": ("method", ""), "runs": ("runs", "d"), "best cell": ("best: mean (95 %)", ""),
-            "best_iqm cell": ("best: IQM (95 %)", ""), "final cell": ("final: mean (95 %)", ""),
+            "final cell": ("final: mean (95 %)", ""),
             "guide": ("its guide", ".1f"), "difference cell": (f"best - {self.against}'s (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
         }  # fmt: skip
         parts = ["## Table 4: the return in training", _paper_table(tables[""])]
         for world, table in tables.items():
             parts += [*pages.world_heading(world), markdown_table(table, columns)]
-        parts += [TABLE_4_NOTES.strip().format(against=self.against, resamples=self.resamples)]
+        parts += [TABLE_4_NOTES.strip().format(against=self.against)]
         claims = []
         for world, table in tables.items():
             for line in table:
                 if line["label"] == "coil" and self.against == "ppo":
                     claim = ", ".join(filter(None, ("COIL's best return in training is above PPO's", world)))
                     paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
-                    ours = pages.verdict(line["difference"], line["difference_low"], line["difference_high"], "+.1f")
-                    claims.append({"claim": claim, "paper": paper, "ours": ours})
+                    claims.append({"claim": claim, "paper": paper, "ours": pages.Claim(line["difference"], "+.1f")})
         if claims:
             parts.append(pages.claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
         return "\n\n".join(parts)
@@ -84,11 +83,11 @@ class Table4(WorldsResult):
             ours, theirs = (np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference))
             line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
             line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
-            line |= self.estimate("best", best[:, None], np.mean) | self.estimate("best_iqm", best[:, None], iqm)
-            line |= self.estimate("final", final[:, None], np.mean)
-            line |= self.estimate("difference", (ours - theirs)[:, None], np.mean, "+.1f")
+            for key, values in {"best": best, "final": final, "difference": ours - theirs}.items():
+                line[key] = estimate(values)
+                line[f"{key} cell"] = line[key].cell("+.1f" if key == "difference" else ".1f")
             table.append(line)
-        return sorted(table, key=lambda line: -line["best"] if math.isfinite(line["best"]) else math.inf)
+        return sorted(table, key=lambda line: -line["best"].mean if math.isfinite(line["best"].mean) else math.inf)
 
 
 class Figure22(Result):
@@ -125,7 +124,7 @@ class Figure22(Result):
                 if len(frames):
                     at = int(np.abs(frames - fraction * frames[-1]).argmin())
                     ends = (low[at], high[at]) if len(of_label) > 1 else (np.nan, np.nan)
-                    line[str(fraction)] = pages.with_interval(mean[at], *ends)
+                    line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
             reached = frames[mean >= guide] if guide is not None else frames[:0]
             table.append(line | {"reached": reached[0] if len(reached) else None})
         write_csv(rows, stem.with_suffix(".csv"))
@@ -155,7 +154,8 @@ def _paper_table(table: Sequence[Row]) -> str:
     by_label = {line["label"]: line for line in table}
     rows: list[dict[str, Any]] = [{"source": "paper, best", **PAPER_RETURNS}]
     for key in ("best", "final"):
-        rows.append({"source": f"ours, {key}"} | {label: by_label.get(label, {}).get(key) for label in PAPER_RETURNS})
+        ours = {label: by_label[label][key].mean if label in by_label else None for label in PAPER_RETURNS}
+        rows.append({"source": f"ours, {key}"} | ours)
     for row in rows:
         coil, ppo = row["coil"], row["ppo"]
         row["ratio"] = coil / ppo - 1 if coil is not None and ppo is not None and ppo > 0 else None
@@ -171,7 +171,7 @@ def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path:
     panels = {
         key: [
             Interval(
-                line["label"], line[key], line[f"{key}_low"], line[f"{key}_high"], guide=guide,
+                line["label"], line[key].mean, line[key].low, line[key].high, guide=guide,
                 points=[row[key] for row in rows if row["label"] == line["label"]] if line["runs"] > 1 else [],
             )
             for line in table

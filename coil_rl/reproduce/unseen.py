@@ -7,12 +7,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
-from coil_rl.report.comparison import Group, Paired, compare, paired
-from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, Run
-from coil_rl.report.statistics import iqm
+from coil_rl.report.comparison import Group, compare, paired
+from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, TERM, Run
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
 
@@ -27,6 +24,7 @@ PAPER_UNSEEN = {
     "coil": {"lap_time": 48.48, "smoothness": 0.606, "reward": 632.9},
 }
 MEASURE_COLUMNS = {"lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"), "reward": ("reward", ".1f")}
+SCORE = "reward / guide's"
 MAX_TRACK_COLUMNS = 8
 
 # The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
@@ -41,12 +39,13 @@ CLAIMS = (
 )
 
 NOTES = """
-Completed: share of seeds and tracks on which both laps were finished; all else is the mean over seeds and tracks. IQM:
-the mean of the middle half of the rewards. Reward - {against}'s: of the same seed on the same track; better: the share
-of seeds and tracks with more. Intervals: percentile bootstrap of whole seeds, {resamples} resamples; with five seeds
-they contain the mean in about 85 of 100 cases. The paper drove with sampled actions, here several episodes a track;
-deterministic actions are the mode. Drivers with only one kind of actions, as imitations and the guide, are in both
-tables."""
+Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. {score}:
+each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean over
+the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks of
+different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
+seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track:
+they also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions,
+as imitations and the guide, are in both tables."""
 
 
 class Table5(WorldsResult):
@@ -63,51 +62,51 @@ class Table5(WorldsResult):
             parts += pages.world_heading(world)
             if not world:
                 parts.append(_paper_table(rows))
-                panels = {f"{actions} actions": _intervals(groups[actions], rows[actions]) for actions in ACTIONS}
-                title = "Table 5: unseen tracks"
-                draw_intervals(panels, stem.with_suffix(".png"), measure="reward (mean)", title=title)
+                panels = {f"{actions} actions": _intervals(groups[actions]) for actions in ACTIONS}
+                title, measure = "Table 5: unseen tracks", f"{_score(groups[ACTIONS[0]])[0]} (mean)"
+                draw_intervals(panels, stem.with_suffix(".png"), measure=measure, title=title)
             for actions in ACTIONS:
-                parts += [f"**{actions.capitalize()} actions**", self._driver_table(rows[actions])]
+                parts += [f"**{actions.capitalize()} actions**", self._driver_table(rows[actions], groups[actions])]
                 parts += [] if world else [_track_table(groups[actions], stem.name)]
         write_csv(episodes, stem.with_suffix(".csv"))
-        notes = NOTES.strip().format(against=self.against, resamples=self.resamples)
+        notes = NOTES.strip().format(against=self.against, score=SCORE.capitalize())
         return "\n\n".join([*parts, notes, self._claims(worlds)])
 
     def _drivers(self, runs: Sequence[Run], actions: str) -> list[Group]:
-        """Return the guide, then the agents by reward; agents with only deterministic actions are always included."""
+        """Return the guide, then the agents by rank; agents with only deterministic actions are always included."""
         agents: dict[str, Group] = {}
         comparison, deterministic = compare(runs, actions), compare(runs, "deterministic")
         for group in (*comparison.agents, *deterministic.agents):
             if not group.advice:
                 agents.setdefault(group.name, group)
         guide = (agents[self.against].guide if self.against in agents else None) or comparison.guides[0]
-        ranked = sorted(agents.values(), key=lambda group: -group.scores.mean())
+        ranked = sorted(agents.values(), key=lambda group: group.rank)
         return [dataclasses.replace(guide, name=GUIDE), *ranked]
 
     def _row(self, group: Group, groups: Sequence[Group]) -> dict[str, Any]:
         """Return the measures of a driver, and its comparison with the guide and with `against`."""
-        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means()}
-        row |= self.estimate("reward", group.scores, np.mean) | self.estimate("iqm", group.scores, iqm)
+        _, spec = _score(groups)
+        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means(), **group.parts(TERM)}
+        row |= {"crashes": group.crashes, "score cell": group.score.cell(spec)}
         others = {other.name: other for other in groups if other.name != group.name}
         row |= {"difference": None, "better": None, "over_guide": None}
         if group.is_guide:
             return row
-        if self.against in others and (pairs := self._paired(group, others[self.against])):
-            row |= {"difference": pages.with_interval(*pairs.difference, "+.1f"), "better": pairs.better[0]}
-        if pairs := self._paired(group, others[GUIDE]):
-            row["over_guide"] = pairs.better[0]
+        if self.against in others and (pairs := paired(group, others[self.against])):
+            row |= {"difference": pairs.difference.cell(f"+{spec}"), "better": pairs.better}
+        if pairs := paired(group, others[GUIDE]):
+            row["over_guide"] = pairs.better
         return row
 
-    def _paired(self, group: Group, other: Group, measure: str = "reward") -> Paired | None:
-        return paired(group, other, measure, resamples=self.resamples, seed=self.seed)
-
-    def _driver_table(self, rows: Sequence[Row]) -> str:
+    def _driver_table(self, rows: Sequence[Row], groups: Sequence[Group]) -> str:
+        terms = dict.fromkeys(key for row in rows for key in row if key.startswith(TERM))
         return markdown_table(rows, {
             "driver": ("driver", ""), "seeds": ("seeds", ""), "completed": ("completed", ".0%"),
-            "crashed": ("crashed", ".0%"), "lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"),
-            "reward cell": ("reward: mean (95 %)", ""), "iqm cell": ("reward: IQM (95 %)", ""),
-            "difference": (f"reward - {self.against}'s (95 %)", ""), "better": (f"better than {self.against}", ".0%"),
-            "over_guide": ("better than the guide", ".0%"),
+            "crashes": ("seeds with a crash (95 %)", ""), "score cell": (f"{_score(groups)[0]} (95 %)", ""),
+            "difference": (f"difference to {self.against} (95 %)", ""),
+            "better": (f"better than {self.against}", ".0%"),
+            "over_guide": ("better than the guide", ".0%"), **MEASURE_COLUMNS,
+            **{key: (key.removeprefix(TERM), ".1f") for key in terms},
         })  # fmt: skip
 
     def _claims(self, worlds: Mapping[str, Mapping[str, Sequence[Group]]]) -> str:
@@ -119,17 +118,19 @@ class Table5(WorldsResult):
                 for actions, groups in by_actions.items():
                     by_name = {group.name: group for group in groups}
                     if driver in by_name and other in by_name and (measure == "reward" or not world):
-                        pairs = self._paired(by_name[driver], by_name[other], measure)
-                        spec = f"+{MEASURE_COLUMNS[measure][1]}"
-                        cells[actions] = pages.verdict(*pairs.difference, spec, sign) if pairs else None
+                        in_score = measure == "reward"
+                        pairs = paired(by_name[driver], by_name[other], "score" if in_score else measure)
+                        spec = f"+{_score(groups)[1] if in_score else MEASURE_COLUMNS[measure][1]}"
+                        cells[actions] = pages.Claim(pairs.difference, spec, sign) if pairs else None
                 if cells:
-                    paper = _paper_difference(measure, driver, other)
+                    relative = _score(by_actions[ACTIONS[0]])[0] == SCORE
+                    paper = _paper_difference(measure, driver, other, relative)
                     rows.append({"claim": f"{claim}, {world}" if world else claim, "paper": paper} | cells)
         crashes: dict[str, str] = {"claim": "Nobody crashes", "paper": "0%"}
         for actions, groups in worlds[""].items():
-            shares = {group.name: group.means()["crashed"] for group in groups if group.name in PAPER_UNSEEN}
-            details = ", ".join(f"{name} {share:.0%}" for name, share in shares.items())
-            crashes[actions] = pages.certain_verdict(not any(shares.values()), details)
+            drivers = [group for group in groups if group.name in PAPER_UNSEEN]
+            details = ", ".join(f"{group.name} {group.crashes}" for group in drivers)
+            crashes[actions] = pages.certain_verdict(not any(group.means()["crashed"] for group in drivers), details)
         headings = {"paper": "paper"} | {actions: f"ours, {actions} actions (95 %)" for actions in ACTIONS}
         return pages.claims_section([*rows, crashes], headings)
 
@@ -171,10 +172,18 @@ def _track_table(groups: Sequence[Group], name: str) -> str:
     return markdown_table(rows, {"driver": ("mean reward", "")} | {track: (track, "") for track in tracks})
 
 
-def _paper_difference(measure: str, driver: str, other: str) -> str | None:
+def _score(groups: Sequence[Group]) -> tuple[str, str]:
+    """Return name and format of the score of drivers, which begin with the guide."""
+    return (SCORE, ".3f") if groups[0].reference is not None else MEASURE_COLUMNS["reward"]
+
+
+def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> str | None:
     if driver not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
-    return f"{PAPER_UNSEEN[driver][measure] - PAPER_UNSEEN[other][measure]:+{MEASURE_COLUMNS[measure][1]}}"
+    difference = PAPER_UNSEEN[driver][measure] - PAPER_UNSEEN[other][measure]
+    if measure == "reward" and relative:
+        return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+.3f}"
+    return f"{difference:+{MEASURE_COLUMNS[measure][1]}}"
 
 
 def _episodes(run: Run) -> list[dict[str, Any]]:
@@ -183,13 +192,12 @@ def _episodes(run: Run) -> list[dict[str, Any]]:
     return [{"label": run.label, "seed": run.seed} | row for row in rows]
 
 
-def _intervals(groups: Sequence[Group], rows: Sequence[Row]) -> list[Interval]:
-    guide = float(groups[0].scores.mean())
+def _intervals(groups: Sequence[Group]) -> list[Interval]:
     return [
         Interval(
-            group.name, row["reward"], row["reward_low"], row["reward_high"], guide=guide,
-            points=[float(score) for score in group.scores.mean(axis=1)] if len(group.scores) > 1 else [],
+            group.name, group.score.mean, group.score.low, group.score.high, guide=groups[0].score.mean,
+            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
         )
-        for group, row in zip(groups, rows, strict=True)
+        for group in groups
         if not group.is_guide
     ]  # fmt: skip

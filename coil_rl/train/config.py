@@ -189,8 +189,6 @@ class ReportConfig(ProgramConfig):
     folder: Any = MISSING
     actions: Annotated[str, one_of("deterministic", "sampled", "both")] = "deterministic"
     against: str | None = None
-    resamples: Annotated[int, Field(ge=1, le=1_000_000)] = 2000
-    seed: Seed = 0
 
 
 @dataclass

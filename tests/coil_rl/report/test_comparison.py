@@ -6,6 +6,7 @@ from run_folders import driven, make_run, make_sweep
 from coil_rl.errors import UserError
 from coil_rl.report.comparison import compare, paired
 from coil_rl.report.runs import read_runs
+from coil_rl.report.statistics import estimate
 
 TRACKS = {"a": 500.0, "b": 600.0}
 
@@ -35,22 +36,56 @@ def test_guides_come_first_then_agents_by_score_each_with_its_variants(sweep):
 def test_numbers_are_those_of_the_runs(sweep):
     rows = table(sweep, against="ppo")
     coil, zeroed = rows["coil", ""], rows["coil", "zeroed"]
-    assert coil["mean"] == pytest.approx(571)
-    assert coil["iqm"] == pytest.approx((0.5 * 521 + 522 + 620 + 0.5 * 621) / 3)
-    assert coil["low"] < coil["iqm"] < coil["high"]
+    assert coil["reward"] == pytest.approx(571)
+    scores = [((520 + seed) / 500 + (620 + seed) / 600) / 2 for seed in range(3)]
+    assert (coil["score"], coil["low"], coil["high"]) == pytest.approx(estimate(scores)[:3])
+    assert rows["guide", ""]["score"] == 1
+    assert (coil["crashes"], zeroed["crashes"]) == ("0 of 3 (0% to 71%)", "3 of 3 (29% to 100%)")
+    assert rows["guide", ""]["crashes"] == "0 of 2 tracks"
     assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
     assert math.isnan(zeroed["lap_time"])
     assert math.isnan(rows["guide", ""]["low"])
-    assert (coil["improvement"], rows["guide", ""]["improvement"], rows["ppo", ""]["improvement"]) == (0, 0, None)
-    assert [row["improvement"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
+    assert (coil["better"], rows["guide", ""]["better"], rows["ppo", ""]["better"]) == (0, None, None)
+    assert coil["difference"] == pytest.approx(-(20 / 500 + 20 / 600) / 2)
+    assert [row["better"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
     tracks = compare(read_runs([sweep])).track_table()
     by_track = {(row["driver"], row["advice"], row["track"]): row["reward"] for row in tracks}
     assert len(by_track) == 8
     assert by_track["coil", "", "b"] == pytest.approx(621)
     rows = table(sweep, "ppo", "sampled")
     assert list(rows) == [("guide", ""), ("coil", ""), ("ppo", "")]
-    assert rows["coil", ""]["mean"] == pytest.approx(561)
-    assert rows["coil", ""]["improvement"] == 0.5, "better on a, worse on b"
+    assert rows["coil", ""]["reward"] == pytest.approx(561)
+    assert rows["coil", ""]["better"] == 0.5, "better on a, worse on b"
+
+
+def test_completion_ranks_before_the_mean(tmp_path):
+    rewards = {"a": 900.0, "b": 900.0}
+    make_run(tmp_path / "0", "fast", 0, driven("guide", TRACKS) + driven("fast", rewards, completed=0.9, crashed=0.1))
+    make_run(tmp_path / "1", "safe", 0, driven("guide", TRACKS) + driven("safe", TRACKS))
+    assert list(table(tmp_path)) == [("guide", ""), ("safe", ""), ("fast", "")]
+
+
+@pytest.mark.parametrize("failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}])
+def test_where_the_guide_fails_its_mean_over_the_other_tracks_is_the_reference(failure, tmp_path):
+    guide = driven("guide", {"a": 500.0, "c": 300.0})[:2] + driven("guide", **failure)[:1]
+    make_run(tmp_path / "0", "agent", 0, guide + driven("agent", {"a": 500.0, "c": 600.0, "b": 200.0}))
+    assert compare(read_runs([tmp_path])).agents[0].scores.tolist() == [[1, 2, 0.5]]
+
+
+def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
+    make_run(tmp_path / "0", "agent", 0, driven("guide", {"a": -1.0, "b": 0.0}) + driven("agent", TRACKS))
+    comparison = compare(read_runs([tmp_path]))
+    assert not comparison.normalised
+    assert comparison.agents[0].score.mean == 550
+
+
+def test_every_track_counts_as_much_however_much_it_pays(tmp_path):
+    guide = {"a": 10.0, "b": 1000.0}
+    for label, rewards in {"small": {"a": 15.0, "b": 1000.0}, "large": {"a": 10.0, "b": 1400.0}}.items():
+        make_run(tmp_path / label, label, 0, driven("guide", guide) + driven(label, rewards))
+    rows = table(tmp_path)
+    assert list(rows) == [("guide", ""), ("small", ""), ("large", "")]
+    assert rows["small", ""]["score"] == pytest.approx(1.25)
 
 
 def test_clearance_is_the_smallest_and_lap_time_the_mean_of_completed_laps(tmp_path):
@@ -69,7 +104,7 @@ def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
     rows = table(tmp_path)
     assert list(rows)[:3] == [("guide (a, b and 2 more)", ""), ("guide (e)", ""), ("a", "")]
     assert rows["e", ""]["guide"] == "guide (e)"
-    assert rows["guide (e)", ""]["mean"] == pytest.approx(450)
+    assert rows["guide (e)", ""]["reward"] == pytest.approx(450)
 
 
 def test_guide_with_random_actions_has_an_interval_over_its_different_evaluations(tmp_path):
@@ -78,15 +113,15 @@ def test_guide_with_random_actions_has_an_interval_over_its_different_evaluation
         make_run(tmp_path / str(index), label, seed, guide + driven(label, TRACKS))
     guide = table(tmp_path)["guide", ""]
     assert guide["seeds"] == 3, "ppo has two of the three evaluations"
-    assert guide["mean"] == pytest.approx(560)
-    assert guide["low"] < guide["iqm"] < guide["high"]
+    assert guide["reward"] == pytest.approx(560)
+    assert guide["low"] < guide["score"] < guide["high"]
 
 
 def test_agents_and_guides_may_be_alone(tmp_path):
     make_run(tmp_path / "agents" / "0", "alone", 0, driven("alone", TRACKS), needs_guide=False)
     guide = driven("guide", TRACKS)
     rows = table(tmp_path / "agents", against="guide")
-    assert (rows["alone", ""]["guide"], rows["alone", ""]["improvement"], rows["alone", ""]["seeds"]) == (None, None, 1)
+    assert (rows["alone", ""]["guide"], rows["alone", ""]["better"], rows["alone", ""]["seeds"]) == (None, None, 1)
     make_run(tmp_path / "guides" / "0", "spline", 0, guide, needs_guide=None)
     make_run(tmp_path / "guides" / "1", "zero", 0, driven("guide", {"a": 1.0, "b": 2.0}), needs_guide=None)
     assert list(table(tmp_path / "guides")) == [("guide (spline)", ""), ("guide (zero)", "")]
@@ -115,7 +150,7 @@ def test_label_with_the_same_seed_twice_or_with_different_tracks_is_an_error(tmp
 def test_labels_on_different_tracks_are_not_compared(tmp_path):
     for label in "ab":
         make_run(tmp_path / label, label, 0, driven("guide", {label: 1.0}) + driven(label, {label: 1.0}))
-    assert table(tmp_path, against="b")["a", ""]["improvement"] is None
+    assert table(tmp_path, against="b")["a", ""]["better"] is None
     groups = groups_by_title(tmp_path)
     assert paired(groups["a"], groups["b"]) is None
     assert set(groups) == {"a", "b", "guide (a)", "guide (b)"}
@@ -128,19 +163,18 @@ def test_pairs_are_the_common_seeds_in_any_order(tmp_path):
         make_run(tmp_path / f"b{seed}", "b", seed, driven("b", {"x": 10.0 * seed - 4, "y": 5.0}))
     groups = groups_by_title(tmp_path)
     pairs = paired(groups["a"], groups["b"])
-    assert pairs.seeds == 2
-    assert pairs.difference == (2, 2, 2), "4 more on x and equal on y, for both seeds"
-    assert pairs.better == (0.75, 0.75, 0.75)
-    assert paired(groups["b"], groups["a"]).difference[0] == -2
+    assert pairs.difference[:4] == (2, 2, 2, 2), "4 more on x and equal on y, for both seeds"
+    assert pairs.better == 0.75
+    assert paired(groups["b"], groups["a"]).difference.mean == -2
 
 
 def test_guide_is_paired_with_every_seed(sweep, tmp_path):
     groups = groups_by_title(sweep)
     pairs = paired(groups["coil"], groups["guide"])
-    assert (pairs.seeds, pairs.better[0]) == (3, 1)
-    assert pairs.difference[0] == pytest.approx(21)
-    assert pairs.difference[1] < 21 < pairs.difference[2]
-    assert paired(groups["coil"], groups["ppo"], "smoothness").difference[0] == pytest.approx(0.1)
+    assert (pairs.difference.seeds, pairs.better) == (3, 1)
+    assert pairs.difference.mean == pytest.approx((21 / 500 + 21 / 600) / 2)
+    assert paired(groups["coil"], groups["guide"], "reward").difference.mean == pytest.approx(21)
+    assert paired(groups["coil"], groups["ppo"], "smoothness").difference.mean == pytest.approx(0.1)
     assert paired(groups["coil, zeroed"], groups["coil"], "lap_time") is None, "no completed lap"
     make_run(tmp_path / "other" / "9", "coil", 9, driven("coil", TRACKS))
     assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, "no common seed"

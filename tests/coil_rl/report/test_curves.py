@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.stats import t
 
 from coil_rl.report import draw_curve_grid, draw_learning_curves, draw_phases
 from coil_rl.report.curves import TRAINING, mean_curve
@@ -74,7 +75,8 @@ def test_runs_are_averaged_over_their_common_frames():
     second = [{"frames": f, TRAINING: 3.0 * f} for f in (5, 15, 25)]
     frames, mean, low, high = mean_curve([first, second, []], TRAINING)
     np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
-    np.testing.assert_allclose([mean, low, high], [2 * frames, 1 * frames, 3 * frames])
+    half = t.ppf(0.975, 1) * frames
+    np.testing.assert_allclose([mean, low, high], [2 * frames, 2 * frames - half, 2 * frames + half])
 
 
 def test_interval_of_the_mean_has_its_coverage():

@@ -26,7 +26,7 @@ def test_panel_shows_the_given_values():
 def test_plot_needs_rows(tmp_path):
     for panels in ({}, {"one": []}):
         with pytest.raises(ValueError, match="at least one driver"):
-            draw_intervals(panels, tmp_path / "plot.png")
+            draw_intervals(panels, tmp_path / "plot.png", measure="reward")
     assert not list(tmp_path.iterdir())
-    draw_intervals({"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", title="Placebo")
+    draw_intervals({"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", measure="reward", title="Placebo")
     assert (tmp_path / "plot.png").exists()

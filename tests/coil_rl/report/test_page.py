@@ -21,16 +21,24 @@ def test_section_has_a_table_of_drivers_and_one_of_tracks(tmp_path):
     heading, drivers, tracks = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
     assert heading == "## Results"
     titles, guide, ppo, coil, zeroed = cells(drivers)
-    assert titles[:6] == ["driver", "advice", "seeds", "reward (IQM)", "95 % interval", "mean"]
-    assert titles[-2:] == ["better than ppo", "guide at test time"]
-    assert guide[:6] == ["guide", "", "-", "550.0", "-", "550.0"]
-    assert coil[:4] == ["coil", "", "3", "571.0"]
-    assert coil[6:] == ["100%", "0%", "50.00", "0.200", "0.30", "0%", "yes"]
-    assert (ppo[-2:], zeroed[:2], zeroed[-1]) == (["-", "no"], ["coil", "zeroed"], "-")
-    low, high = map(float, coil[4].split(" to "))
-    assert 570 <= low < high <= 572
+    assert titles[:6] == [
+        "driver", "advice", "seeds", "completed", "seeds with a crash (95 %)", "reward / guide's (95 %)",
+    ]  # fmt: skip
+    assert guide[:6] == ["guide", "", "-", "100%", "0 of 2 tracks", "1.000"]
+    assert coil == [
+        "coil", "", "3", "100%", "0 of 3 (0% to 71%)", "1.038 (1.034 to 1.043)", "-0.037 (-0.037 to -0.037)", "0.000",
+        "0%", "571.0", "50.00", "0.200", "0.30", "yes",
+    ]  # fmt: skip
+    assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (["-", "-", "-"], "no", ["coil", "zeroed"], "-")
     assert cells(tracks)[0] == ["mean reward", "a", "b"]
     assert cells(tracks)[-1] == ["coil, zeroed", "-100.0", "-201.0"]
+
+
+def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
+    rows = driven("guide", {"a": 1.0}, reward_cone=2.0, reward_smooth=-1.0)
+    make_run(tmp_path / "run", "coil", 0, rows + driven("coil", {"a": 2.5}, reward_cone=2.75, reward_smooth=-0.25))
+    terms = cells(section(tmp_path).split("\n\n")[2])
+    assert terms == [["term of the reward", "cone", "smooth"], ["guide", "2.0", "-1.0"], ["coil", "2.8", "-0.2"]]
 
 
 def test_tasks_have_their_own_table(tmp_path):
@@ -72,5 +80,5 @@ def test_empty_columns_and_many_tracks_are_omitted(tmp_path):
     text = section(tmp_path)
     assert not [word for word in ("advice", "better than") if word in text]
     assert text.endswith("The rewards on each of the 9 tracks are in report_tracks.csv.")
-    assert "Better than" not in page.notes(10, None)
-    assert "Better than its guide: the probability" in page.notes(1234, "guide")
+    assert "Difference" not in page.notes(None, True, False)
+    assert "Difference to its guide: of the same seed" in page.notes("guide", False, True)

@@ -1,9 +1,12 @@
 import json
+import math
 
-from reproduced_runs import make_runs
+import pytest
+from reproduced_runs import make_runs, row
 
+from coil_rl.report.statistics import Estimate, estimate
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.pages import verdict, with_interval
+from coil_rl.reproduce.pages import Claim, claims_section
 
 
 def test_a_page_has_heading_warning_picture_text_and_origin():
@@ -43,12 +46,27 @@ def test_results_md_has_the_claims_the_pages_and_the_missing_results():
     assert text.count("A note.") == text.count("| more |") == 1
 
 
-def test_a_verdict_needs_the_whole_interval_on_one_side():
-    assert verdict(1.5, 1.0, 2.0) == "**held up**: 1.5 (1.0 to 2.0)"
-    assert verdict(-1.5, -2.0, -1.0) == "**did not hold up**: -1.5 (-2.0 to -1.0)"
-    assert verdict(-1.5, -2.0, -1.0, "+.2f", -1) == "**held up**: -1.50 (-2.00 to -1.00)"
-    nan = float("nan")
-    words = [verdict(0.5, *ends).split("**")[1] for ends in [(-1, 1), (0, 1), (nan, nan)]]
-    assert words == ["undecided"] * 3
-    assert verdict(nan, nan, nan) is None
-    assert with_interval(2.0, nan, nan, "+.1f") == "+2.0"
+@pytest.mark.parametrize(
+    ("number", "sign", "p", "cell"),
+    [
+        ((1.5, 1.0, 2.0, 3), 1, 0.049, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.049"),
+        ((-1.5, -2.0, -1.0, 3), 1, 0.01, "**did not hold up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
+        ((-1.5, -2.0, -1.0, 3), -1, 0.01, "**held up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
+        ((1.5, 1.0, 2.0, 3), 1, 0.06, "**undecided**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.060"),
+        ((2.0,), 1, math.nan, "**undecided**: +2.0, 1 seed"),
+        ((math.nan,), 1, math.nan, None),
+    ],
+)
+def test_a_verdict_needs_a_small_p(number, sign, p, cell):
+    assert Claim(Estimate(*number), "+.1f", sign).verdict(p) == cell
+
+
+def test_the_verdicts_of_a_page_are_one_family():
+    alone = Claim(estimate([1.0, 1.1, 1.3]), ".1f")
+    undecided = Claim(estimate([1.0, -1.0, 0.5]), ".1f")
+    assert 0.005 < alone.estimate.p < 0.025
+    for others, word in [(1, "held up"), (8, "undecided")]:
+        page = claims_section(
+            [{"claim": "first", "ours": alone}, *[{"claim": "other", "ours": undecided}] * others], {"ours": "ours"}
+        )
+        assert row(page, "first")[1].startswith(f"**{word}**")

@@ -106,7 +106,7 @@ def drive(method, seed=None, **others):
 
 
 def page_of(*drives):
-    return robot_page(drives, "", 80.0, 200, 0)
+    return robot_page(drives, "", 80.0)
 
 
 @pytest.fixture(scope="module")
@@ -125,24 +125,29 @@ def test_a_method_has_the_means_of_its_drives_next_to_the_paper(page):
 
 
 def test_claims_have_a_verdict_by_seed(page):
-    expected = "**held up**: -0.194 (-0.194 to -0.194)"
+    expected = "**held up**: -0.194 (-0.194 to -0.194), 3 seeds, p 0.000"
     assert row(page, "PPO steers more smoothly than the guide")[1:] == ["-0.163", "3 of 3", expected]
-    assert row(page, "COIL steers more smoothly than PPO")[3] == "**undecided**: -0.001 (-0.006 to +0.004)"
-    expected = "**did not hold up**: guide 0 of 2 drives, ppo 0 of 3 drives, coil 1 of 3 drives"
+    assert (
+        row(page, "COIL steers more smoothly than PPO")[3]
+        == "**undecided**: -0.001 (-0.065 to +0.063), 2 seeds, p 1.000"
+    )
+    expected = "**did not hold up**: guide 0 of 2 drives, ppo 0 of 3 (0% to 71%) seeds, coil 1 of 3 (1% to 91%) seeds"
     assert row(page, "Nobody crashes") == ["Nobody crashes", "0", "-", expected]
 
 
 def test_drives_without_a_complete_lap_are_compared_by_clearance_only(page):
-    assert row(page, "COIL's laps")[1:] == ["-0.61", "2 of 3", "**held up**: -1.00 (-1.00 to -1.00)"]
-    expected = "**held up**: -0.195 (-0.200 to -0.190)"
+    assert row(page, "COIL's laps")[1:] == ["-0.61", "2 of 3", "**held up**: -1.00 (-1.00 to -1.00), 2 seeds, p 0.000"]
+    expected = "**held up**: -0.195 (-0.259 to -0.131), 2 seeds, p 0.049"
     assert row(page, "COIL steers more smoothly than its guide")[1:] == ["-0.183", "2 of 3", expected]
     lost = page_of(drive("guide"), drive("ppo", "0", **LOST))
     assert row(lost, "PPO steers more smoothly")[2:] == ["0 of 1", "-"]
-    assert row(lost, "PPO drives nearer")[2:] == ["1 of 1", "**undecided**: -0.050"]
+    assert row(lost, "PPO drives nearer")[2:] == ["1 of 1", "**undecided**: -0.050, 1 seed"]
 
 
 def test_an_agent_without_seed_leaves_claims_undecided_and_other_drivers_have_none():
-    assert row(page_of(drive("guide"), drive("coil", smoothness=0.1)), "COIL steers")[3] == "**undecided**: -0.200"
+    assert (
+        row(page_of(drive("guide"), drive("coil", smoothness=0.1)), "COIL steers")[3] == "**undecided**: -0.200, 1 seed"
+    )
     assert "held up" not in page_of(drive("mine"), drive("guide"))
 
 

@@ -14,7 +14,7 @@ def made(tmp_path_factory):
         "imitation": make_runs(folder / "imitation", {"oil": 5.0}, sampled=False, completed=0.5, crashed=0.5),
         "other": make_runs(folder / "other", {"coil": 80.0, "ppo": 60.0}),
     }
-    page = Table5(["main", "imitation"], {"another world": "other"}, resamples=200).make(folder / "t", runs)
+    page = Table5(["main", "imitation"], {"another world": "other"}).make(folder / "t", runs)
     assert (folder / "t.png").exists()
     return page, read_csv(folder / "t.csv")
 
@@ -29,19 +29,21 @@ def drivers(page, heading, world=0):
 def test_drivers_are_the_guide_and_then_the_agents_by_reward(made):
     deterministic = drivers(made[0], "Deterministic actions")
     assert list(deterministic) == ["guide", "ppo", "coil", "coil_shuffled", "oil"]
-    assert (deterministic["oil"]["completed"], deterministic["oil"]["crashed"]) == ("50%", "50%")
-    assert deterministic["coil"]["reward: mean (95 %)"].startswith("581.0 (580.0 to 58")
+    crashes = deterministic["oil"]["seeds with a crash (95 %)"]
+    assert (deterministic["oil"]["completed"], crashes) == ("50%", "3 of 3 (29% to 100%)")
+    # 530, 531 and 532 of 500, and 630, 631 and 632 of 600.
+    assert deterministic["coil"]["reward / guide's (95 %)"] == "1.057 (1.052 to 1.061)"
 
     sampled = drivers(made[0], "Sampled actions")
-    assert list(sampled) == ["guide", "ppo", "oil", "coil", "coil_shuffled"], "oil has no sampled actions"
+    assert list(sampled) == ["guide", "ppo", "coil", "coil_shuffled", "oil"], "oil has no sampled actions"
 
 
 def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
     coil = drivers(made[0], "Deterministic actions")["coil"]
-    assert coil["reward - ppo's (95 %)"] == "-30.0 (-30.0 to -30.0)"
+    assert coil["difference to ppo (95 %)"] == "-0.055 (-0.055 to -0.055)"
     assert (coil["better than ppo"], coil["better than the guide"]) == ("0%", "100%")
     other = drivers(made[0], "Deterministic actions", world=1)["coil"]
-    assert other["reward - ppo's (95 %)"] == "+20.0 (+20.0 to +20.0)"
+    assert other["difference to ppo (95 %)"] == "+0.037 (+0.037 to +0.037)"
 
 
 def test_the_papers_drivers_are_next_to_the_paper(made):
@@ -58,13 +60,16 @@ def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made)
     table = made[0].split("### What held up\n\n")[1].splitlines()[2:]
     claims = {row[0]: row[1:] for row in map(cells, table)}
     paper, sampled, deterministic = claims["COIL earns more than its guide"]
-    assert paper == "+23.5"
-    assert sampled.startswith("**did not hold up**: -19.0 (-20.0 to")
-    assert deterministic.startswith("**held up**: +31.0 (+30.0 to")
-    assert claims["COIL earns more than PPO, another world"][1] == "**held up**: +20.0 (+20.0 to +20.0)"
-    assert claims["COIL's laps take less time than PPO's"][:2] == ["-0.10", "**undecided**: +0.00 (+0.00 to +0.00)"]
+    assert paper == "+0.039"
+    assert sampled.startswith("**did not hold up**: -0.035 (-0.039 to -0.030), 3 seeds, p 0.0")
+    assert deterministic.startswith("**held up**: +0.057 (+0.052 to +0.061), 3 seeds, p 0.0")
+    expected = "**held up**: +0.037 (+0.037 to +0.037), 3 seeds, p 0.000"
+    assert claims["COIL earns more than PPO, another world"][1] == expected
+    expected = "**undecided**: +0.00 (+0.00 to +0.00), 3 seeds, p 1.000"
+    assert claims["COIL's laps take less time than PPO's"][:2] == ["-0.10", expected]
     assert claims["COIL earns more with its guide's advice than with another car's"][0] == "-"
-    crashes = "**did not hold up**: guide 0%, ppo 0%, oil 50%, coil 0%"
+    none = "0 of 3 (0% to 71%)"
+    crashes = f"**did not hold up**: guide 0 of 2 tracks, ppo {none}, coil {none}, oil 3 of 3 (29% to 100%)"
     assert claims["Nobody crashes"][:2] == ["0%", crashes]
     assert len(claims) == 7 + 3 + 1
 
