@@ -18,7 +18,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
-from coil_rl.envs.limits import LARGEST_COUNT, check_choice, check_range
+from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -30,7 +30,7 @@ from coil_rl.envs.reward import (
 )
 from coil_rl.envs.sight import SAMPLES, Frame, View, encode_samples, view
 from coil_rl.envs.splines import quadratic_spline, smoothing_spline
-from coil_rl.envs.track import Track
+from coil_rl.envs.track import NEVER, Track, places
 from coil_rl.envs.track_map import Location, TrackMap
 
 FINISH_RADIUS = 0.625  # m
@@ -74,7 +74,11 @@ class ConeTrackEnv(SeededEnv):
         laps: completed laps that end an episode.
         time_limit: s, after which an episode is truncated.
         held_steps: number of steps at the start of an episode with steering 0.
-        assignment: "random" draws a track at each reset, "cyclic" keeps car i on track i mod len(tracks).
+        starts: number of places where an episode may begin; place i is on track i mod len(tracks), and those of a track
+            are spread along its middle. A lap that begins there counts as driven from the finish at full speed. None
+            for the starts of the tracks.
+        assignment: "random" draws a place at each reset; with `starts` it also draws at the first reset how much of
+            `time_limit` is over, so that the episodes do not end together. "cyclic" keeps car i on place i mod places.
         kept_cones: K.
         speed: m/s.
         car_length: m.
@@ -109,6 +113,7 @@ class ConeTrackEnv(SeededEnv):
         laps: int = 2,
         time_limit: float = 200.0,
         held_steps: int = 0,
+        starts: int | None = None,
         assignment: Literal["random", "cyclic"] = "random",
         kept_cones: int = 16,
         speed: float = 2.0,
@@ -123,6 +128,7 @@ class ConeTrackEnv(SeededEnv):
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
         check_choice(("random", "cyclic"), assignment=assignment)
         check_range(0, above=True, num_cars=num_cars, kept_cones=kept_cones, speed=speed, car_length=car_length)
+        check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, 1000, above=True, rate=rate)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
@@ -144,7 +150,8 @@ class ConeTrackEnv(SeededEnv):
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()
         self._register_state(num_cars)
-        self._register_starts()
+        self.staggered = starts is not None
+        self._register_starts(starts)
         self.set_seed(seed)
 
     def _declare_specs(self) -> None:
@@ -177,46 +184,59 @@ class ConeTrackEnv(SeededEnv):
         self.history: Tensor = zeros(HISTORY)  # actions, newest first
         self.steps: Tensor = zeros(dtype=torch.int32)  # of the episode
         self.lap: Tensor = zeros(dtype=torch.int32)  # completed laps
-        self.lap_start: Tensor = zeros(dtype=torch.int32)  # step of the last entry of the finish circle, else -1
+        self.lap_start: Tensor = zeros(dtype=torch.int32)  # step of the last entry of the finish circle
         self.in_finish: Tensor = zeros(dtype=torch.bool)  # whether inside the finish circle
         self.epoch: Tensor = zeros(dtype=torch.int32)  # period of one reward per cone, a lap or a step
         self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)  # epoch of each cone's last sighting
         self.samples: Tensor = zeros(2, SAMPLES, 2)  # m, last boundary estimate, in world coordinates
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
 
-    def _register_starts(self) -> None:
-        """Observe the start of each track once, so that a reset only copies."""
-        tracks = torch.arange(len(self.map), device=self.device)
+    def _register_starts(self, starts: int | None) -> None:
+        """Observe all P places where an episode may begin once, so that a reset only copies."""
+        index, pose, driven = map(torch.as_tensor, places(self.map.tracks, starts))
+        tracks, pose = index.to(self.device), pose.T.contiguous().to(self.map.starts)
+        lap_start = torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed).round().int().to(self.device)
+        frame = Frame(pose)
+        location = self.map.locate(tracks, frame.position)
+        visible, _ = self._view(location, pose, frame)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
-        frame = Frame(self.map.starts)
-        visible, _ = self._view(self.map.locate(tracks, frame.position), self.map.starts, frame)
         observation, samples, sampled = self._observe(frame, visible, samples, torch.zeros_like(samples[0, 0]))
         outputs = {"observation": observation.t(), "cones": visible.cones, "count": visible.count.long()}
-        for name, value in {**outputs, "samples": samples, "sampled": sampled}.items():
+        state = {"track": tracks, "pose": pose, "lap_start": lap_start, "samples": samples, "sampled": sampled}
+        state["in_finish"] = _in_finish(location) & (lap_start > NEVER)
+        for name, value in {**outputs, **state}.items():
             self.register_buffer(f"start_{name}", value, persistent=False)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         everyone = torch.arange(self.batch_size[0], device=self.device)
         cars = everyone if mask is None else mask.view(-1).nonzero().squeeze(-1)
+        count = len(self.start_track)
+        steps = torch.zeros_like(cars, dtype=self.steps.dtype)
         if self.assignment == "cyclic":
-            track = cars % len(self.map)
+            place = cars % count
         else:
             # One draw per car, reset or not, keeps the random sequence independent of the data.
-            drawn = torch.randint(len(self.map), self.batch_size, generator=self.generator)
-            track = drawn.to(self.device).index_select(0, cars)
+            drawn = torch.randint(count, self.batch_size, generator=self.generator)
+            place = drawn.to(self.device).index_select(0, cars)
+            if mask is None and self.staggered:
+                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator).to(steps)
 
-        def start(of_tracks: Tensor) -> Tensor:
-            return of_tracks.index_select(-1, track)
+        def start(of_places: Tensor) -> Tensor:
+            return of_places.index_select(-1, place)
 
-        samples, sampled = start(self.start_samples), start(self.start_sampled)
-        copied = {"track": track, "pose": start(self.map.starts), "samples": samples, "sampled": sampled}
+        copied = {name: start(getattr(self, f"start_{name}")) for name in ("track", "pose", "samples", "sampled")}
+        copied |= {
+            "steps": steps,
+            "in_finish": start(self.start_in_finish),
+            "lap_start": steps + start(self.start_lap_start),
+        }
         for name, value in copied.items():
             setattr(self, name, getattr(self, name).index_copy(-1, cars, value))
-        for name, number in {"history": 0, "in_finish": False, "steps": 0, "lap": 0, "lap_start": -1}.items():
-            setattr(self, name, getattr(self, name).index_fill(-1, cars, number))
+        for name in ("history", "lap"):
+            setattr(self, name, getattr(self, name).index_fill(-1, cars, 0))
         # Under either rule of the cone bonus, no cone was seen in the epoch before the new one.
-        self.epoch = self.epoch.index_add(0, cars, torch.full_like(track, 2, dtype=self.epoch.dtype))
+        self.epoch = self.epoch.index_add(0, cars, torch.full_like(cars, 2, dtype=self.epoch.dtype))
         zero = torch.zeros_like(self.pose[0])
         observation, cones, count = (
             at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
@@ -263,11 +283,10 @@ class ConeTrackEnv(SeededEnv):
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
-        square = (location.position - location.finish).square_().sum(0)
-        inside = square < constant(FINISH_RADIUS**2, square)
+        inside = _in_finish(location)
         entered = inside & ~self.in_finish
-        finished = entered & (self.lap_start >= constant(0, self.lap_start))
-        lap_time = (self.steps - self.lap_start) * finished / constant(self.rate, square)
+        finished = entered & (self.lap_start > constant(NEVER, self.lap_start))
+        lap_time = (self.steps - self.lap_start) * finished / constant(self.rate, location.position)
         self.in_finish = inside
         self.lap_start = torch.where(entered, self.steps, self.lap_start)
         self.lap = self.lap + finished
@@ -323,3 +342,8 @@ class ConeTrackEnv(SeededEnv):
             entries |= {"pose": self.pose.t(), "reward": TensorDict(rewards, self.batch_size, device=self.device)}
             data["info"] = TensorDict(entries, self.batch_size, device=self.device)
         return TensorDict(data, self.batch_size, device=self.device)
+
+
+def _in_finish(location: Location) -> Tensor:
+    square = (location.position - location.finish).square_().sum(0)
+    return square < constant(FINISH_RADIUS**2, square)

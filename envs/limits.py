@@ -6,6 +6,7 @@ import math
 
 LARGEST_SEED = 2**63 - 1
 LARGEST_COUNT = 10**6  # of laps, and of seconds or held steps of an episode
+LARGEST_STARTS = 10**5  # places of a world where an episode may begin
 
 
 def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:

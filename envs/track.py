@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,6 +21,9 @@ AS_COMPLEX = np.array([1, 1j])
 MIN_CONES, MAX_CONES = 4, 1000
 MAX_COORDINATE = 10_000.0  # m
 MAX_EXTENT, MAX_LENGTH = 500.0, 5000.0  # m, of a side
+NEVER = -(2**30)  # as the step of the last entry of the finish circle
+PLACE_SPACING = 0.1  # m, of the line on which places are chosen
+GOLDEN_RATIO = (5**0.5 - 1) / 2  # steps of this share of a lap spread any number of places evenly
 MAX_PAIRS = 2 * 10**7  # of boundary segments tested for crossings
 
 
@@ -127,6 +131,34 @@ class Track:
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
             fault = f"The left side of track {self.name!r} is not on the left of its driving direction"
             raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
+
+
+def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:
+    """Choose places where an episode may begin: place i is on track i mod len(tracks), in the middle of its width.
+
+    The places of a track are spread along the lap, also if only the first ones are used. `count=None` gives the starts
+    of the tracks.
+
+    Returns:
+        Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish in m, [P], NaN for
+        the start of a track, from where the first lap has not begun.
+    """
+    if count is None:
+        starts = np.array([track.start for track in tracks])
+        return np.arange(len(tracks)), starts, np.full(len(tracks), np.nan)
+    poses, driven = zip(*(_spread(track, -(-count // len(tracks))) for track in tracks), strict=True)
+    index = np.arange(count) % len(tracks)
+    return index, np.stack(poses, 1).reshape(-1, 3)[:count], np.stack(driven, 1).ravel()[:count]
+
+
+def _spread(track: Track, count: int) -> tuple[Array, Array]:
+    middle = track.middle()
+    middle = np.roll(middle, -int(((middle - track.finish) ** 2).sum(1).argmin()), axis=0)
+    middle = resample(middle, PLACE_SPACING)
+    at = ((np.arange(count) + 0.5) * GOLDEN_RATIO % 1 * len(middle)).astype(int)
+    forward = (np.roll(middle, -1, axis=0) - np.roll(middle, 1, axis=0))[at]
+    driven = np.concatenate([[0.0], np.linalg.norm(np.diff(middle, axis=0), axis=1).cumsum()])
+    return np.column_stack([middle[at], np.arctan2(forward[:, 1], forward[:, 0])]), driven[at]
 
 
 def resample(ring: Array, spacing: float) -> Array:

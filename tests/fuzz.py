@@ -52,7 +52,10 @@ FAILURES = ("traceback", "hang", "crash", "sentences", "exit code", "outside", "
 
 TRACKS = "track=generated track.train.count=1 track.test.count=1"
 SHORT = "env.laps=1 env.time_limit=1 evaluation.repeats=1"
-TRAIN = f"{SHORT} evaluation.gif=false budget.frames=32 budget.cars=4 budget.steps=8 checkpoint_every=1 logger=none"
+CURVE = "evaluation.curve.cars=2 evaluation.curve.env.time_limit=1"
+TRAIN = (
+    f"{SHORT} {CURVE} evaluation.gif=false budget.frames=32 budget.cars=4 budget.steps=8 checkpoint_every=1 logger=none"
+)
 PROXY = "proxy.budget.frames=32 proxy.budget.cars=4 proxy.budget.steps=8 proxy.learner.regressor.epochs=1"
 PHASES = "learner.phases.agent_phase.frames=32 learner.phases.guide_phase.frames=32"
 ONCE, MINIBATCHES = "learner.epochs=1 learner.minibatches=2", "learner.minibatches=2"
@@ -76,9 +79,9 @@ USES = {  # of a run
     "replay": "replay recording=drive.mcap runs=[RUN]",
     "resume": "train resume=RUN",
     "guide": f"train {TRACKS} {TRAIN} {ONCE} guide=learned guide.learned.run=RUN",
-    "distil": f"distill {TRACKS} {SHORT} {PROXY} guide=learned guide.learned.run=RUN",
-    "report": "report resamples=20 folder=RUN",
-    "reports": "report resamples=20 folder=runs actions=both",
+    "distil": f"distill {TRACKS} {SHORT} {CURVE} {PROXY} guide=learned guide.learned.run=RUN",
+    "report": "report folder=RUN",
+    "reports": "report folder=runs actions=both",
     "robot": f"robot {SHORT} steps=[drive] runs=[RUN]",
 }
 POLICY, LOGS = ["config.yaml", "policy_last.pt"], ["config.yaml", "metrics.csv", "guide_return.json"]
@@ -102,7 +105,7 @@ CLASSIFIER = (
 OF_CLASSIFIER = [f"robot {SHORT} steps=[drive] {CLASSIFIER}", f"replay recording=drive.mcap {CLASSIFIER}"]
 COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "train": [f"train {TRACKS} {TRAIN} {ONCE} method=coil"],
-    "distill": [f"distill {TRACKS} {SHORT} {PROXY}"],
+    "distill": [f"distill {TRACKS} {SHORT} {CURVE} {PROXY}"],
     "evaluate": [USES["evaluate"], f"evaluate {TRACKS} {SHORT}"],
     "listen": [USES["listen"]],
     "replay": [USES["replay"]],

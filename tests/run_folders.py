@@ -43,7 +43,8 @@ def make_run(
     (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
     frames = range(1000, 20_001, 1000)
     write_csv(
-        [{"frames": n, "train/return": 400 * (1 - math.exp(-n / 5000)) + seed} for n in frames], folder / "metrics.csv"
+        [{"frames": n, "evaluation/return": 400 * (1 - math.exp(-n / 5000)) + seed} for n in frames],
+        folder / "metrics.csv",
     )
     if rows is not None:
         write_csv(rows, folder / "evaluation.csv")

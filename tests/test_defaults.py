@@ -14,9 +14,9 @@ CONF = Path(__file__).parents[1] / "conf"
 VARIATION_FOLDERS = ("experiment", "method", "preset")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.
 VARIATIONS = {
-    "env/cone_track.yaml": ["reward"],  # None in the constructor: the rewards of the paper
-    "env/driving_tasks.yaml": ["reward"],
-    "env/simulated_robot.yaml": ["reward", "lidar", "car_length"],  # rounded length
+    "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
+    "env/driving_tasks.yaml": ["env.reward"],
+    "env/simulated_robot.yaml": ["env.reward", "env.lidar", "env.car_length"],  # rounded length
     "env/mcap_replay.yaml": ["car_length"],
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],

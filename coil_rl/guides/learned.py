@@ -27,7 +27,7 @@ class LearnedGuide(TensorDictModuleBase):
 
     Args:
         run: folder of a run of `coil-train`.
-        which: the last policy, or the one with the best training return.
+        which: the last policy, or the best of the kept ones.
         device: device of the networks.
 
     Raises:

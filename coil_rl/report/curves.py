@@ -1,7 +1,8 @@
-"""Training curves: learning curves in one plot or in a grid, and the training phases of one run."""
+"""Evaluation curves: in one plot or in a grid, in numbers, and with the training phases of one run."""
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -16,14 +17,14 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from coil_rl.report import style
+from coil_rl.report.runs import CHOICE, RETURN, Run
 from coil_rl.report.statistics import mean_interval
 
 Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, object]]
 
-TRAINING = "train/return"
 UNITS = {1e6: "frames (millions)", 1e3: "frames (thousands)"}
-RETURN = "return (sum of rewards of an episode)"
+RETURNS = "return from the cases of the evaluation"
 GRID_COLUMNS = 3
 GRID_ROW_HEIGHT = 1.55  # inches
 AGENT = "#1a1a1a"  # the agent in `draw_phases`
@@ -36,36 +37,35 @@ def draw_learning_curves(
     guides: Mapping[str, float] | None = None,
     title: str | None = None,
 ) -> None:
-    """Draw the return in training against frames, one curve per label.
+    """Draw the return of the kept policies against frames, one curve per label.
 
     Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 % t
     interval of that mean as a band.
 
     Args:
         runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with "frames" (env frames
-            so far) and "train/return", which may be missing, None or NaN.
+            so far) and "evaluation/return", which may be missing, None or NaN.
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
     """
     if not any(len(seeds) for seeds in runs.values()):
         raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
-    curves = {label: mean_curve(seeds, TRAINING) for label, seeds in runs.items()}
+    curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
     unit, unit_name = _frame_unit(curves)
     strokes = style.strong_strokes(runs)
     handles: list[Artist] = []
     for label, stroke in strokes.items():
         seeds = f" ({len(runs[label])} runs)" if len(runs[label]) > 1 else ""
         handles.append(Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=2, label=label + seeds))
-    handles.append(Line2D([], [], color=style.QUIET, lw=0.9, label="training"))
     if any(len(seeds) > 1 for seeds in runs.values()):
         handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
     with style.picture(path, title, handles, 4.2) as figure:
-        axes = figure.add_subplot(xlabel=unit_name, ylabel=RETURN)
+        axes = figure.add_subplot(xlabel=unit_name, ylabel=RETURNS)
         style.lighten(axes)
         for label, stroke in strokes.items():
             frames, mean, low, high = curves[label]
-            axes.plot(frames / unit, mean, color=stroke.colour, ls=stroke.linestyle, alpha=0.45, lw=0.9)
+            axes.plot(frames / unit, mean, color=stroke.colour, ls=stroke.linestyle, lw=1.6)
             axes.fill_between(frames / unit, low, high, color=stroke.colour, alpha=0.16, lw=0)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
@@ -89,12 +89,12 @@ def draw_curve_grid(
     """
     if not runs:
         raise ValueError("A grid of learning curves needs at least one label; got none.")
-    curves = {label: mean_curve(seeds, TRAINING) for label, seeds in runs.items()}
+    curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
     unit, unit_name = _frame_unit(curves)
     columns = min(GRID_COLUMNS, len(runs))
     rows = -(-len(runs) // columns)
     handles: list[Artist] = [
-        Line2D([], [], color=style.AGENTS[0], lw=1.5, label="training, mean of the runs"),
+        Line2D([], [], color=style.AGENTS[0], lw=1.5, label="mean of the runs"),
         Patch(color=style.AGENTS[0], alpha=0.25, lw=0, label="95 % interval of the mean"),
         Line2D([], [], color=style.KERB, lw=0.6, label="the others"),
     ]
@@ -120,7 +120,7 @@ def draw_curve_grid(
         for axes in figure.axes[:-columns]:
             axes.tick_params(labelbottom=False)
         figure.supxlabel(unit_name, size=9)
-        figure.supylabel(RETURN, size=9)
+        figure.supylabel(RETURNS, size=9)
 
 
 def draw_phases(
@@ -138,30 +138,26 @@ def draw_phases(
     if not rows:
         raise ValueError("A plot of phases needs at least one row; got none.")
     colours = {name: style.AGENTS[index % len(style.AGENTS)] for index, name in enumerate(guides)}
-    frames = _column(rows, "frames")
-    unit, unit_name = _unit(float(frames[-1]))
-    frames = frames / unit
-    handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent, in training")]
+    updates = [row for row in rows if not math.isnan(row["learner/guide"])]  # without the state before the first one
+    unit, unit_name = _unit(float(rows[-1]["frames"]))
+    frames = _column(updates, "frames") / unit
+    handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent")]
     alone: dict[str, Any] = {"ls": (0, style.DASHES), "lw": 1.1, "marker": "o", "ms": 4}
     handles += [Line2D([], [], color=colour, label=f"{name} alone", **alone) for name, colour in colours.items()]
     handles.append(Patch(color=style.QUIET, alpha=0.25, lw=0, label="a guide learns (its colour)"))
     with style.picture(path, title, handles, 6.8, h_pad=0.08) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1, 1))
-        top.plot(frames, _column(rows, TRAINING), color=AGENT, lw=1.6)
+        top.plot(*(points(rows, RETURN) / (unit, 1)).T, color=AGENT, lw=1.6, marker="o", ms=3)
         for name, colour in colours.items():
-            returns = _column(rows, f"guide/{name}")
-            measured = np.isfinite(returns)
-            # The guides of the first row were measured before the first update.
-            measured_at = np.where(np.arange(len(frames)) == 0, 0.0, frames)
-            top.plot(measured_at[measured], returns[measured], color=colour, **alone)
-            middle.plot(frames, _column(rows, f"learner/moved_{name}"), color=colour, lw=1.4)
-        _draw_rates(bottom, frames, rows, list(colours.values()))
+            top.plot(*(points(rows, f"guide/{name}") / (unit, 1)).T, color=colour, **alone)
+            middle.plot(frames, _column(updates, f"learner/moved_{name}"), color=colour, lw=1.4)
+        _draw_rates(bottom, frames, updates, list(colours.values()))
         for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
             axes.set_ylabel(label)
             style.lighten(axes)
             axes.margins(x=0)
             axes.set_xlim(left=0)
-            _shade_phases(axes, frames, rows, list(colours.values()))
+            _shade_phases(axes, frames, updates, list(colours.values()))
         middle.set_ylim(bottom=0)
         bottom.set_xlabel(unit_name)
 
@@ -178,6 +174,38 @@ def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Arr
     if len(curves) == 1:
         return frames, *values, *values, *values
     return frames, *mean_interval(values)
+
+
+def learning(run: Run) -> dict[str, float]:
+    """Return the evaluation curve of a run in numbers, NaN where unknown.
+
+    These are the `frames` of the run; the return of the `first`, the `final` and the `best` policy, which is chosen in
+    other cases, with the frames `best_at`; the mean of the curve (`area`, under the curve divided by the frames); the
+    return of the best `guide`; and the frames `until_90` and `until_100` percent of that.
+    """
+    curve, choice = points(run.curve, RETURN), points(run.curve, CHOICE)
+    guide = max(run.guide_returns.values(), default=math.nan)
+    frames = run.curve[-1]["frames"] if run.curve else math.nan
+    if not len(curve):
+        unknown = ("first", "best", "best_at", "final", "area", "until_90", "until_100")
+        return {"frames": frames, "guide": guide} | dict.fromkeys(unknown, math.nan)
+    at, values = curve.T
+    best = int((choice if len(choice) == len(curve) else curve)[:, 1].argmax())
+    return {
+        "frames": frames, "guide": guide, "first": values[0], "final": values[-1], "best": values[best],
+        "best_at": at[best], "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
+        "until_90": frames_until(at, values, 0.9 * guide) if guide > 0 else math.nan,
+        "until_100": frames_until(at, values, guide),
+    }  # fmt: skip
+
+
+def frames_until(frames: Sequence[float] | Array, returns: Sequence[float] | Array, level: float) -> float:
+    """Return the frames at which a curve first reaches a level, by linear interpolation; NaN if it never does."""
+    reached = np.flatnonzero(np.asarray(returns) >= level)
+    if not len(reached):
+        return math.nan
+    part = slice(max(int(reached[0]) - 1, 0), int(reached[0]) + 1)
+    return float(np.interp(level, returns[part], frames[part]))
 
 
 def points(run: Rows, key: str) -> Array:

@@ -8,7 +8,7 @@ from statistics import mean
 from typing import Any
 
 from coil_rl.report.comparison import Comparison
-from coil_rl.report.curves import TRAINING, points
+from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import markdown_table
@@ -32,13 +32,17 @@ COLUMNS = {
     "clearance": ("smallest clearance (m)", ".2f"),
     "needs_guide": ("guide at test time", ""),
 }
-TRAINING_COLUMNS = {
-    "label": ("return in training", ""),
+LEARNING_COLUMNS = {
+    "label": ("return in the cases of the evaluation", ""),
     "seeds": ("seeds", ""),
     "frames": ("frames", ",.0f"),
+    "guide": ("guide", ".1f"),
+    "first": ("first policy", ".1f"),
+    "until_90 cell": ("frames until 90 % of the guide", ""),
+    "until_100 cell": ("until 100 %", ""),
     "area": ("area under the curve / frames", ".1f"),
-    "final": ("final", ".1f"),
-    "highest": ("highest", ".1f"),
+    "best": ("best policy", ".1f"),
+    "final": ("last policy", ".1f"),
     "seconds": ("training (s)", ".0f"),
 }
 
@@ -81,19 +85,21 @@ def guide_training(runs: Sequence[Run]) -> list[str]:
 
 
 def training(runs: Sequence[Run]) -> list[str]:
-    """Return the table of returns and durations of training, means over seeds; no table if nothing was trained."""
+    """Return the table of evaluation curves, means over seeds; no table if nothing was trained."""
     rows: list[dict[str, Any]] = []
-    for label, curves in _curves(runs):
-        returns = [values for curve in curves if len(values := points(curve, TRAINING)[:, 1].tolist())]
-        seconds = [run.seconds for run in runs if run.label == label and run.curve and run.seconds is not None]
-        if returns:
-            rows.append({
-                "label": label, "seeds": len(returns), "frames": max(curve[-1]["frames"] for curve in curves),
-                "area": mean(map(mean, returns)), "final": mean(values[-1] for values in returns),
-                "highest": mean(map(max, returns)), "seconds": mean(seconds) if seconds else None,
-            })  # fmt: skip
+    for label in dict.fromkeys(run.label for run in runs if run.curve):
+        of_label = [run for run in runs if run.label == label and run.curve]
+        numbers = [learning(run) for run in of_label]
+        seconds = [run.seconds for run in of_label if run.seconds is not None]
+        row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
+        row |= {"label": label, "seeds": len(of_label), "seconds": mean(seconds) if seconds else None}
+        for key in ("until_90", "until_100"):
+            reached = [seed[key] for seed in numbers if not math.isnan(seed[key])]
+            some = f" ({len(reached)} of {len(numbers)} seeds)" if len(reached) < len(numbers) else ""
+            row[f"{key} cell"] = f"{mean(reached):,.0f}{some}" if reached else None
+        rows += [row] if not math.isnan(row["area"]) else []
     rows.sort(key=lambda row: -float(row["area"]))
-    return [markdown_table(rows, TRAINING_COLUMNS)] if rows else []
+    return [markdown_table(rows, LEARNING_COLUMNS)] if rows else []
 
 
 def notes(against: str | None, normalised: bool, sampled: bool) -> str:

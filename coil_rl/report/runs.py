@@ -20,6 +20,8 @@ from coil_rl.train.trust import read_yaml
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "track")
 MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
+EVALUATION, SELECTION = "evaluation", "selection"  # sets of cases: for reports, and for the choice of the best policy
+RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
 PER_STEP = "per_step_"  # prefix of the columns of tasks
 TERM = "reward_"  # prefix of the columns of the terms of the reward
 
@@ -38,7 +40,7 @@ class Run:
             ("deterministic" or "sampled"), `track`, MEASURES, for each task `per_step_TASK`, and for each term of the
             reward `reward_TERM`.
         curve: rows of metrics.csv; empty if nothing was trained.
-        guide_returns: mean return of each guide on the training tracks, if it was measured.
+        guide_returns: mean return of each guide in the cases of the evaluation, if it was measured.
         seconds: duration of the training; None if unknown, as for an interrupted run.
     """
 

@@ -1,4 +1,4 @@
-"""Table 4 and figure 22 of the paper: the return during training."""
+"""Table 4 and figure 22 of the paper: the return of the policies of a training run."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
-from coil_rl.report.curves import TRAINING, mean_curve, points
-from coil_rl.report.runs import GUIDE, Run
+from coil_rl.report.curves import frames_until, learning, mean_curve
+from coil_rl.report.runs import GUIDE, RETURN
 from coil_rl.report.statistics import Estimate, estimate, wins
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, WorldsResult, runs_by_label
@@ -22,26 +22,31 @@ PAPER_RETURNS = {"coil": 477.6, "ppo": 414.2}  # mean over 5 runs of the highest
 FRACTIONS = {0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
 
 TABLE_4_NOTES = """
-The return of a run is the mean over its last 100 finished episodes on the training tracks, actions sampled; best: the
-highest during training, as in the paper; final: the last one. The highest point of a noisy curve is above the policy's
-mean return, the more so the longer the run. Differences to {against} are of the same seed; better: the share of seeds
-with a higher best. Intervals: t over the runs. Its guide: the guide alone on the training tracks, degraded as the
-agent's was."""
+The return of a policy is its mean over fixed cases on the test tracks: drives of some seconds from places spread along
+them, deterministic actions. Best: of the kept policy with the highest return in such cases on the training tracks;
+final: of the last one. The paper's is the highest mean reward of whole episodes during training, so only ratios
+compare. Differences to {against} are of the same seed; better: the share of seeds with a higher best. Intervals: t over
+the runs. Its guide: the guide alone in the same cases, degraded as the agent's was."""
 
 FIGURE_22_NOTES = """
-The return is the mean over the last 100 finished episodes on the training tracks, actions sampled; the curve is the
-mean of the runs, the band its 95 % t interval. The guide alone earns {guide} there. Up to the
-guide: the number of frames after which the mean of the runs first reaches that. The paper draws three curves of each
-method and prints no numbers."""
+The return of a policy is its mean over fixed cases on the test tracks: places spread along them, deterministic actions.
+The curve is the mean of the runs, the band its 95 % t interval. The guide alone earns {guide} there. Up to the guide:
+the number of frames after which the mean of the runs first reaches that, interpolated. The paper draws three curves of
+each method and prints no numbers."""
 
 
 class Table4(WorldsResult):
-    """Best and final training return of each method."""
+    """Return of the best and of the last policy of each method."""
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         rows = {
-            world: [training_returns(run) for experiment in experiments for run in runs[experiment] if run.curve]
+            world: [
+                {"label": run.label, "seed": run.seed} | learning(run)
+                for experiment in experiments
+                for run in runs[experiment]
+                if run.curve
+            ]
             for world, experiments in self.worlds.items()
         }
         write_csv([{"world": world} | row for world in rows for row in rows[world]], stem.with_suffix(".csv"))
@@ -53,7 +58,7 @@ class Table4(WorldsResult):
             "guide": ("its guide", ".1f"), "difference cell": (f"best - {self.against}'s (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
         }  # fmt: skip
-        parts = ["## Table 4: the return in training", _paper_table(tables[""])]
+        parts = ["## Table 4: the return of the trained policies", _paper_table(tables[""])]
         for world, table in tables.items():
             parts += [*pages.world_heading(world), markdown_table(table, columns)]
         parts += [TABLE_4_NOTES.strip().format(against=self.against)]
@@ -61,7 +66,7 @@ class Table4(WorldsResult):
         for world, table in tables.items():
             for line in table:
                 if line["label"] == "coil" and self.against == "ppo":
-                    claim = ", ".join(filter(None, ("COIL's best return in training is above PPO's", world)))
+                    claim = ", ".join(filter(None, ("COIL's best return is above PPO's", world)))
                     paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
                     claims.append({"claim": claim, "paper": paper, "ours": pages.Claim(line["difference"], "+.1f")})
         if claims:
@@ -112,7 +117,7 @@ class Figure22(Result):
         guide = float(np.mean(own)) if own else None
         rows, table = [], []
         for label, of_label in curves.items():
-            curve = mean_curve(of_label, TRAINING)
+            curve = mean_curve(of_label, RETURN)
             rows += [
                 {"label": label, "frames": frames, "mean": mean, "low": low, "high": high}
                 for frames, mean, low, high in zip(*curve, strict=True)
@@ -125,28 +130,17 @@ class Figure22(Result):
                     at = int(np.abs(frames - fraction * frames[-1]).argmin())
                     ends = (low[at], high[at]) if len(of_label) > 1 else (np.nan, np.nan)
                     line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
-            reached = frames[mean >= guide] if guide is not None else frames[:0]
-            table.append(line | {"reached": reached[0] if len(reached) else None})
+            table.append(line | {"reached": None if guide is None else frames_until(frames, mean, guide)})
         write_csv(rows, stem.with_suffix(".csv"))
         draw_learning_curves(
             curves, stem.with_suffix(".png"), guides={} if guide is None else {GUIDE: guide},
-            title="Figure 22: the return in training",
+            title="Figure 22: the return of the trained policies",
         )  # fmt: skip
         columns = {"label": ("method", ""), "runs": ("runs", "d")}
         columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
         columns |= {"reached": ("frames up to the guide", ",.0f")}
         notes = FIGURE_22_NOTES.strip().format(guide="an unknown return" if guide is None else f"{guide:.1f}")
         return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"
-
-
-def training_returns(run: Run) -> dict[str, Any]:
-    """Return the best and final training return of a run and its guide's return; NaN where unknown."""
-    curve = points(run.curve, TRAINING)
-    best_at, best = curve[curve[:, 1].argmax()] if len(curve) else (math.nan, math.nan)
-    return {
-        "label": run.label, "seed": run.seed, "frames": run.curve[-1]["frames"], "best": best, "best_at": best_at,
-        "final": curve[-1, 1] if len(curve) else math.nan, "guide": max(run.guide_returns.values(), default=math.nan),
-    }  # fmt: skip
 
 
 def _paper_table(table: Sequence[Row]) -> str:
@@ -178,4 +172,6 @@ def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path:
         ]
         for key in ("best", "final")
     }  # fmt: skip
-    draw_intervals(panels, path, measure="return (mean of the runs)", title="Table 4: the return in training")
+    draw_intervals(
+        panels, path, measure="return (mean of the runs)", title="Table 4: the return of the trained policies"
+    )

@@ -167,6 +167,12 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
     return dict(resolved)
 
 
+def cases_node(config: DictConfig, cases: str) -> dict[str, Any]:
+    """Return the overrides of `env` for a set of cases of the evaluation curve."""
+    curve = config.evaluation.curve
+    return {**curve.env, **curve.cases[cases], "num_cars": curve.cars}
+
+
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
     """Return the learner of a configuration, which observes `method.observes` and `also_observes` of an env.
 

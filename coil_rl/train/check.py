@@ -20,6 +20,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.train.arguments import validation_message
 from coil_rl.train.build import (
     build,
@@ -29,6 +30,7 @@ from coil_rl.train.build import (
     build_guided_env,
     build_guides,
     build_learner,
+    cases_node,
     check_node,
     learner_kind,
     trains_guides,
@@ -174,7 +176,7 @@ def _check_drive(config: DictConfig, split: str, tracks: int, build_drive: Calla
 def _check_training(config: DictConfig, tracks: int) -> None:
     if not config.method.observes:
         raise UserError("method.observes=[]: the agent has no observations; give some, or null for no agent")
-    env = build_env(config)
+    env = build_env(config, config.training.env)
     if trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
     guides = build_guides(config) if trains_guides(config) else {}
@@ -192,6 +194,12 @@ def _check_training(config: DictConfig, tracks: int) -> None:
             "track.train gives one track, which cannot be left out to validate; set learner.group_key=null, "
             "or learner.validate=false"
         )
+    if cases := list(config.evaluation.curve.cases):
+        if set(cases) != {EVALUATION, SELECTION}:
+            given = ", ".join(cases)
+            raise UserError(f"evaluation.curve.cases has {given}; give {EVALUATION} and {SELECTION}, or none")
+        for name in cases:
+            build_env(config, cases_node(config, name))
     if config.logger:
         check_node(config.logger, "logger")
     _check_watch(config, env)

@@ -52,10 +52,32 @@ class BudgetConfig(NodeConfig):
 
 
 @dataclass
+class CurveConfig(NodeConfig):
+    """Evaluation of the policies that a run keeps, see `coil_rl.train.curve`.
+
+    `cars` is the number of cases in a set; `env` and, by the name of a set, `cases` are overrides of the env.
+    """
+
+    points: Annotated[int, Field(ge=1, le=1000)] = 16
+    batches: Annotated[int, Field(ge=1, le=1000)] = 1
+    cars: Cars = 1
+    env: dict[str, Any] = field(default_factory=dict)
+    cases: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+@dataclass
+class TrainingConfig(NodeConfig):
+    """Overrides of `env` in training."""
+
+    env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
 class EvaluationConfig(NodeConfig):
     """Evaluation of a policy."""
 
     env: dict[str, Any] = field(default_factory=dict)
+    curve: CurveConfig = field(default_factory=CurveConfig)
     advice: dict[str, Any] = field(default_factory=dict)
     repeats: Repeats = 5
     policy: WhichPolicy = "last"
@@ -112,6 +134,7 @@ class DrivingConfig(ProgramConfig):
     also_observes: list[str] = field(default_factory=list)
     action: dict[str, Any] = field(default_factory=dict)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     seed: Seed = 0
     device: str = "cpu"

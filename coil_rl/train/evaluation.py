@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -72,21 +73,36 @@ def evaluate_policy(
         names: of the tracks.
         tick: called after every step.
     """
-    history: list[dict[str, Tensor]] = []
+    history = [
+        _record(after) | {"running": running} for after, running in episodes(env, policy, sampled=sampled, tick=tick)
+    ]
+    steps = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
+    return _measure(steps, names, getattr(env, "rate", float("nan")))
+
+
+def episodes(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    sampled: bool | Tensor = False,
+    tick: Callable[[], Any] | None = None,
+) -> Iterator[tuple[TensorDictBase, Tensor]]:
+    """Yield the entries after each step of one episode on every row, and whether the row was still in it, [B, 1].
+
+    Arguments as for `evaluate_policy`.
+    """
     carrier = env.eval().reset()
     running = torch.ones_like(env.full_done_spec["done"].zero())
-    while True:
+    for count in itertools.count(1):
         step = env.step(_act(policy, carrier, sampled))
-        history.append(_record(step["next"]) | {"running": running})
+        yield step["next"], running
         running = running & ~step["next", "done"]
         # The test waits for the device.
-        if len(history) % 8 == 0 and not running.any():
-            break
+        if count % 8 == 0 and not running.any():
+            return
         carrier = env.step_mdp(step)
         if tick is not None:
             tick()
-    steps = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
-    return _measure(steps, names, getattr(env, "rate", float("nan")))
 
 
 def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor) -> TensorDictBase:

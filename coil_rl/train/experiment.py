@@ -1,4 +1,4 @@
-"""The training loop: collect a batch, update, log, keep the best policy, save checkpoints."""
+"""The training loop: collect a batch, update, log, keep and judge policies, save checkpoints."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import csv
 import io
 import math
 import os
+import shutil
 import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -22,8 +24,9 @@ from tqdm import tqdm
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import whole_file
-from coil_rl.report.runs import read_curve
+from coil_rl.report.runs import CHOICE, RETURN, read_curve
 from coil_rl.train import checkpoint
+from coil_rl.train.curve import EvaluationCurve
 from coil_rl.train.rollout import Rollout
 from coil_rl.train.run_folder import check_same
 
@@ -62,9 +65,10 @@ class Probe(Protocol):
 class Experiment:
     """One training run in one folder.
 
-    Files: `metrics.csv` (a row per update), `checkpoint.pt` (the complete state), `checkpoint_previous.pt`,
-    `policy_best.pt` and `policy_last.pt`. A run that was killed at any moment and resumed in a new process ends with
-    the same files, to the bit on a CPU.
+    Files: `metrics.csv` (a row for the state before the first update and after each update), `checkpoint.pt` (the
+    complete state), `checkpoint_previous.pt`, `policy_last.pt`, `policy_best.pt` (best evaluation; the last one without
+    evaluations) and `policies/` (the kept ones). A run that was killed at any moment and resumed in a new process ends
+    with the same files, to the bit on a CPU.
 
     Args:
         learner: see `Learner`.
@@ -77,6 +81,7 @@ class Experiment:
             ("step").
         checkpoint_every: updates between two checkpoints.
         probe: see `Probe`.
+        curve: drives the kept policies.
         identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
     """
 
@@ -93,16 +98,16 @@ class Experiment:
         watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
         checkpoint_every: int = 10,
         probe: Probe | None = None,
+        curve: EvaluationCurve | None = None,
         identity: Mapping[str, Any] | None = None,
     ) -> None:
         self.learner, self.rollout, self.frames, self.folder = learner, rollout, frames, folder
         self.metrics, self.checkpoint_every = Metrics(folder / "metrics.csv", logger), checkpoint_every
-        self.probe, self.identity = probe, dict(identity or {})
+        self.probe, self.curve, self.identity = probe, curve, dict(identity or {})
         watch = watch or {}
         self.watch_episode = {name: ("next", *key) for name, key in watch.get("episode", {}).items()}
         self.watch_step = {name: ("next", *key) for name, key in watch.get("step", {}).items()}
         self.updates = 0
-        self.best = -math.inf
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
         self.rows: list[dict[str, float]] = []
 
@@ -115,7 +120,7 @@ class Experiment:
             with file_of_a_run(newest, remedy):
                 check_same(state["identity"], self.identity, f"{newest} belongs to a run", remedy)
                 self.load_state_dict(state)
-        self.rows = self.metrics.truncate(self.updates)
+        self.rows = self.metrics.truncate(self.updates + 1 if self.updates else 0)
         where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
         print(f"{self.folder} continues {where}", file=sys.stderr)
 
@@ -129,36 +134,56 @@ class Experiment:
         with tqdm(
             total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
         ) as bar:
-            while self.updates < updates:
-                before = self._probe(self.updates == 0)
+            first = self._probe(self.updates == 0)
+            while True:
+                evaluated = self._evaluate(updates)
+                if self.updates == updates:
+                    break
                 row = self.update(self.updates / updates)
                 changed = self.probe is not None and self.probe.each_phase and row["learner/guides_changed"]
-                after = self._probe(self.updates == updates or bool(changed))
-                row |= {name: before[name] if math.isnan(value) else value for name, value in after.items()}
-                self.rows.append(row)
-                self.metrics.append(row)
+                row |= self._probe(self.updates == updates or bool(changed))
+                if not self.rows:
+                    self._log({**dict.fromkeys(row, math.nan), "frames": 0, **first})
+                self._log(row)
                 bar.update(frames)
-                postfix = {"return": f"{row['train/return']:.0f}"}
-                if guide_return is not None:
-                    postfix["guide"] = f"{guide_return:.0f}"
-                bar.set_postfix(postfix)
+                returns = {"return": row["train/return"], "evaluation": evaluated, "guide": guide_return}
+                bar.set_postfix({name: f"{value:.0f}" for name, value in returns.items() if value is not None})
                 if self.updates % self.checkpoint_every == 0 or self.updates == updates:
                     self._save()
         policy = self.learner.policy.state_dict()
         checkpoint.save(policy, self.folder / "policy_last.pt")
-        if self.best == -math.inf:
+        if self.curve is None:
             checkpoint.save(policy, self.folder / "policy_best.pt")
         return self.rows
+
+    def _log(self, row: dict[str, float]) -> None:
+        self.rows.append(row)
+        self.metrics.append(row)
+
+    def _evaluate(self, updates: int) -> float | None:
+        """Keep the policy and drive the kept ones if it is time; return the newest return of the evaluation."""
+        if self.curve is None:
+            return None
+        if self.updates in self.curve.kept(updates):
+            self.curve.keep(self.updates * self.rollout.frames)
+        batch = self.curve.batch(self.updates, updates)
+        if batch and math.isnan(self.rows[batch[-1]][RETURN]):
+            frames = [update * self.rollout.frames for update in batch]
+            results = dict(zip(batch, self.curve.drive(frames), strict=True))
+            for update, result in results.items():
+                self.rows[update] |= result
+                self.metrics.log(result, update * self.rollout.frames)
+            judged = (row for row in self.rows if not math.isnan(row[CHOICE]))
+            with whole_file(self.folder / "policy_best.pt") as unfinished:
+                shutil.copyfile(self.curve.file(int(max(judged, key=itemgetter(CHOICE))["frames"])), unfinished)
+            self.metrics.fill(results)
+        return next((row[RETURN] for row in reversed(self.rows) if not math.isnan(row[RETURN])), None)
 
     def update(self, progress: float) -> dict[str, float]:
         """Collect one batch, learn from it and return the row of the log."""
         with self._resume_hint():
             batch = self.rollout.collect(progress)
-        row = self._describe(batch)
-        if len(self.returns) == self.EPISODES and row["train/return"] > self.best:
-            # The policy that collected this batch, before the update.
-            self.best = row["train/return"]
-            checkpoint.save(self.learner.policy.state_dict(), self.folder / "policy_best.pt")
+        row = dict.fromkeys(self.curve.names if self.curve else [], math.nan) | self._describe(batch)
         learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
         self.updates += 1
         with self._resume_hint():
@@ -210,7 +235,6 @@ class Experiment:
             "rollout": self.rollout.state_dict(),
             "identity": self.identity,
             "updates": self.updates,
-            "best": self.best,
             "returns": list(self.returns),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
@@ -220,7 +244,7 @@ class Experiment:
         """Restore a state of `state_dict`."""
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
-        self.updates, self.best = state["updates"], state["best"]
+        self.updates = state["updates"]
         self.returns = deque(state["returns"], maxlen=self.EPISODES)
         torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"]:
@@ -270,9 +294,24 @@ class Metrics:
             if first:
                 writer.writeheader()
             writer.writerow(row)
-        if self.logger is not None:
-            for name, value in row.items():
-                self.logger.log_scalar(name, value, step=int(row["frames"]))
+        self.log(row, int(row["frames"]))
+
+    def log(self, values: Mapping[str, float], frames: int) -> None:
+        """Give values to the logger."""
+        for name, value in values.items() if self.logger is not None else ():
+            if not math.isnan(value):
+                self.logger.log_scalar(name, value, step=frames)  # type: ignore[union-attr]
+
+    def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
+        """Put values into rows, by their numbers, of the CSV file; the other cells keep their text."""
+        with self.path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        for number, values in results.items():
+            rows[number] |= {name: str(value) for name, value in values.items()}
+        with whole_file(self.path) as unfinished, unfinished.open("w", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
 
     def flush(self) -> None:
         """Wait until all rows are on the disk."""

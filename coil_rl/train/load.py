@@ -17,7 +17,7 @@ PROXIES = "proxies"  # subfolder with the networks that replace guides without p
 
 
 def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
-    """Return the policy of a run, `last` or `best` (highest mean return of a training batch).
+    """Return the policy of a run, `last` or `best` (of the kept ones, in the cases of selection).
 
     The env has the transforms of the run.
 

@@ -5,18 +5,30 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import torch
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, draw_phases
+from coil_rl.report.runs import EVALUATION
 from coil_rl.train import checkpoint, distillation
-from coil_rl.train.build import build, build_env, build_guides, build_learner, trains_guides
-from coil_rl.train.evaluate_run import drive_guides, driver_names, evaluate_run, report_outcome
+from coil_rl.train.build import (
+    build,
+    build_env,
+    build_guided_env,
+    build_guides,
+    build_learner,
+    cases_node,
+    trains_guides,
+)
+from coil_rl.train.curve import EvaluationCurve, measures
+from coil_rl.train.evaluate_run import driver_names, evaluate_run, report_outcome
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.load import PROXIES, load_guides, weights_file
 from coil_rl.train.rollout import Rollout
@@ -69,7 +81,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     guide_returns = _saved_guide_returns(config, folder / "guide_return.json")
     # After the guides, which a resumed run does not drive again.
     torch.manual_seed(config.seed)
-    env = build_env(config)
+    env = build_env(config, config.training.env)
     learner = build_learner(config, env, load_guides(folder, config) if improves_guides else None)
     keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(
@@ -81,12 +93,13 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
         probe=GuideReturns(config, learner.guides) if improves_guides else None,
+        curve=_curve(config, folder, learner.policy),
         identity=flat(config),
     )
     if resumed:
         experiment.resume()
     start = time.monotonic()
-    rows = experiment.run(max(guide_returns.values()))
+    rows = experiment.run(max(guide_returns.values(), default=None))
     if not resumed:  # the time before the interruption is unknown
         _write_json({"seconds": time.monotonic() - start}, folder / "training_time.json")
     if improves_guides:
@@ -113,7 +126,7 @@ def _distil(config: DictConfig, folder: Path) -> None:
 
 
 class GuideReturns:
-    """Mean return of each guide of a learner on the training tracks, with its present parameters; a `Probe`."""
+    """Mean return of each guide of a learner in the cases of the evaluation, with its present parameters; a `Probe`."""
 
     def __init__(self, config: DictConfig, guides: Mapping[str, TensorDictModuleBase]) -> None:
         self.config, self.guides = config, guides
@@ -136,10 +149,27 @@ def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
 
 
 def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None) -> dict[str, float]:
-    """Return the mean return of each guide on the training tracks."""
-    names = [track.name for track in build(config.track.train, "track.train")]
-    results = drive_guides(config, {"assignment": "cyclic"}, names, guides)
-    return {driver: result.mean_reward for driver, result in results.items()}
+    """Return the mean return of each guide in the cases of the evaluation."""
+    guides = guides or build_guides(config)
+    if EVALUATION not in config.evaluation.curve.cases:
+        return {}
+    env, policy = build_guided_env(config, cases_node(config, EVALUATION), guides)
+    with torch.random.fork_rng():
+        returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
+    return dict(zip(driver_names(guides), returns.tolist(), strict=True))
+
+
+def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> EvaluationCurve | None:
+    """Return the evaluation curve of a run; None without cases."""
+
+    def build_cases(cases: str, drivers: int) -> EnvBase:
+        overrides = cases_node(config, cases)
+        return build_env(config, overrides | {"num_cars": drivers * config.evaluation.curve.cars})
+
+    curve = config.evaluation.curve
+    envs = {cases: partial(build_cases, cases) for cases in curve.cases}
+    options = {"watch": config.watch, "points": curve.points, "batches": curve.batches}
+    return EvaluationCurve(folder, policy, envs, **options) if envs else None
 
 
 def _write_json(numbers: Mapping[str, float], file: Path) -> None:

@@ -18,7 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
-from coil_rl.envs.limits import LARGEST_COUNT, check_choice, check_range
+from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.reward import (
     HISTORY,
     REWARD_TERMS,
@@ -31,7 +31,7 @@ from coil_rl.envs.reward import (
 from coil_rl.envs.robot.course import RobotCourse, robot_track
 from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
 from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs, simulated_cone_classifier
-from coil_rl.envs.track import Track
+from coil_rl.envs.track import NEVER, Track, places
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones
 
@@ -50,7 +50,7 @@ class SimulatedRobotEnv(SeededEnv):
     Args:
         tracks: in the robot's own metres; None for `robot_track()`.
         num_cars: B.
-        assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
+        starts, assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
         perception: None for `Perception` with the shipped classifier.
         lidar: None for an RPLIDAR A1M8; one control step per scan.
         speed: m/s.
@@ -72,6 +72,7 @@ class SimulatedRobotEnv(SeededEnv):
         tracks: Sequence[Track] | None = None,
         num_cars: int = 1,
         *,
+        starts: int | None = None,
         assignment: Literal["random", "cyclic"] = "random",
         perception: Perception | None = None,
         lidar: SimulatedLidar | None = None,
@@ -86,6 +87,7 @@ class SimulatedRobotEnv(SeededEnv):
         seed: int = 0,
     ) -> None:
         check_range(0, above=True, num_cars=num_cars, speed=speed, car_length=car_length)
+        check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
         check_choice(("random", "cyclic"), assignment=assignment)
@@ -106,14 +108,17 @@ class SimulatedRobotEnv(SeededEnv):
         self.memory = BoundaryMemory(num_cars, spline, smoothing, sight=sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
-        self.starts = torch.tensor([track.start for track in self.tracks]).t()
+        index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
+        self.start_track, self.start_pose, self.staggered = index, poses.T.float(), starts is not None
+        self.start_lap = torch.where(driven.isnan(), NEVER, -driven / self.step_length).round().long()
         self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
-        self.track: Tensor = nn.Buffer(torch.arange(num_cars) % len(self.tracks))
+        self.place: Tensor = nn.Buffer(torch.arange(num_cars) % len(index))
+        self.track: Tensor = nn.Buffer(self.start_track[self.place])
         self.pose: Tensor = nn.Buffer(torch.zeros(3, num_cars))
         self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_cars))
         self.steps: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
         self.lap: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
-        self.lap_start: Tensor = nn.Buffer(torch.full((num_cars,), -1))
+        self.lap_start: Tensor = nn.Buffer(torch.full((num_cars,), NEVER))
         self.in_finish: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.bool))
         self.scan: Tensor = nn.Buffer(torch.full((num_cars, self.lidar.beams), torch.inf))
         declare_specs(self, self._reset())
@@ -121,14 +126,23 @@ class SimulatedRobotEnv(SeededEnv):
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
-        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
+        steps = torch.zeros(self.batch_size, dtype=torch.int64)
         # All robots draw and measure, reset or not: the order of random numbers must not depend on the data.
         if self.assignment == "random":
-            drawn = torch.randint(len(self.tracks), self.batch_size, generator=self.generator)
-            self.track = torch.where(mask, drawn, self.track)
-        self.pose = torch.where(mask, self.starts[:, self.track], self.pose)
-        for name, value in {"history": 0, "steps": 0, "lap": 0, "lap_start": -1, "in_finish": False}.items():
-            setattr(self, name, getattr(self, name).masked_fill(mask, value))
+            drawn = torch.randint(len(self.start_track), self.batch_size, generator=self.generator)
+            if mask is None and self.staggered:
+                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
+            self.place = drawn if mask is None else torch.where(mask.view(-1), drawn, self.place)
+        mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
+        place = self.place
+        start = {"track": self.start_track[place], "pose": self.start_pose[:, place], "steps": steps}
+        start["lap_start"] = steps + self.start_lap[place]
+        for name, value in start.items():
+            setattr(self, name, torch.where(mask, value, getattr(self, name)))
+        begun = self.lap_start > NEVER
+        self.in_finish = torch.where(mask, self._inside() & begun, self.in_finish)
+        for name in ("history", "lap"):
+            setattr(self, name, getattr(self, name).masked_fill(mask, 0))
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
         self.memory.reset(mask)
@@ -182,13 +196,17 @@ class SimulatedRobotEnv(SeededEnv):
 
     def _count_laps(self) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 without a completed lap, and whether one was completed [B]."""
-        inside = (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
+        inside = self._inside()
         entered = inside & ~self.in_finish
-        finished = entered & (self.lap_start >= 0)
+        finished = entered & (self.lap_start > NEVER)
         lap_time = (self.steps - self.lap_start) * finished / self.rate
         self.in_finish, self.lap = inside, self.lap + finished
         self.lap_start = torch.where(entered, self.steps, self.lap_start)
         return lap_time, finished
+
+    def _inside(self) -> Tensor:
+        """Return whether each robot is in the finish circle, [B]."""
+        return (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
 
     def _tensordict(self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor) -> TensorDict:
         columns = {"track": self.track, "lap": self.lap, **values}

@@ -12,6 +12,7 @@ from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
 from coil_rl.testing import check_env
+from coil_rl.train.evaluation import evaluate_policy
 
 AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}
 
@@ -281,3 +282,20 @@ def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
         assert theirs.device.type == "cuda"
         assert torch.allclose(ours["observation"], theirs["observation"].cpu(), atol=1e-2)
         assert torch.equal(ours["info", "track"], theirs["info", "track"].cpu())
+
+
+def test_lap_that_begins_anywhere_counts_as_driven_from_the_finish(rings):
+    world = {"assignment": "cyclic", "laps": 1, "rate": 12}
+    whole = evaluate_policy(ConeTrackEnv(rings, 3, **world), SplineGuide()).episodes
+    for car, part in enumerate(evaluate_policy(ConeTrackEnv(rings, 12, starts=12, **world), SplineGuide()).episodes):
+        assert part["completed"]
+        assert part["steps"] < whole[car % 3]["steps"]
+        assert part["lap_time"] == pytest.approx(whole[car % 3]["lap_time"], rel=0.04)
+
+
+def test_staggered_episodes_end_at_different_times(rings):
+    env = ConeTrackEnv(rings, 200, starts=30, time_limit=10, rate=6)
+    data = env.rollout(60, SplineGuide(), break_when_any_done=False, auto_cast_to_device=False)
+    ends = data["next", "truncated"].sum(0).squeeze(-1)
+    assert ends.sum() >= 199
+    assert ends.max() < 14

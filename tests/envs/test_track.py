@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from coil_rl.envs.track import Track, TrackError, resample
+from coil_rl.envs import shipped_tracks
+from coil_rl.envs.track import SIDES, Track, TrackError, places, resample
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
@@ -98,3 +100,25 @@ def test_crossings_are_tested_on_the_curves_instead_of_the_polygons():
     quarter = np.array([[0, 1], [-1, 0]])
     larger = np.vstack([edge @ np.linalg.matrix_power(quarter, turns) for turns in range(4)])
     assert "The two sides cross each other" in error_of(left=corners, right=larger)
+
+
+@pytest.mark.parametrize("count", [7, 24, 112])
+def test_places_are_spread_along_the_middle_of_each_track(count):
+    tracks = shipped_tracks("train")
+    index, poses, driven = places(tracks, count)
+    assert index.tolist() == [i % len(tracks) for i in range(count)]
+    for number, track in enumerate(tracks):
+        own, at = poses[index == number], np.sort(driven[index == number])
+        lap = np.concatenate([at, at[:1] + track.length])
+        assert np.diff(lap).max() < 2.7 * track.length / len(at)
+        tree = {side: cKDTree(track.boundary(side)) for side in SIDES}
+        left, right = (tree[side].query(own[:, :2])[0] for side in SIDES)
+        assert np.abs(left - right).max() < 0.3
+
+
+def test_places_without_a_count_are_the_starts():
+    tracks = shipped_tracks("test")
+    index, poses, driven = places(tracks, None)
+    assert index.tolist() == [0, 1, 2]
+    assert np.isnan(driven).all()
+    assert np.array_equal(poses, [track.start for track in tracks])

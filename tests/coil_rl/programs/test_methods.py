@@ -102,7 +102,9 @@ def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
 def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
     # Before the first update its numbers are those of plain PPO.
     coupled = trained(tmp_path / "rfc", "rfc", "method.transforms.coupling.beta=1000")
-    first, other = (next(csv.DictReader((run / "metrics.csv").open(newline=""))) for run in (coupled, plain))
+    (_, first, *_), (_, other, *_) = (
+        csv.DictReader((run / "metrics.csv").open(newline="")) for run in (coupled, plain)
+    )
     same = [key for key in other if key.startswith("train/")]
     assert {key: first[key] for key in same} == {key: other[key] for key in same}
     assert float(first["train/guide_distance"]) > 0

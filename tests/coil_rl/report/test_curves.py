@@ -6,13 +6,14 @@ from PIL import Image
 from scipy.stats import t
 
 from coil_rl.report import draw_curve_grid, draw_learning_curves, draw_phases
-from coil_rl.report.curves import TRAINING, mean_curve
+from coil_rl.report.curves import frames_until, mean_curve
+from coil_rl.report.runs import RETURN
 
 
 def run(seed, rows=40):
     rng = np.random.default_rng(seed)
     values = [300 * (1 - math.exp(-index / 10)) + float(rng.normal()) for index in range(rows)]
-    return [{"frames": 50_000 * (n + 1), TRAINING: value if n else math.nan} for n, value in enumerate(values)]
+    return [{"frames": 50_000 * (n + 1), RETURN: value if n else math.nan} for n, value in enumerate(values)]
 
 
 def phase_rows(updates=24):
@@ -22,7 +23,7 @@ def phase_rows(updates=24):
         phase = update // 4
         guide = -1 if phase % 2 == 0 else phase // 2 % 2
         rows.append({
-            "frames": 1000.0 * (update + 1), "train/return": math.nan if update < 5 else 10.0 * update,
+            "frames": 1000.0 * (update + 1), RETURN: math.nan if update < 5 else 10.0 * update,
             "learner/guide": guide, "learner/learning_rate": 1e-3 * 0.9**phase if guide < 0 else 0.0,
             "learner/guide_learning_rate": 0.0 if guide < 0 else 1e-4,
             "learner/moved_a": 0.01 * phase, "learner/moved_b": 0.005 * phase,
@@ -36,7 +37,7 @@ def phase_rows(updates=24):
     [
         {"COIL": [run(0), run(1), run(2)], "PPO": [run(3, rows=20)]},
         {str(index): [run(index)] for index in range(8)},
-        {"no values": [[{"frames": 0, TRAINING: None}, {"frames": 100}, {"frames": 200, TRAINING: math.nan}]]},
+        {"no values": [[{"frames": 0, RETURN: None}, {"frames": 100}, {"frames": 200, RETURN: math.nan}]]},
         {"no common frames": [run(0, rows=3), [{**row, "frames": 1e9} for row in run(1, rows=3)]]},
     ],
 )
@@ -63,17 +64,17 @@ def test_phases_are_drawn_for_guides_in_turn_and_together(tmp_path):
 
 
 def test_single_run_is_its_own_mean_and_interval():
-    rows = [{"frames": f, TRAINING: v} for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))]
-    frames, *curves = mean_curve([rows], TRAINING)
+    rows = [{"frames": f, RETURN: v} for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))]
+    frames, *curves = mean_curve([rows], RETURN)
     np.testing.assert_array_equal(frames, [10, 20, 40])
     for curve in curves:
         np.testing.assert_array_equal(curve, [1, 2, 4])
 
 
 def test_runs_are_averaged_over_their_common_frames():
-    first = [{"frames": f, TRAINING: 1.0 * f} for f in (0, 10, 20, 30)]
-    second = [{"frames": f, TRAINING: 3.0 * f} for f in (5, 15, 25)]
-    frames, mean, low, high = mean_curve([first, second, []], TRAINING)
+    first = [{"frames": f, RETURN: 1.0 * f} for f in (0, 10, 20, 30)]
+    second = [{"frames": f, RETURN: 3.0 * f} for f in (5, 15, 25)]
+    frames, mean, low, high = mean_curve([first, second, []], RETURN)
     np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
     half = t.ppf(0.975, 1) * frames
     np.testing.assert_allclose([mean, low, high], [2 * frames, 2 * frames - half, 2 * frames + half])
@@ -82,7 +83,7 @@ def test_runs_are_averaged_over_their_common_frames():
 def test_interval_of_the_mean_has_its_coverage():
     hits = 0
     for values in np.random.default_rng(0).normal(size=(100, 20)):
-        _, _, low, high = mean_curve([[{"frames": 1, TRAINING: float(value)}] for value in values], TRAINING)
+        _, _, low, high = mean_curve([[{"frames": 1, RETURN: float(value)}] for value in values], RETURN)
         hits += bool(low[0] <= 0 <= high[0])
     assert 0.88 < hits / 100 < 0.98
 
@@ -91,7 +92,11 @@ def test_interval_of_the_mean_has_its_coverage():
     ("draw", "data", "message"),
     [
         (draw_learning_curves, [{"COIL": [], "PPO": []}], "at least one run; got none for: COIL, PPO"),
-        (draw_learning_curves, [{"COIL": [[{"step": 1, TRAINING: 2.0}]]}], "no 'frames'; it has: step, train/return"),
+        (
+            draw_learning_curves,
+            [{"COIL": [[{"step": 1, RETURN: 2.0}]]}],
+            "no 'frames'; it has: step, evaluation/return",
+        ),
         (draw_curve_grid, [{}], "at least one label"),
         (draw_phases, [[], ["a"]], "at least one row"),
     ],
@@ -100,3 +105,9 @@ def test_missing_data_is_an_error_and_leaves_no_file(draw, data, message, tmp_pa
     with pytest.raises(ValueError, match=message):
         draw(*data, tmp_path / "plot.png")
     assert not list(tmp_path.iterdir())
+
+
+def test_frames_until_a_level_are_interpolated():
+    frames, returns = [0, 100, 200, 300], [0.0, 50.0, 40.0, 90.0]
+    assert [frames_until(frames, returns, level) for level in (50, 65, -1)] == [100, 250, 0]
+    assert all(math.isnan(frames_until(frames, returns, level)) for level in (91, math.nan))

@@ -61,17 +61,22 @@ def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
     assert page.guide_training(read_runs([tmp_path / "2"])) == []
 
 
-def test_training_is_summarised_by_area_final_and_highest_return(tmp_path):
+def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
     rows = driven("any", {"a": 500.0})
-    for label, returns in {"late": ["nan", 100.0, 300.0], "early": [200.0, 400.0, 300.0]}.items():
-        folder = make_run(tmp_path / label, label, 0, rows)
-        write_csv([{"frames": 1000 * n, page.TRAINING: x} for n, x in enumerate(returns, 1)], folder / "metrics.csv")
+    curves = {"late": [0.0, "nan", 100.0, 300.0], "early": [200.0, 250.0, 400.0, 300.0]}
+    for label, returns in curves.items():
+        folder = make_run(tmp_path / label, label, 0, rows, guide=200.0)
+        lines = [{"frames": 1000 * n, "evaluation/return": x, "selection/return": -n} for n, x in enumerate(returns)]
+        write_csv(lines, folder / "metrics.csv")
     (tmp_path / "late" / "training_time.json").write_text('{"seconds": 12.4}')
-    (table,) = page.training(read_runs([tmp_path]))
+    make_run(tmp_path / "never", "late", 1, rows, guide=1000.0)
+    (table,) = page.training(read_runs([tmp_path / "late", tmp_path / "early"]))
     assert cells(table)[1:] == [
-        ["early", "1", "3,000", "300.0", "300.0", "400.0", "-"],
-        ["late", "1", "3,000", "200.0", "300.0", "300.0", "12"],
+        ["early", "1", "3,000", "200.0", "200.0", "0", "0", "300.0", "200.0", "300.0", "-"],
+        ["late", "1", "3,000", "200.0", "0.0", "2,400", "2,500", "100.0", "300.0", "300.0", "12"],
     ]
+    (table,) = page.training(read_runs([tmp_path]))
+    assert cells(table)[2][5:7] == ["2,400 (1 of 2 seeds)", "2,500 (1 of 2 seeds)"]
 
 
 def test_empty_columns_and_many_tracks_are_omitted(tmp_path):

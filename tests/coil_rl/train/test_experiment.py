@@ -12,6 +12,7 @@ from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.train import checkpoint
+from coil_rl.train.curve import EvaluationCurve
 from coil_rl.train.experiment import Experiment, Metrics, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -26,11 +27,19 @@ def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
     learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
     rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
-    return Experiment(learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2)
+    curve = EvaluationCurve(
+        folder, learner.policy, dict.fromkeys(("evaluation", "selection"), cases), points=4, batches=2
+    )
+    return Experiment(learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2, curve=curve)
+
+
+def cases(drivers):
+    env = ConeTrackEnv(shipped_tracks("test"), 3 * drivers, assignment="cyclic", rate=6, time_limit=2)
+    return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
 
 
 def contents(folder):
-    return {file.name: file.read_bytes() for file in folder.iterdir()}
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
 def as_written(rows):
@@ -40,10 +49,11 @@ def as_written(rows):
 def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
     names = {"checkpoint.pt", "checkpoint_previous.pt", "metrics.csv", "policy_best.pt", "policy_last.pt"}
-    assert set(contents(tmp_path / "run")) == names
+    kept = {f"policies/{128 * update:012d}.pt" for update in range(5)}
+    assert set(contents(tmp_path / "run")) == names | kept
     with (tmp_path / "run" / "metrics.csv").open() as file:
         written = list(csv.DictReader(file))
-    assert [float(row["frames"]) for row in written] == [row["frames"] for row in rows] == [128, 256, 384, 512]
+    assert [float(row["frames"]) for row in written] == [row["frames"] for row in rows] == [0, 128, 256, 384, 512]
     assert {"train/return", "train/crashed", "train/cone", "learner/loss_critic"} <= set(written[0])
 
 
@@ -84,7 +94,7 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
     assert f"{tmp_path / 'stopped'} continues {place}\n" in capsys.readouterr().err
     whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
     assert whole.keys() == resumed.keys()
-    for name in ("metrics.csv", "policy_last.pt", "policy_best.pt"):
+    for name in whole.keys() - {"checkpoint.pt", "checkpoint_previous.pt"}:
         assert whole[name] == resumed[name], name
     finished = experiment(tmp_path / "stopped", seed=9, frames=frames, guide=guide())
     finished.resume()
@@ -123,6 +133,39 @@ def test_damaged_log_is_refused(tmp_path, damage):
     log.write_bytes(damage(log.read_bytes()))
     with pytest.raises(UserError, match=r"metrics\.csv is damaged .*; put the whole file back"):
         experiment(tmp_path).resume()
+
+
+@pytest.mark.parametrize("method", ["drive", "keep"])
+def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, method, monkeypatch):
+    rows = experiment(tmp_path / "whole").run()
+    stopped = experiment(tmp_path / "stopped")
+    called, calls = getattr(stopped.curve, method), []
+
+    def dying(frames):
+        calls.append(frames)
+        if len(calls) == (2 if method == "drive" else 5):  # the last one of the run
+            raise Killed
+        return called(frames)
+
+    monkeypatch.setattr(stopped.curve, method, dying)
+    with pytest.raises(Killed):
+        stopped.run()
+    again = experiment(tmp_path / "stopped", seed=9)
+    again.resume()
+    assert as_written(again.run()) == as_written(rows)
+    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
+    assert [name for name in whole if whole[name] != resumed[name]] in ([], ["checkpoint_previous.pt"])
+
+
+def test_best_policy_is_chosen_in_the_cases_of_selection(tmp_path):
+    run = experiment(tmp_path / "run")
+    drive = run.curve.drive
+    run.curve.drive = lambda frames: [
+        row | {"selection/return": -abs(f - 256)} for f, row in zip(frames, drive(frames), strict=True)
+    ]
+    run.run()
+    files = contents(tmp_path / "run")
+    assert files["policy_best.pt"] == files["policies/000000000256.pt"] != files["policy_last.pt"]
 
 
 class WriteNaN(Transform):

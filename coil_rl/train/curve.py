@@ -1,0 +1,159 @@
+"""The evaluation curve of a run: policies are kept during the training and driven from fixed cases.
+
+The return in training says little about a policy: its actions are sampled, and it is the mean of the episodes that
+happen to end. The kept policies act deterministically, all of them in one batch, each from the same cases.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coil_rl.train import checkpoint
+from coil_rl.train.evaluation import episodes
+
+POLICIES = "policies"  # subfolder with the kept policies
+
+
+class EvaluationCurve:
+    """Measures of the kept policies of a run from sets of cases.
+
+    Args:
+        folder: of the run; `keep` writes `policies/FRAMES.pt`.
+        policy: of the learner; a copy of it drives.
+        envs: for each set of cases a function that makes an env with a copy of all cases for a number of drivers.
+        watch: name to key of further measures, "episode" at the end of an episode, "step" as the mean over its steps.
+        points: number of policies that are kept, besides the first one.
+        batches: number of times that the policies kept since the last time are driven; each takes as long as one drive.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        policy: TensorDictModuleBase,
+        envs: Mapping[str, Callable[[int], EnvBase]],
+        *,
+        watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
+        points: int = 16,
+        batches: int = 1,
+    ) -> None:
+        self.folder, self.policy, self.envs, self.watch = folder / POLICIES, policy, envs, watch or {}
+        self.points, self.batches = points, batches
+        measures = ["return", *(name for group in self.watch.values() for name in group)]
+        self.names = [f"{cases}/{measure}" for cases in envs for measure in measures]
+
+    def kept(self, updates: int) -> list[int]:
+        """Return the updates of a run after which the policy is kept."""
+        return sorted({round(updates * point / self.points) for point in range(self.points + 1)})
+
+    def batch(self, update: int, updates: int) -> list[int]:
+        """Return the updates whose policies are driven after an update, if any."""
+        ends = sorted({round(updates * batch / self.batches) for batch in range(self.batches + 1)})
+        if update not in ends[1:]:
+            return []
+        begin = ends[ends.index(update) - 1]
+        return [each for each in self.kept(updates) if begin < each <= update or begin == each == 0]
+
+    def keep(self, frames: int) -> None:
+        """Write the policy as it is."""
+        self.folder.mkdir(exist_ok=True)
+        checkpoint.save(self.policy.state_dict(), self.file(frames))
+
+    def file(self, frames: int) -> Path:
+        """Return the file of the policy after some frames."""
+        return self.folder / f"{frames:012d}.pt"
+
+    def drive(self, frames: Sequence[int]) -> list[dict[str, float]]:
+        """Return the mean measures of the policies after some frames, by their names in the log.
+
+        Raises:
+            UserError: if a file is missing or damaged.
+        """
+        states = [checkpoint.load(self.file(each)) for each in frames]
+        rows: list[dict[str, float]] = [{} for _ in frames]
+        # The training's random numbers are left alone.
+        with torch.random.fork_rng(), tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
+            for cases, build in self.envs.items():
+                policies = policy_batch(self.policy, states)
+                for name, values in measures(build(len(frames)), policies, self.watch, bar.update).items():
+                    for row, value in zip(rows, values.view(len(frames), -1).double().mean(1).tolist(), strict=True):
+                        row[f"{cases}/{name}"] = value
+        return rows
+
+
+@torch.no_grad()
+def measures(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
+    tick: Callable[[], Any] | None = None,
+) -> dict[str, Tensor]:
+    """Run one episode on every row of an env [B] with deterministic actions, and return its measures, [B] each.
+
+    These are the `return`, the sum of the rewards of the task, and those of `watch`; `tick` is called after every step.
+    """
+    watch = watch or {}
+    at_end = {"return": ("episode_reward",), **{name: tuple(key) for name, key in watch.get("episode", {}).items()}}
+    over_steps = {name: tuple(key) for name, key in watch.get("step", {}).items()}
+    sums: dict[str, Tensor] = {}
+    steps: Tensor | float = 0.0
+    for after, running in episodes(env, policy, tick=tick):
+        weights = {name: running & after["done"] for name in at_end} | dict.fromkeys(over_steps, running)
+        for name, key in (at_end | over_steps).items():
+            sums[name] = sums.get(name, 0) + torch.where(weights[name], after[key], 0).double()
+        steps = steps + running
+    return {name: (value / steps if name in over_steps else value).squeeze(-1) for name, value in sums.items()}
+
+
+def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> TensorDictModuleBase:
+    """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
+    tensors = {name for name, value in [*policy.named_parameters(), *policy.named_buffers()]}
+    return StackedPolicies(policy, states) if tensors == set(policy.state_dict()) else PoliciesInTurn(policy, states)
+
+
+class PoliciesInTurn(TensorDictModuleBase):
+    """Several states of any policy, each for its own part of the rows."""
+
+    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        self.policies = torch.nn.ModuleList(copy.deepcopy(policy) for _ in states)
+        for each, state in zip(self.policies, states, strict=True):
+            each.load_state_dict(state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`."""
+        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
+        actions = [policy(part)["action"] for policy, part in zip(self.policies, parts, strict=True)]
+        return tensordict.set("action", torch.cat(actions))
+
+
+class StackedPolicies(TensorDictModuleBase):
+    """Several states of a policy whose state is its tensors, each for its own part of the rows, computed at once."""
+
+    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        policies = PoliciesInTurn(policy, states).policies
+        self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
+        self._policy = (copy.deepcopy(policy),)  # a tuple, so that it is no submodule
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action`."""
+        rows = tensordict.select(*self.in_keys).view(len(self.states), -1)
+        return tensordict.set("action", torch.vmap(self._act)(self.states, rows).flatten(0, 1))
+
+    def _act(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
+        (policy,) = self._policy
+        with state.to_module(policy):
+            action: Tensor = policy(rows)["action"]
+        return action
