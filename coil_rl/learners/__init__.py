@@ -4,6 +4,7 @@ from coil_rl.learners.a2c import A2C
 from coil_rl.learners.dqn import DQN
 from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule
 from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.ppo import PPO
 from coil_rl.learners.reinforce import Reinforce
 from coil_rl.learners.sac import SAC
@@ -19,6 +20,7 @@ __all__ = [
     "AtConvergence",
     "DynamicCoil",
     "KickstartLoss",
+    "NoiseDecay",
     "PhaseSchedule",
     "Reinforce",
 ]

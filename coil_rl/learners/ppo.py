@@ -23,6 +23,7 @@ from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
 from coil_rl.learners import networks
 from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.noise import NoiseDecay
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -50,6 +51,7 @@ class PPO:
         critic: coefficient of the critic's loss.
         max_grad_norm: gradients are scaled down to this norm.
         compile: whether to use `torch.compile` for the loss, which changes the last digits of the numbers.
+        noise: schedule of the standard deviation of the policy.
         auxiliary: additional losses of the policy.
         seed: of the order of minibatches.
 
@@ -93,6 +95,7 @@ class PPO:
         critic: float = 0.5,
         max_grad_norm: float = 0.5,
         compile: bool = False,
+        noise: NoiseDecay | None = None,
         auxiliary: Sequence[KickstartLoss] = (),
         seed: int = 0,
     ) -> None:
@@ -103,10 +106,12 @@ class PPO:
         check_range(1, epochs=epochs, minibatches=minibatches)
         check_range(0, LARGEST_SEED, seed=seed)
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
-        self.critic_coefficient, self.auxiliary = critic, list(auxiliary)
+        self.critic_coefficient, self.auxiliary, self.noise = critic, list(auxiliary), noise
         self.policy, self.critic = self.build_networks(
             env, in_keys, hidden, scale=action_scale, gain=action_gain, squash=squash
         )
+        if noise:
+            noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss: LossModule = ClipPPOLoss(
             self.policy,
@@ -131,6 +136,7 @@ class PPO:
         read += [key for auxiliary_loss in self.auxiliary for key in auxiliary_loss.keys]
         read += ["agent_acts"] if self.guide_may_act else []
         self.keys = [*read, *(("next", key) for key in (*in_keys, "reward", "done", "terminated"))]
+        self.keys += [noise.key] if noise else []
         self.minibatch_keys = [*read, "advantage", "value_target"]
 
     def build_networks(
@@ -173,7 +179,11 @@ class PPO:
             reports.append(losses.detach())
         names = list(reports[0].keys())
         means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
-        return means | {"learning_rate": self.learning_rate(progress)}
+        return means | {"learning_rate": self.learning_rate(progress)} | self.limit_noise(batch, progress)
+
+    def limit_noise(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Apply the schedule of the noise, if there is one; returns the standard deviation of the policy."""
+        return {"noise": self.noise.apply(batch, progress)} if self.noise else {}
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
         """Apply the schedules and compute advantages; returns the rows to learn from, [B * T]."""
@@ -234,6 +244,7 @@ class PPO:
             "critic": self.critic.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
+            "noise": self.noise.state_dict() if self.noise else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -242,6 +253,8 @@ class PPO:
         self.critic.load_state_dict(state["critic"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["generator"])
+        if self.noise:
+            self.noise.load_state_dict(state["noise"])
 
 
 class Advantages:

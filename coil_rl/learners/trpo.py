@@ -79,7 +79,7 @@ class TRPO(PPO):
             self.step(error)
             errors.append(error.detach())
         means = {"loss_critic": float(torch.stack(errors).mean()), "learning_rate": self.learning_rate(progress)}
-        return {name: float(value) for name, value in report.items()} | means
+        return {name: float(value) for name, value in report.items()} | means | self.limit_noise(batch, progress)
 
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.

@@ -1,0 +1,82 @@
+"""A schedule of the exploration noise that begins when the failures of training have stopped."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from coil_rl.envs.limits import check_range
+from coil_rl.learners.networks import GlobalScaleHead
+
+
+class NoiseDecay:
+    """Upper limit of the standard deviation of a policy, which falls exponentially from a certain time on.
+
+    The agent needs the noise until it can do its task. Later it only makes the actions rough.
+
+    Args:
+        end: limit at the end of the run, before squashing.
+        failure: entry after a step that is true where an episode fails.
+        tolerance: share of failures among the last episodes up to which the failures have stopped.
+        episodes: the number of these episodes.
+
+    Raises:
+        ValueError: for a value out of range.
+    """
+
+    def __init__(
+        self,
+        end: float = 0.05,
+        *,
+        failure: NestedKey | Sequence[str] = "terminated",
+        tolerance: float = 0.01,
+        episodes: int = 200,
+    ) -> None:
+        check_range(0, above=True, end=end)
+        check_range(0, 1, tolerance=tolerance)
+        check_range(1, episodes=episodes)
+        self.end, self.tolerance = end, tolerance
+        self.key: NestedKey = ("next", failure) if isinstance(failure, str) else ("next", *failure)
+        self.failures: deque[bool] = deque(maxlen=episodes)
+        self.begin: tuple[float, float] | None = None  # progress and standard deviation
+        self.scales: list[Tensor] = []  # logarithms of the standard deviations
+
+    def attach(self, policy: nn.Module) -> None:
+        """Choose the policy; raises a `ValueError` if it has no standard deviation of its own."""
+        self.scales = [module.log_scale for module in policy.modules() if isinstance(module, GlobalScaleHead)]
+        if not self.scales:
+            raise ValueError("noise: discrete actions have no standard deviation to limit; leave it out")
+
+    @torch.no_grad()
+    def apply(self, batch: TensorDictBase, progress: float) -> float:
+        """Limit the noise after an update from a batch, and return the mean standard deviation of the policy."""
+        self.failures.extend(batch[self.key][batch["next", "done"]].tolist())
+        scale = float(torch.cat(self.scales).exp().mean())
+        full = len(self.failures) == self.failures.maxlen
+        if self.begin is None and full and sum(self.failures) <= self.tolerance * len(self.failures):
+            self.begin = progress, scale
+        if self.begin is None:
+            return scale
+        since, first = self.begin
+        share = (progress - since) / (1 - since) if since < 1 else 1.0
+        limit = min(first, self.end) ** share * first ** (1 - share)
+        for log_scale in self.scales:
+            log_scale.clamp_(max=math.log(limit))
+        return min(scale, limit)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the last episodes and where the fall began."""
+        return {"failures": list(self.failures), "begin": self.begin}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self.failures.clear()
+        self.failures.extend(state["failures"])
+        self.begin = state["begin"]
