@@ -57,7 +57,7 @@ def sentence(error: BaseException) -> str:
         if error.errno == errno.ENAMETOOLONG:
             name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
         return f"{name} cannot be used ({error.strerror}); {remedy}"
-    if isinstance(error, AssertionError):  # of Hydra, for a choice of a group that is no text
+    if isinstance(error, (AssertionError, TypeError)):  # of Hydra, for a choice of a group that is no text
         return "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"

@@ -9,18 +9,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from coil_rl.errors import UserError
+
 
 @contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path with the same suffix that becomes `path` at the end of the block.
 
     Parents are made and an older file is replaced. If the block raises, the temporary file is removed.
+
+    Raises:
+        UserError: if a folder is in its place, or a file in that of a parent.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(path.parent)
     unfinished = _temporary(path)
     try:
         yield unfinished
+        if path.is_dir():
+            raise UserError(f"{path} is a folder, but a file is to be written there; remove it")
         _to_disk(unfinished)
         unfinished.replace(path)
         folder_to_disk(path.parent)
@@ -44,10 +51,13 @@ def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Parents are made. If the block raises, the temporary folder is removed.
 
     Raises:
-        OSError: if `path` exists and is not an empty folder.
+        OSError: if `path` is a folder that is not empty.
+        UserError: if `path` or a parent is a file.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make_folder(path.parent)
+    if path.is_file():
+        raise UserError(f"{path} is a file, but a folder is to be made there; remove it")
     unfinished = _temporary(path)
     unfinished.mkdir()
     try:
@@ -71,6 +81,14 @@ def folder_to_disk(folder: Path) -> None:
     """Wait until the entries of a folder are on the disk."""
     if os.name != "nt":  # Windows cannot open a folder
         _to_disk(folder)
+
+
+def _make_folder(path: Path) -> None:
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        obstacle = next((place for place in (path, *path.parents) if place.is_file()), path)
+        raise UserError(f"{obstacle} is a file, but a folder is to be made there; remove it") from error
 
 
 def _temporary(path: Path) -> Path:

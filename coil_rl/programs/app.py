@@ -104,7 +104,7 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
         _check_options(config_name)
         try:
             hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
-        except (HydraException, ValueError, OSError, yaml.YAMLError, AssertionError) as error:
+        except (HydraException, ValueError, OSError, yaml.YAMLError, AssertionError, TypeError) as error:
             # Outside of the task these errors come from the command line and the configuration files.
             if error in bugs:
                 raise

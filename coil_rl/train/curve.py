@@ -65,7 +65,6 @@ class EvaluationCurve:
 
     def keep(self, frames: int) -> None:
         """Write the policy as it is."""
-        self.folder.mkdir(exist_ok=True)
         checkpoint.save(self.policy.state_dict(), self.file(frames))
 
     def file(self, frames: int) -> Path:

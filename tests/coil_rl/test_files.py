@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 
+from coil_rl.errors import UserError
 from coil_rl.files import remove_unfinished, whole_file, whole_folder, write_text
 
 
@@ -48,6 +49,20 @@ def test_folder_with_contents_is_not_replaced(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="data"), whole_folder(tmp_path / "data"):
         pass
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["mine"]
+
+
+def test_what_is_in_the_way_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("1")
+    (tmp_path / "folder").mkdir()
+    for context, path, message in (
+        (whole_file, "folder", "folder is a folder, but a file is to be written there; remove it"),
+        (whole_file, "file/below", "file is a file, but a folder is to be made there; remove it"),
+        (whole_folder, "file", "file is a file, but a folder is to be made there; remove it"),
+        (whole_folder, "file/below/it", "file is a file, but a folder is to be made there; remove it"),
+    ):
+        with pytest.raises(UserError, match=message), context(tmp_path / path) as unfinished:
+            unfinished.touch()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 
 
 @pytest.mark.parametrize("end", ["", "\n", "\n\n"])
