@@ -14,6 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
+# Another kind of file than expected, or one that may not be used.
+IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP)
 LAUNCHERS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # and their extras
 
 
@@ -22,8 +24,9 @@ class UserError(Exception):
 
 
 def is_no_bug(error: BaseException) -> bool:
-    """Return whether an error has a cause outside of the program: the input, the configuration or a full disk."""
-    return isinstance(error, (UserError, OmegaConfBaseException)) or getattr(error, "errno", None) in NO_SPACE
+    """Return whether an error has a cause outside of the program: the input, the configuration or the disk."""
+    outside = isinstance(error, (UserError, OmegaConfBaseException))
+    return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 
 @contextmanager
@@ -32,7 +35,7 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if is_no_bug(error):
+        if is_no_bug(error) and getattr(error, "errno", None) not in IN_THE_WAY:
             raise
         missing = f"it lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
         problem = textwrap.shorten(missing, 200, placeholder=" ...")
@@ -56,6 +59,8 @@ def sentence(error: BaseException) -> str:
         name, remedy = error.filename or "the output", "choose another folder with hydra.run.dir=FOLDER"
         if error.errno == errno.ENAMETOOLONG:
             name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
+        elif error.errno in IN_THE_WAY:
+            remedy = "put the right file or folder there, with the right to use it"
         return f"{name} cannot be used ({error.strerror}); {remedy}"
     if isinstance(error, (AssertionError, TypeError)):  # of Hydra, for a choice of a group that is no text
         return "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"

@@ -37,6 +37,7 @@ from coil_rl import programs
 from coil_rl.errors import UserError, is_no_bug, sentence
 from coil_rl.train.trust import trust_packages
 
+HYDRA_FILES = ("config.yaml", "hydra.yaml", "overrides.yaml")  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 
 
@@ -135,8 +136,9 @@ def program(name: str) -> Iterator[None]:
 def refuse(name: str, error: Exception) -> NoReturn:
     """End the program with one sentence and exit code 2, and remove new folders that hold no files of the task."""
     for folder in filter(os.path.exists, _new_folders):  # a name may be too long for one
-        inside = [path for path in folder.rglob("*") if not path.is_dir()]
-        if all(path.name == "multirun.yaml" or path.parent.name == ".hydra" for path in inside):
+        inside = {path for path in folder.rglob("*") if not path.is_dir()}
+        of_jobs = {path.with_name(name) for path in inside if path.name == "hydra.yaml" for name in HYDRA_FILES}
+        if all(path.name == "multirun.yaml" or path in of_jobs for path in inside):
             shutil.rmtree(folder, ignore_errors=True)
     _new_folders.clear()
     print(f"{name}: {sentence(error)}", file=sys.stderr)

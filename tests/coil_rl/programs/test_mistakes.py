@@ -312,3 +312,18 @@ def test_folder_in_place_of_the_lock_is_named(tmp_path):
     lock.mkdir(parents=True)
     ended = called("train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY, cwd=tmp_path, code=2)
     assert ended.stderr == f"train: {lock} is a folder, but must be a file that locks the run; remove it\n"
+
+
+def test_folder_in_place_of_a_file_is_named(tmp_path):
+    (tmp_path / "runs" / "one" / "config.yaml").mkdir(parents=True)
+    ended = called("report", "folder=runs", cwd=tmp_path, code=2)
+    (sentence,) = ended.stderr.splitlines()
+    assert sentence == (
+        "report: runs/one/config.yaml cannot be used (Is a directory); "
+        "put the right file or folder there, with the right to use it"
+    )
+
+
+def test_refused_program_leaves_no_folder_with_another_name_of_hydras_files(tmp_path):
+    called("evaluate", "hydra.output_subdir=x", "guide=zero", "env.laps=-1", cwd=tmp_path, code=2)
+    assert not list(tmp_path.iterdir())
