@@ -126,7 +126,9 @@ OPTIONS = [
 ]  # fmt: skip
 UNFINISHED = re.compile(r"\..+\.\d+(\.\w+)?")  # temporary files of atomic writes
 HYDRA = re.compile(r"(^|/)\.hydra(/|$)|(^|/)(multirun\.yaml|\.lock)$")
-NOTES = re.compile(r" continues after update \d+$|using checkpoint_previous\.pt$|runs are missing$|^coil-train -m")
+NOTES = re.compile(
+    r" continues after update \d+$|using checkpoint_previous\.pt$|runs are missing$|^coil-train -m|they are ignored"
+)
 
 
 @dataclass

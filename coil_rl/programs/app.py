@@ -18,6 +18,7 @@ import re
 import shutil
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -122,6 +123,7 @@ def program(name: str) -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
+    warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
     try:
         yield
     except Exception as error:

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 
 from coil_rl.errors import UserError, sentence
-from coil_rl.programs import train
+from coil_rl.programs import app, train
 from coil_rl.train import checkpoint, evaluate_run
 from coil_rl.train.build import build_env, build_learner
 from coil_rl.train.check import check
@@ -327,3 +328,12 @@ def test_folder_in_place_of_a_file_is_named(tmp_path):
 def test_refused_program_leaves_no_folder_with_another_name_of_hydras_files(tmp_path):
     called("evaluate", "hydra.output_subdir=x", "guide=zero", "env.laps=-1", cwd=tmp_path, code=2)
     assert not list(tmp_path.iterdir())
+
+
+def test_warning_is_one_line_of_the_program(monkeypatch):
+    monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
+    with app.program("robot"):
+        assert (
+            warnings.formatwarning("a topic is ignored", UserWarning, "reading.py", 189)
+            == "robot: a topic is ignored\n"
+        )
