@@ -22,6 +22,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any, NoReturn
 
 import hydra
@@ -40,6 +41,8 @@ from coil_rl.train.trust import trust_packages
 
 HYDRA_FILES = ("config.yaml", "hydra.yaml", "overrides.yaml")  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
+
+_interrupts: list[int] = []  # signals of this program
 
 
 class NewFolders(Callback):
@@ -88,6 +91,7 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     _new_folders.clear()
+    _interrupts.clear()
     bugs: list[Exception] = []
 
     @functools.wraps(task)
@@ -95,6 +99,8 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
         try:
             trust_packages(config.get("trust", []), config)
             check(config)
+            if _interrupts:
+                raise KeyboardInterrupt
             return task(config)
         except Exception as error:
             if is_no_bug(error):
@@ -120,8 +126,8 @@ def program(name: str) -> Iterator[None]:
     The exit code is 2 for a mistake of the user, and 130 for Ctrl-C and SIGTERM.
     """
     if signal.getsignal(signal.SIGINT) is programs.interrupted:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+        signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _interrupt)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
     try:
@@ -133,6 +139,12 @@ def program(name: str) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         print(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}", file=sys.stderr)
         sys.exit(130)
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
+    """Raise a `KeyboardInterrupt`, and remember it, because a module that is being imported may swallow it."""
+    _interrupts.append(signum)
+    raise KeyboardInterrupt
 
 
 def refuse(name: str, error: Exception) -> NoReturn:
