@@ -41,7 +41,6 @@ from coil_rl.train.trust import trust_packages
 
 HYDRA_FILES = ("config.yaml", "hydra.yaml", "overrides.yaml")  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
-
 _interrupts: list[int] = []  # signals of this program
 
 
