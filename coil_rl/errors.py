@@ -35,7 +35,7 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if is_no_bug(error) and getattr(error, "errno", None) not in IN_THE_WAY:
+        if isinstance(error, OmegaConfBaseException) or getattr(error, "errno", None) in NO_SPACE:
             raise
         missing = f"it lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
         problem = textwrap.shorten(missing, 200, placeholder=" ...")

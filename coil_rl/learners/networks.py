@@ -177,7 +177,7 @@ class ClippedNormal(SafeProbabilisticModule):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Entries that are written."""
+        """Keys of the entries that `forward` writes."""
         return [*super().out_keys, "action"]
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:

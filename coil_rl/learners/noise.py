@@ -17,7 +17,7 @@ from coil_rl.learners.networks import GlobalScaleHead
 
 
 class NoiseDecay:
-    """Upper limit of the standard deviation of a policy, which falls exponentially from a certain time on.
+    """Upper limit of the standard deviation of a policy, which decays exponentially once episodes no longer fail.
 
     The agent needs the noise until it can do its task. Later it only makes the actions rough.
 
@@ -72,7 +72,7 @@ class NoiseDecay:
         return min(scale, limit)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the last episodes and where the fall began."""
+        """Return whether the last episodes failed, and when the decay began."""
         return {"failures": list(self.failures), "begin": self.begin}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -182,7 +182,7 @@ class PPO:
         return means | {"learning_rate": self.learning_rate(progress)} | self.limit_noise(batch, progress)
 
     def limit_noise(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Apply the schedule of the noise, if there is one; returns the standard deviation of the policy."""
+        """Apply the noise schedule, if there is one; returns the metric `noise`, the policy's standard deviation."""
         return {"noise": self.noise.apply(batch, progress)} if self.noise else {}
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:

@@ -39,6 +39,7 @@ from coil_rl import programs
 from coil_rl.errors import UserError, is_no_bug, sentence
 from coil_rl.train.trust import trust_packages
 
+COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
 HYDRA_FILES = ("config.yaml", "hydra.yaml", "overrides.yaml")  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
@@ -70,12 +71,23 @@ def _record(config: DictConfig, key: str) -> None:
     _new_folders[:] = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
 
 
+def overrides() -> list[tuple[str, str]]:
+    """Return the top-level key and the text of each override on the command line."""
+    texts = HydraConfig.get().overrides.task
+    keys = (text.lstrip("+~").partition("=")[0].rpartition("@")[2] for text in texts)
+    return [(re.split(r"[./]", key)[0], text) for key, text in zip(keys, texts, strict=True)]
+
+
 def check_used(used: Iterable[str], reason: str) -> None:
-    """Raise a `UserError` for an override outside of the top-level keys `used`; `reason` is why it has no effect."""
-    for override in HydraConfig.get().overrides.task:
-        key = override.lstrip("+~").partition("=")[0].rpartition("@")[2]
-        if re.split(r"[./]", key)[0] not in used:
-            raise UserError(f"{override} has no effect: {reason}; what can be changed is {', '.join(used)}")
+    """Raise a `UserError` for an override that has no effect.
+
+    `used` are the top-level keys that have one, besides those of every program that drives; `reason` is why others do
+    not.
+    """
+    known = (*used, *COMMON_KEYS)
+    for key, text in overrides():
+        if key not in known:
+            raise UserError(f"{text} has no effect: {reason}; what can be changed is {', '.join(known)}")
 
 
 def check_run(config: DictConfig) -> None:

@@ -57,7 +57,7 @@ def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration of the proxies, and make their folder."""
     from coil_rl.train.check import check_proxies, check_values, make_folder
 
-    used = ("preset", "track", "env", "guide", "evaluation", "proxy", "seed", "device", "threads", "run_dir", "trust")
+    used = ("preset", "track", "env", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")
     check_values(config)
     check_proxies(config, config.guide)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "track", "degrade", "evaluation", "seed", "device", "threads", "trust", "run_dir")
+OF_A_RUN = ("run", "track", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
 
 if TYPE_CHECKING:
@@ -48,7 +47,7 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
     from coil_rl.train.load import load_policy
     from coil_rl.train.run_folder import read_config
 
-    if HydraConfig.initialized() and not any(re.match(r"[+~]*track\b", o) for o in HydraConfig.get().overrides.task):
+    if HydraConfig.initialized() and "track" not in dict(app.overrides()):
         requested.track = read_config(run, "run").track
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
     # The advice of the training is evaluated too.

@@ -102,9 +102,7 @@ def _summary(label: str, table: list[dict[str, Any]]) -> str:
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
     used = ("run", "track", "evaluation", "donors", "turn_radius", "approach", "bin")
-    app.check_used(
-        (*used, "seed", "device", "threads", "trust", "run_dir"), f"run={config.run} has its own configuration"
-    )
+    app.check_used(used, f"run={config.run} has its own configuration")
     app.check_run(config)
 
 

@@ -85,8 +85,8 @@ def check(config: DictConfig) -> None:
     from coil_rl.train.build import build
     from coil_rl.train.check import check as check_common
 
+    used = ("preset", "track", "env", "guide", "degrade", "evaluation")
     own = ("steps", "runs", "recordings", "table_6", "figure_25")
-    used = ("preset", "track", "env", "guide", "degrade", "evaluation", "seed", "device", "threads", "run_dir", "trust")
     app.check_used((*used, *own), "guides drive alone, and each of the runs has its own configuration")
     unknown = [step for step in config.steps if step not in STEPS]
     if unknown or not config.steps:

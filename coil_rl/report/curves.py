@@ -163,7 +163,10 @@ def draw_phases(
 
 
 def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
-    """Return frames, mean over the runs and its 95 % t interval (low, high), each [P]; P = 0 without data."""
+    """Return the mean curve of several runs, each part [P]; P = 0 without data.
+
+    These are the frames, the mean over the runs, and the low and the high end of its 95 % t interval.
+    """
     curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     if not curves:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0)

@@ -42,7 +42,7 @@ VISIBILITY_BINS = (0.0, 0.5, 0.999, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """A classifier trained on all drives, and the accuracy of thin against thick in its cross-validation."""
+    """A trained classifier, and the accuracy with which it tells thin from thick cones in cross-validation."""
 
     classifier: ConeClassifier
     accuracy: Array

@@ -167,10 +167,10 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
     return dict(resolved)
 
 
-def cases_node(config: DictConfig, cases: str) -> dict[str, Any]:
-    """Return the overrides of `env` for a set of cases of the evaluation curve."""
+def cases_node(config: DictConfig, cases: str, drivers: int = 1) -> dict[str, Any]:
+    """Return the overrides of `env` for a set of cases of the evaluation curve, all of them for each driver."""
     curve = config.evaluation.curve
-    return {**curve.env, **curve.cases[cases], "num_cars": curve.cars}
+    return {**curve.env, **curve.cases[cases], "num_cars": drivers * curve.cars}
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:

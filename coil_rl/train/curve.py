@@ -1,7 +1,7 @@
-"""The evaluation curve of a run: policies are kept during the training and driven from fixed cases.
+"""The evaluation curve of a run: the returns of policies that were kept during the training.
 
 The return in training says little about a policy: its actions are sampled, and it is the mean of the episodes that
-happen to end. The kept policies act deterministically, all of them in one batch, each from the same cases.
+happen to end. The kept policies act deterministically, all of them in one batch, each from the same starts (cases).
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class EvaluationCurve:
     ) -> None:
         self.folder, self.policy, self.envs, self.watch = folder / POLICIES, policy, envs, watch or {}
         self.points, self.batches = points, batches
-        measures = ["return", *(name for group in self.watch.values() for name in group)]
-        self.names = [f"{cases}/{measure}" for cases in envs for measure in measures]
+        measured = ["return", *(name for group in self.watch.values() for name in group)]
+        self.names = [f"{cases}/{name}" for cases in envs for name in measured]
 
     def kept(self, updates: int) -> list[int]:
         """Return the updates of a run after which the policy is kept."""
@@ -77,12 +77,11 @@ class EvaluationCurve:
         Raises:
             UserError: if a file is missing or damaged.
         """
-        states = [checkpoint.load(self.file(each)) for each in frames]
+        policies = policy_batch(self.policy, [checkpoint.load(self.file(each)) for each in frames])
         rows: list[dict[str, float]] = [{} for _ in frames]
         # The training's random numbers are left alone.
         with torch.random.fork_rng(), tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
             for cases, build in self.envs.items():
-                policies = policy_batch(self.policy, states)
                 for name, values in measures(build(len(frames)), policies, self.watch, bar.update).items():
                     for row, value in zip(rows, values.view(len(frames), -1).double().mean(1).tolist(), strict=True):
                         row[f"{cases}/{name}"] = value
@@ -115,7 +114,7 @@ def measures(
 
 def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> TensorDictModuleBase:
     """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
-    tensors = {name for name, value in [*policy.named_parameters(), *policy.named_buffers()]}
+    tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
     return StackedPolicies(policy, states) if tensors == set(policy.state_dict()) else PoliciesInTurn(policy, states)
 
 
@@ -130,7 +129,7 @@ class PoliciesInTurn(TensorDictModuleBase):
             each.load_state_dict(state)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action`."""
+        """Write the `action` of the policy of each row."""
         parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
         actions = [policy(part)["action"] for policy, part in zip(self.policies, parts, strict=True)]
         return tensordict.set("action", torch.cat(actions))
@@ -147,7 +146,7 @@ class StackedPolicies(TensorDictModuleBase):
         self._policy = (copy.deepcopy(policy),)  # a tuple, so that it is no submodule
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action`."""
+        """Write the `action` of the policy of each row."""
         rows = tensordict.select(*self.in_keys).view(len(self.states), -1)
         return tensordict.set("action", torch.vmap(self._act)(self.states, rows).flatten(0, 1))
 

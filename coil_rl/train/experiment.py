@@ -135,8 +135,10 @@ class Experiment:
             total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
         ) as bar:
             first = self._probe(self.updates == 0)
+            evaluated = self._newest_evaluation()
             while True:
-                evaluated = self._evaluate(updates)
+                if self._evaluate(updates):
+                    evaluated = self._newest_evaluation()
                 if self.updates == updates:
                     break
                 row = self.update(self.updates / updates)
@@ -160,24 +162,30 @@ class Experiment:
         self.rows.append(row)
         self.metrics.append(row)
 
-    def _evaluate(self, updates: int) -> float | None:
-        """Keep the policy and drive the kept ones if it is time; return the newest return of the evaluation."""
+    def _newest_evaluation(self) -> float | None:
+        """Return the return of the last policy that has been evaluated, None before the first one."""
+        returns = (row.get(RETURN, math.nan) for row in reversed(self.rows))
+        return next((value for value in returns if not math.isnan(value)), None)
+
+    def _evaluate(self, updates: int) -> bool:
+        """Keep the policy, and drive the kept ones, if it is time; return whether any were driven."""
         if self.curve is None:
-            return None
+            return False
         if self.updates in self.curve.kept(updates):
             self.curve.keep(self.updates * self.rollout.frames)
         batch = self.curve.batch(self.updates, updates)
-        if batch and math.isnan(self.rows[batch[-1]][RETURN]):
-            frames = [update * self.rollout.frames for update in batch]
-            results = dict(zip(batch, self.curve.drive(frames), strict=True))
-            for update, result in results.items():
-                self.rows[update] |= result
-                self.metrics.log(result, update * self.rollout.frames)
-            judged = (row for row in self.rows if not math.isnan(row[CHOICE]))
-            with whole_file(self.folder / "policy_best.pt") as unfinished:
-                shutil.copyfile(self.curve.file(int(max(judged, key=itemgetter(CHOICE))["frames"])), unfinished)
-            self.metrics.fill(results)
-        return next((row[RETURN] for row in reversed(self.rows) if not math.isnan(row[RETURN])), None)
+        if not batch or not math.isnan(self.rows[batch[-1]][RETURN]):
+            return False
+        frames = [update * self.rollout.frames for update in batch]
+        results = dict(zip(batch, self.curve.drive(frames), strict=True))
+        for update, result in results.items():
+            self.rows[update] |= result
+            self.metrics.log(result, update * self.rollout.frames)
+        judged = (row for row in self.rows if not math.isnan(row[CHOICE]))
+        with whole_file(self.folder / "policy_best.pt") as unfinished:
+            shutil.copyfile(self.curve.file(int(max(judged, key=itemgetter(CHOICE))["frames"])), unfinished)
+        self.metrics.fill(results)
+        return True
 
     def update(self, progress: float) -> dict[str, float]:
         """Collect one batch, learn from it and return the row of the log."""
@@ -297,7 +305,7 @@ class Metrics:
         self.log(row, int(row["frames"]))
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
-        """Give values to the logger."""
+        """Log values with the TorchRL logger, if there is one; NaN is left out."""
         for name, value in values.items() if self.logger is not None else ():
             if not math.isnan(value):
                 self.logger.log_scalar(name, value, step=frames)  # type: ignore[union-attr]

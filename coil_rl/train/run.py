@@ -150,9 +150,9 @@ def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
 
 def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None) -> dict[str, float]:
     """Return the mean return of each guide in the cases of the evaluation."""
-    guides = guides or build_guides(config)
     if EVALUATION not in config.evaluation.curve.cases:
         return {}
+    guides = guides or build_guides(config)
     env, policy = build_guided_env(config, cases_node(config, EVALUATION), guides)
     with torch.random.fork_rng():
         returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
@@ -163,8 +163,7 @@ def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> Ev
     """Return the evaluation curve of a run; None without cases."""
 
     def build_cases(cases: str, drivers: int) -> EnvBase:
-        overrides = cases_node(config, cases)
-        return build_env(config, overrides | {"num_cars": drivers * config.evaluation.curve.cars})
+        return build_env(config, cases_node(config, cases, drivers))
 
     curve = config.evaluation.curve
     envs = {cases: partial(build_cases, cases) for cases in curve.cases}

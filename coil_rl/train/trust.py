@@ -74,7 +74,7 @@ _own: frozenset[str] = frozenset()  # targets in the configuration of the comman
 
 
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
-    """Trust packages in every folder that this process reads from here on, and only these.
+    """Let the run folders that this process reads from here on use parts of these packages, and of no others.
 
     Args:
         packages: top-level names. The folder may call everything that is defined in them.

@@ -152,7 +152,10 @@ class RecordingWriter:
         self._metadata[name] = dict(sorted(entries.items()))
 
     def attach(self, name: str, media_type: str, data: bytes, times: tuple[int, int] | None = None) -> None:
-        """Add an attachment, such as a configuration; ns of creation and logging, by default of the first message."""
+        """Add an attachment, such as a configuration.
+
+        `times` are those of creation and of logging in ns, by default both the time of the first message.
+        """
         self._attachments[name] = media_type, data, times
 
     def __enter__(self) -> Self:
