@@ -31,7 +31,7 @@ def train_config(args: Namespace, method: str) -> DictConfig:
 def driving_env(args: Namespace, cars: int, guide: bool) -> EnvBase:
     """Return the configured env, with or without the advice of the guide at every step."""
     config = train_config(args, "coil")
-    env = build_bare_env(config, {"num_cars": cars})
+    env = build_bare_env(config, {"num_envs": cars})
     return TransformedEnv(env, GuideActions(build_guides(config))) if guide else env
 
 

@@ -38,7 +38,7 @@ class Training:
 
     def __init__(self, args: Namespace, method: str, cars: int, steps: int) -> None:
         config = train_config(args, method)
-        env = build_env(config, {"num_cars": cars})
+        env = build_env(config, {"num_envs": cars})
         learner = build_learner(config, env)
         rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
@@ -72,7 +72,7 @@ def by_hand(args: Namespace, method: str, cars: int, steps: int) -> Work:
     config = train_config(args, method)
     guide = next(iter(build_guides(config).values())) if method == "coil" else None
     hyper_parameters = instantiate(config.learner, _target_="builtins.dict", _convert_="all")
-    plain = PlainPPO(build_bare_env(config, {"num_cars": cars}), guide, steps, **hyper_parameters)
+    plain = PlainPPO(build_bare_env(config, {"num_envs": cars}), guide, steps, **hyper_parameters)
 
     def update() -> int:
         plain.update(plain.collect())
@@ -175,7 +175,7 @@ def sb3(args: Namespace, envs: int) -> Work:
 
     config = train_config(args, "ppo")
     options: Any = OmegaConf.to_container(config.env, resolve=True)
-    options = {key: value for key, value in options.items() if key not in ("_target_", "num_cars", "device")}
+    options = {key: value for key, value in options.items() if key not in ("_target_", "num_envs", "device")}
     options["tracks"] = build(config.track.train, "track.train")
     hidden = list(config.learner.hidden)
     policy: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": nn.Tanh}

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
+    from coil_rl.envs import EnvBatch as EnvBatch
+    from coil_rl.envs import GymnasiumEnv as GymnasiumEnv
     from coil_rl.envs import McapReplayEnv as McapReplayEnv
     from coil_rl.envs import SimulatedRobotEnv as SimulatedRobotEnv
     from coil_rl.envs import Track as Track
@@ -20,7 +22,11 @@ if TYPE_CHECKING:
     from coil_rl.envs import shipped_tracks as shipped_tracks
     from coil_rl.errors import UserError as UserError
     from coil_rl.guides import ConstantGuide as ConstantGuide
+    from coil_rl.guides import ControllerGuide as ControllerGuide
+    from coil_rl.guides import EntryGuide as EntryGuide
+    from coil_rl.guides import PerRow as PerRow
     from coil_rl.guides import RandomGuide as RandomGuide
+    from coil_rl.guides import RecordedGuide as RecordedGuide
     from coil_rl.guides import SplineGuide as SplineGuide
     from coil_rl.guides import ZeroGuide as ZeroGuide
     from coil_rl.guides.learned import LearnedGuide as LearnedGuide
@@ -38,6 +44,7 @@ if TYPE_CHECKING:
     from coil_rl.train.evaluation import evaluate_policy as evaluate_policy
     from coil_rl.train.load import load_policy as load_policy
     from coil_rl.train.load import load_policy_in_env as load_policy_in_env
+    from coil_rl.train.measures import Measure as Measure
     from coil_rl.train.rollout import Rollout as Rollout
     from coil_rl.train.run_folder import read_config as read_config
     from coil_rl.train.trust import trust_packages as trust_packages
@@ -47,22 +54,25 @@ if TYPE_CHECKING:
     from coil_rl.transforms import MixedAction as MixedAction
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
+    from coil_rl.transforms import set_progress as set_progress
 
 _NAMES = {
-    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv McapReplayEnv SimulatedRobotEnv Track load_track load_tracks "
-    "random_tracks shipped_tracks",
+    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch GymnasiumEnv McapReplayEnv SimulatedRobotEnv Track "
+    "load_track load_tracks random_tracks shipped_tracks",
     "coil_rl.errors": "UserError",
-    "coil_rl.guides": "ConstantGuide RandomGuide SplineGuide ZeroGuide",
+    "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide SplineGuide ZeroGuide",
     "coil_rl.guides.learned": "LearnedGuide",
     "coil_rl.imitation": "Imitation",
     "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
     "coil_rl.testing": "check_env check_guide check_transform",
     "coil_rl.train.evaluation": "evaluate_policy",
     "coil_rl.train.load": "load_policy load_policy_in_env",
+    "coil_rl.train.measures": "Measure",
     "coil_rl.train.rollout": "Rollout",
     "coil_rl.train.run_folder": "read_config",
     "coil_rl.train.trust": "trust_packages",
-    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling",
+    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling "
+    "set_progress",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -50,9 +50,13 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
 
 def sentence(error: BaseException) -> str:
     """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
+    return " ".join(_message(error).split())
+
+
+def _message(error: BaseException) -> str:
     cause = error.__cause__
     if isinstance(error, UserError):
-        return " ".join(str(error).split())
+        return str(error)
     if isinstance(error, MissingConfigException):
         return _unknown_file(error)
     if isinstance(error, OSError):

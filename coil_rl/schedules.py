@@ -13,24 +13,16 @@ Schedule = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Linear:
-    """Linear interpolation between two values.
-
-    Args:
-        start: value at progress 0.
-        end: value from progress `until` on.
-        until: progress at which `end` is reached, in (0, 1].
-
-    Raises:
-        ValueError: if `until` is out of range.
+    """Linear interpolation between two values; raises a `ValueError` if `until` is out of range.
 
     Example:
         >>> Linear(1.0, 0.0)(0.25)
         0.75
     """
 
-    start: float
-    end: float
-    until: float = 1.0
+    start: float  # value at progress 0
+    end: float  # value from progress `until` on
+    until: float = 1.0  # progress at which `end` is reached, in (0, 1]
 
     def __post_init__(self) -> None:
         if not 0 < self.until <= 1:

@@ -60,12 +60,12 @@ class ConeTrackEnv(SeededEnv):
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
     [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force,
     `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
-    laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `clearance` m (distance to a crash),
+    laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash),
     `smoothness` |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
 
     Args:
         tracks: the tracks.
-        num_cars: B.
+        num_envs: B.
         rate: control steps per second.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
         smoothing: lambda of the cubic smoothing spline, m^3.
@@ -93,7 +93,7 @@ class ConeTrackEnv(SeededEnv):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=8)
+        >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=8)
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([8, 3, 20])
     """
@@ -103,7 +103,7 @@ class ConeTrackEnv(SeededEnv):
     def __init__(
         self,
         tracks: Sequence[Track],
-        num_cars: int = 64,
+        num_envs: int = 64,
         *,
         rate: float = 24.0,
         spline: Literal["cubic", "quadratic"] = "cubic",
@@ -127,7 +127,7 @@ class ConeTrackEnv(SeededEnv):
         check_choice(("cubic", "quadratic"), spline=spline)
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
         check_choice(("random", "cyclic"), assignment=assignment)
-        check_range(0, above=True, num_cars=num_cars, kept_cones=kept_cones, speed=speed, car_length=car_length)
+        check_range(0, above=True, num_envs=num_envs, kept_cones=kept_cones, speed=speed, car_length=car_length)
         check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, 1000, above=True, rate=rate)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
@@ -137,7 +137,7 @@ class ConeTrackEnv(SeededEnv):
         if round(time_limit * rate) < 1:
             raise ValueError(f"time_limit={time_limit} must be at least one step of 1/{rate} s")
         check_weights("reward", reward or {}, RewardWeights._fields)
-        super().__init__(device=torch.device(device), batch_size=torch.Size([num_cars]))
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype_, self.generator = dtype, torch.Generator()
         self.rate, self.laps, self.held_steps, self.assignment, self.info = rate, laps, held_steps, assignment, info
         self.max_steps = round(time_limit * rate)
@@ -149,7 +149,7 @@ class ConeTrackEnv(SeededEnv):
         weights = torch.tensor(RewardWeights(**(reward or {})), dtype=dtype, device=self.device)
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()
-        self._register_state(num_cars)
+        self._register_state(num_envs)
         self.staggered = starts is not None
         self._register_starts(starts)
         self.set_seed(seed)
@@ -166,8 +166,8 @@ class ConeTrackEnv(SeededEnv):
         if self.info:
             terms = Composite({term: real((1,)) for term in self.reward_terms})
             observation["info"] = Composite(
-                track=count((1,)), lap=count((1,)), lap_time=real((1,)), crashed=flag, clearance=real((1,)),
-                smoothness=real((1,)), pose=real((3,)), reward=terms,
+                track=count((1,)), lap=count((1,)), lap_time=real((1,)), crashed=flag, completed=flag,
+                clearance=real((1,)), smoothness=real((1,)), pose=real((3,)), reward=terms,
             )  # fmt: skip
         ends = Composite({key: flag.clone() for key in ("done", "terminated", "truncated")}, device=self.device)
         self.observation_spec, self.done_spec = observation.expand(self.batch_size), ends.expand(self.batch_size)
@@ -242,7 +242,8 @@ class ConeTrackEnv(SeededEnv):
             at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
             for at in (self.start_observation, self.start_cones, self.start_count)
         )
-        info = {"lap_time": zero, "crashed": zero.bool(), "clearance": zero, "smoothness": zero}
+        flags = {"crashed": zero.bool(), "completed": zero.bool()}
+        info = {"lap_time": zero, **flags, "clearance": zero, "smoothness": zero}
         return self._output(observation.t(), cones, count, info, dict.fromkeys(self.reward_terms, zero))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -266,11 +267,13 @@ class ConeTrackEnv(SeededEnv):
         crashed = clearance <= constant(0, clearance)
         alive = (~crashed).to(action.dtype)
         terms = self._reward(Outcome(action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive))
-        terminated = crashed | (self.lap >= constant(self.laps, self.lap))
+        completed = (self.lap >= constant(self.laps, self.lap)) & ~crashed
+        terminated = crashed | completed
         truncated = (self.steps >= constant(self.max_steps, self.steps)) & ~terminated
         reward = reduce(torch.add, terms.values()).to(action.dtype)
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        info = {"lap_time": lap_time, "crashed": crashed, "clearance": clearance, "smoothness": roughness}
+        flags = {"crashed": crashed, "completed": completed}
+        info = {"lap_time": lap_time, **flags, "clearance": clearance, "smoothness": roughness}
         return self._output(observation, visible.cones, visible.count.long(), info, terms, reward=reward, **ends)
 
     def _move(self, action: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class DrivingTasksEnv(ConeTrackEnv):
 
     Args:
         tracks: the tracks.
-        num_cars: B.
+        num_envs: B.
         tasks: name to weights, of `RewardWeights` and `PositionWeights`.
         only: a task that all cars keep; by default they change between all tasks.
         duration: s, mean time until a task changes to another one, drawn every step with equal probabilities.
@@ -53,7 +53,7 @@ class DrivingTasksEnv(ConeTrackEnv):
     Example:
         >>> from coil_rl.envs import DrivingTasksEnv, shipped_tracks
         >>> tasks = {"centred": {"centre": -1.0}, "left": {"left": 0.5}, "right": {"left": -0.5}}
-        >>> env = DrivingTasksEnv(shipped_tracks("train"), num_cars=8, tasks=tasks, reward={"alive": 0.5})
+        >>> env = DrivingTasksEnv(shipped_tracks("train"), num_envs=8, tasks=tasks, reward={"alive": 0.5})
         >>> env.rollout(3, break_when_any_done=False)["task"].shape
         torch.Size([8, 3, 3])
     """
@@ -63,7 +63,7 @@ class DrivingTasksEnv(ConeTrackEnv):
     def __init__(
         self,
         tracks: Sequence[Track],
-        num_cars: int = 64,
+        num_envs: int = 64,
         *,
         tasks: Mapping[str, Mapping[str, float]],
         only: str | None = None,
@@ -79,7 +79,7 @@ class DrivingTasksEnv(ConeTrackEnv):
             raise ValueError("tasks is empty; give at least one, such as tasks={centred: {centre: -1.0}}")
         if only is not None and only not in tasks:
             raise ValueError(f"only={only!r} must be one of {', '.join(tasks)}")
-        super().__init__(tracks, num_cars, **world)
+        super().__init__(tracks, num_envs, **world)
         if not duration * self.rate >= 1:
             raise ValueError(f"duration={duration} must be at least one step of 1/{self.rate} s")
         self.tasks, self.duration = tuple(tasks), duration

@@ -95,6 +95,11 @@ def shipped_tracks(split: Split) -> list[Track]:
     return list(_shipped(split))
 
 
+def track_names(tracks: Sequence[Track]) -> list[str]:
+    """Return the names of tracks, which are the cases of an evaluation."""
+    return [track.name for track in tracks]
+
+
 def shipped_track(name: str) -> Track:
     """Return one of the project's own tracks by name, such as test_1."""
     tracks = {track.name: track for track in shipped_tracks("all")}

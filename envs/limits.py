@@ -10,16 +10,9 @@ LARGEST_STARTS = 10**5  # places of a world where an episode may begin
 
 
 def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:
-    """Raise an error for the first value out of range.
+    """Raise a `ValueError` for the first of some values that is not from `low` to `high`, or is NaN or infinite.
 
-    Args:
-        low: lowest value allowed.
-        high: highest value allowed; by default any finite number.
-        above: whether `low` itself is excluded.
-        values: the values by name.
-
-    Raises:
-        ValueError: for a value that is out of range, NaN or infinite.
+    `above` excludes `low` itself.
     """
     upper = f"and at most {high}" if high < math.inf else "and finite"
     for name, value in values.items():
@@ -28,11 +21,7 @@ def check_range(low: float, high: float = math.inf, *, above: bool = False, **va
 
 
 def check_choice(choices: tuple[str, ...], **values: str) -> None:
-    """Raise an error for the first value that is not one of the choices.
-
-    Raises:
-        ValueError: with the name of the value and the choices.
-    """
+    """Raise a `ValueError` for the first value that is not one of the choices."""
     for name, value in values.items():
         if value not in choices:
             raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

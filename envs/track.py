@@ -35,13 +35,6 @@ class TrackError(ValueError):
 class Track:
     """A closed track between two rings of cones.
 
-    Args:
-        name: display name.
-        left: [N, 2], m, the cones of the left side in driving order, x right and y up.
-        right: [M, 2], m, the cones of the right side.
-        start: x in m, y in m, heading in rad anticlockwise from +x; by default the midpoint of the last left and the
-            last right cone, heading for the finish.
-
     Raises:
         TrackError: for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries that
             cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
@@ -55,9 +48,11 @@ class Track:
         63
     """
 
-    name: str
-    left: Array
-    right: Array
+    name: str  # for display
+    left: Array  # [N, 2] m, the cones of the left side in driving order, x right and y up
+    right: Array  # [M, 2] m, the cones of the right side
+    # x in m, y in m, heading in rad anticlockwise from +x; by default the midpoint of the last left and the last right
+    # cone, heading for the finish.
     start: tuple[float, float, float] = None  # type: ignore[assignment]  # set in __post_init__
 
     # Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon through the cones.

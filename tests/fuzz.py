@@ -52,11 +52,12 @@ FAILURES = ("traceback", "hang", "crash", "sentences", "exit code", "outside", "
 
 TRACKS = "track=generated track.train.count=1 track.test.count=1"
 SHORT = "env.laps=1 env.time_limit=1 evaluation.repeats=1"
-CURVE = "evaluation.curve.cars=2 evaluation.curve.env.time_limit=1"
+CURVE = "evaluation.curve.num_envs=2 evaluation.curve.env.time_limit=1"
 TRAIN = (
-    f"{SHORT} {CURVE} evaluation.gif=false budget.frames=32 budget.cars=4 budget.steps=8 checkpoint_every=1 logger=none"
+    f"{SHORT} {CURVE} evaluation.gif=false budget.frames=32 budget.num_envs=4 budget.steps=8 checkpoint_every=1 "
+    "logger=none"
 )
-PROXY = "proxy.budget.frames=32 proxy.budget.cars=4 proxy.budget.steps=8 proxy.learner.regressor.epochs=1"
+PROXY = "proxy.budget.frames=32 proxy.budget.num_envs=4 proxy.budget.steps=8 proxy.learner.regressor.epochs=1"
 PHASES = "learner.phases.agent_phase.frames=32 learner.phases.guide_phase.frames=32"
 ONCE, MINIBATCHES = "learner.epochs=1 learner.minibatches=2", "learner.minibatches=2"
 REPLAY = "learner.starts=16 learner.batch_size=8 learner.capacity=100"
@@ -210,7 +211,7 @@ class Fuzzer:
         (self.base / "hubconf.py").write_text(f"import os\nos.system({mutations.MARK!r})\n")
         (self.base / "loop").symlink_to("loop")
         drives = [self.base / "drive.mcap", self.base / "other.mcap"]
-        record_drives(SimulatedRobotEnv(num_cars=2, time_limit=3), SplineGuide(), drives)
+        record_drives(SimulatedRobotEnv(num_envs=2, time_limit=3), SplineGuide(), drives)
         for name, overrides in RUNS.items():
             called("train", *f"{TRACKS} {TRAIN} {overrides} hydra.run.dir=runs/{name}".split(), cwd=self.base)
         for use in USES.values():
@@ -282,10 +283,12 @@ class Fuzzer:
             case.damaged.append("without evaluation.csv")
         for _ in range(draw.choice([1, 1, 2])):
             file = folder / draw.choice(likely if draw.random() < 0.9 else names)
+            if not file.parent.is_dir():  # the first damage has put a file in place of its folder
+                continue
             if file.suffix == ".pt" and draw.random() < 0.1:
                 shutil.copyfile(self.base / "runs" / draw.choice(list(RUNS)) / "checkpoint.pt", file)
                 case.damaged.append(f"{file.name}: checkpoint of another run")
-            elif file.parent.is_dir():
+            else:
                 case.damaged.append(mutations.damage(file, draw))
         return case
 
@@ -335,7 +338,11 @@ class Fuzzer:
                 os.dup2(os.open(place / name, os.O_WRONLY | os.O_CREAT), stream)
             sys.stdout, sys.stderr = (os.fdopen(stream, "w", closefd=False) for stream in (1, 2))
             _limit(case, place)
-            os.environ |= {"HOME": str(place / "here"), "TMPDIR": str(place / "here" / "outputs")}
+            os.environ |= {
+                "HOME": str(place / "here"),
+                "MPLCONFIGDIR": str(place / "here" / "outputs"),
+                "TMPDIR": str(place / "here" / "outputs"),
+            }
             os.chdir(place / "here")
             sys.argv = case.words
             importlib.import_module(f"coil_rl.programs.{case.words[0]}").main()
@@ -427,6 +434,7 @@ def _half_written(case: Case, place: Path, changed: set[str], status: int) -> se
     if case.words[0] in ("train", "distill", "robot", "reproduce") or case.file_limit < FILE:
         files = {name for name in left if not (place / name).is_dir()}
         left = {name for name in left - files if not any(file.startswith(f"{name}/") for file in files)}
+        left = {name for name in left if Path(name).name not in ("policies", "proxies")}  # the run can be resumed
     return half | left
 
 
@@ -452,6 +460,7 @@ def main(argv: list[str] | None = None) -> int:
     global fuzzer
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case after this time")
     parser.add_argument("--workers", type=int, default=1)
@@ -475,7 +484,7 @@ def main(argv: list[str] | None = None) -> int:
         (options.folder / "cases.jsonl").open("w") as file,
         tqdm(total=options.cases, unit="case", disable=not sys.stderr.isatty()) as bar,
     ):
-        for number, case in pool.imap_unordered(_run, range(options.cases)):
+        for number, case in pool.imap_unordered(_run, range(options.first, options.cases)):
             bar.update()
             if case:
                 cases[number] = case

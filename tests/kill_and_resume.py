@@ -29,7 +29,7 @@ from tqdm import tqdm  # noqa: E402
 
 from coil_rl.train import checkpoint  # noqa: E402
 
-SMALL = ["budget.frames=10240", "budget.cars=32", "budget.steps=16", "track=generated", "track.train.count=1",
+SMALL = ["budget.frames=10240", "budget.num_envs=32", "budget.steps=16", "track=generated", "track.train.count=1",
          "track.test.count=1", "env.laps=1", "env.time_limit=2", "evaluation.repeats=2", "evaluation.gif=false",
          "learner.epochs=2", "checkpoint_every=1"]  # fmt: skip
 MILESTONES = ["config.yaml", "guide_return.json", "policy_last.pt", "learning_curve.png", "lines.png", "evaluation.csv"]

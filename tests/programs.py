@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
-TINY = [*LAP, "budget.frames=512", "budget.cars=8", "budget.steps=32", "evaluation.repeats=1", "logger=none"]
+TINY = [*LAP, "budget.frames=512", "budget.num_envs=8", "budget.steps=32", "evaluation.repeats=1", "logger=none"]
 
 
 def command(name, *arguments):

@@ -15,9 +15,9 @@ def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
     """Return runs by label whose rewards exceed the guide's by the label's gain plus the seed."""
     for label, gain in gains.items():
         for seed in range(seeds):
-            rewards = {track: reward + gain + seed for track, reward in GUIDE.items()}
+            rewards = {case: reward + gain + seed for case, reward in GUIDE.items()}
             rows = driven("guide", GUIDE) + driven(label, rewards, **others)
-            rows += driven(label, {track: reward - 50 for track, reward in rewards.items()}, "sampled") * sampled
+            rows += driven(label, {case: reward - 50 for case, reward in rewards.items()}, "sampled") * sampled
             run = make_run(folder / f"{label}_{seed}", label, seed, rows)
             returns = [np.nan, *(300 + gain + seed + np.array([0.0, 40.0, 20.0]))]
             frames = range(1000, 5000, 1000)

@@ -7,8 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import yaml
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import ROOT
 
 import coil_rl.train.config  # noqa: F401 registers the configuration schema
 from coil_rl.report import write_csv
@@ -16,16 +18,17 @@ from coil_rl.train import checkpoint
 from coil_rl.train.build import build_env, build_learner
 
 Row = dict[str, Any]
+MEASURES = yaml.safe_load((ROOT / "conf" / "measures" / "driving.yaml").read_text())
 OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0, "clearance": 0.3}
 
 
 def driven(
     driver: str, rewards: Mapping[str, float], actions: str = "deterministic", advice: str = "", **others: float
 ) -> list[Row]:
-    """Return the rows of one driver: a row per track, and their mean."""
+    """Return the rows of one driver: a row per case, and their mean."""
     row = {"driver": driver, "advice": advice, "actions": actions}
-    rows = [row | {"track": track, "reward": reward} | OTHERS | others for track, reward in rewards.items()]
-    return [*rows, rows[0] | {"track": "mean", "reward": sum(rewards.values()) / len(rewards)}]
+    rows = [row | {"case": case, "reward": reward} | OTHERS | others for case, reward in rewards.items()]
+    return [*rows, rows[0] | {"case": "mean", "reward": sum(rewards.values()) / len(rewards)}]
 
 
 def make_run(
@@ -38,7 +41,8 @@ def make_run(
 ) -> Path:
     """Write a run; without rows it is not finished."""
     folder.mkdir(parents=True)
-    config = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
+    config: Row = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
+    config["evaluation"] = {"measures": MEASURES}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
     (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
     frames = range(1000, 20_001, 1000)

@@ -17,6 +17,8 @@ VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
     "env/driving_tasks.yaml": ["env.reward"],
     "env/simulated_robot.yaml": ["env.reward", "env.lidar", "env.car_length"],  # rounded length
+    "env/gym.yaml": ["env.options", "env.controllers"],  # None in the constructor: no options, no controllers
+    "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["car_length"],
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],

@@ -15,7 +15,7 @@ from programs import LAP, called
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
-SMALL = [*LAP, "budget.frames=2048", "budget.cars=8", "budget.steps=64", "evaluation.repeats=1", "logger=none"]
+SMALL = [*LAP, "budget.frames=2048", "budget.num_envs=8", "budget.steps=64", "evaluation.repeats=1", "logger=none"]
 RUNS = {
     "ppo": ["method=ppo"],
     "coil": ["method=coil"],

@@ -1,25 +1,32 @@
-"""Small envs with a guide."""
+"""Small envs with a guide, and the measures of the cone world."""
+
+from functools import cache
 
 import torch
+from hydra import compose, initialize_config_module
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, GymEnv, PendulumEnv, SerialEnv, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
+from coil_rl.train import config  # noqa: F401 registers the configuration schema
+from coil_rl.train.measures import Measure, measures_of
 from coil_rl.transforms import GuideActions
+
+
+@cache
+def driving_measures(env="cone_track") -> dict[str, Measure]:
+    """Return what an evaluation measures in an env of conf/env."""
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return measures_of(compose("train", [f"env={env}"]).evaluation.measures)
 
 
 def cones(*transforms, cars=6) -> TransformedEnv:
     """Return cars with the advice of the spline guide."""
     env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6)
     return TransformedEnv(env, Compose(GuideActions({"spline": SplineGuide()}), *transforms))
-
-
-def without_rate(**options) -> ConeTrackEnv:
-    """Return cars whose control rate is not known."""
-    env = ConeTrackEnv(**options)
-    del env.rate
-    return env
 
 
 def pendulum(*transforms) -> TransformedEnv:
@@ -40,3 +47,35 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
+
+
+class Script(EnvBase):
+    """Rows that show given numbers step by step, also after their episodes have ended.
+
+    `lengths` [*B] are numbers of steps; `reward` and the other entries are [T, *B, ...], those of the steps.
+    """
+
+    rate = 5.0
+
+    def __init__(self, lengths, reward, **entries):
+        super().__init__(batch_size=lengths.shape)
+        self.lengths, self.entries, self.time = lengths.unsqueeze(-1), entries | {"reward": reward}, 0
+        flag = Categorical(2, (*lengths.shape, 1), dtype=torch.bool)
+        shown = {name: Unbounded(values.shape[1:], dtype=values.dtype) for name, values in self.entries.items()}
+        self.full_reward_spec = Composite(reward=shown.pop("reward"), shape=self.batch_size)
+        self.observation_spec = Composite(shown, shape=self.batch_size)
+        self.action_spec = Bounded(-1, 1, (*self.batch_size, 1))
+        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), shape=self.batch_size)
+
+    def _reset(self, tensordict=None, **_):
+        self.time = 0
+        return TensorDict({**self.observation_spec.zero(), **self.full_done_spec.zero()}, self.batch_size)
+
+    def _step(self, tensordict):
+        shown = {name: values[min(self.time, len(values) - 1)] for name, values in self.entries.items()}
+        self.time += 1
+        ended = self.time >= self.lengths
+        return TensorDict({**shown, "done": ended, "terminated": ended}, self.batch_size)
+
+    def _set_seed(self, seed):
+        pass

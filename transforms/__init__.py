@@ -14,7 +14,7 @@ from coil_rl.transforms.degraded_advice import (
 )
 from coil_rl.transforms.discrete_actions import DiscreteActions
 from coil_rl.transforms.guide_actions import GuideActions, Guides
-from coil_rl.transforms.guide_transform import GuideTransform
+from coil_rl.transforms.guide_transform import GuideTransform, set_progress
 from coil_rl.transforms.reward_coupling import RewardCoupling
 
 __all__ = [
@@ -36,4 +36,5 @@ __all__ = [
     "ScaledAdvice",
     "ShuffledAdvice",
     "Takeover",
+    "set_progress",
 ]

@@ -2,29 +2,50 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import Transform
+
+Key = TypeVar("Key", NestedKey, NestedKey | None)
+
+
+def nested_key(key: Key) -> Key:
+    """Return a key as TensorDict takes it; YAML has lists for tuples."""
+    return tuple(key) if isinstance(key, list) else key
 
 
 class ActionSpace:
-    """Actions of an env as vectors [*batch, A]; a discrete action is one-hot, A is the number of choices.
+    """Actions of an env as vectors [*batch, *agents, A]; a discrete action is one-hot, A is the number of choices.
+
+    Several discrete actions (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side.
 
     Args:
         spec: action spec of the env.
         batch_dims: number of batch dimensions of the env.
+
+    Raises:
+        ValueError: for a single action without a dimension of its own, or one of whole numbers that are no choices.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
         self.spec = spec
         self.event = spec.shape[batch_dims:]
-        self.choices = spec.n if isinstance(spec, Categorical) else 0
-        self.size = self.choices or spec.shape[-1]
         self.continuous = spec.dtype.is_floating_point
         self.dtype = spec.dtype if self.continuous else torch.float32
+        self.choices = choices_of(spec)
+        if not self.choices and not (self.continuous and self.event):
+            raise ValueError(f"advice needs a vector of real numbers or choices, but the env's action is {spec}")
+        self.size = sum(self.choices) or spec.shape[-1]
+        self.one_hot = isinstance(spec, OneHot)
+        # An index may have a dimension of its own.
+        self.indexed = bool(self.choices) and not self.one_hot
+        own = not self.indexed or len(self.choices) > 1 or self.event[-1:] == (1,)
+        self.agents = self.event[:-1] if own else self.event
         first = (0,) * batch_dims
         self.bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
 
@@ -42,31 +63,78 @@ class ActionSpace:
         return cls(transform.parent.full_action_spec[action_key], transform.parent.batch_dims)
 
     def vectors(self, action: Tensor) -> Tensor:
-        """Convert env actions to vectors [*batch, A]."""
-        if self.choices:
+        """Convert env actions to vectors [*batch, *agents, A]."""
+        if self.indexed:
             batch = action.shape[: action.ndim - len(self.event)]
-            action = F.one_hot(action.reshape(batch).long(), self.choices)
+            action = self._encoded(action.reshape(*batch, *self.agents, len(self.choices)))
         return action if action.dtype.is_floating_point else action.to(self.dtype)
 
+    def advice(self, action: Tensor, batch: torch.Size) -> Tensor:
+        """Convert the action of a guide to a vector within the bounds of the env's action.
+
+        It is [*batch, *agents, A], for choices also their indices; raises a `ValueError` for another shape.
+        """
+        indices = self._indices(action, batch)
+        vectors = action if indices is None else self._encoded(indices)
+        return self.clamp(vectors.to(self.dtype))
+
+    def check_advice(self, action: Tensor, batch: torch.Size) -> None:
+        """Raise a `ValueError` for a guide's action of another shape, or with numbers that no action has."""
+        indices = self._indices(action, batch)
+        if not action.isfinite().all():
+            raise ValueError("holds a number that is not finite")
+        if self.choices:
+            # The elements of a vector are 0 or 1.
+            limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
+            numbers = action if indices is None else indices
+            if not ((numbers >= 0) & (numbers < limit)).all():
+                raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
+
+    def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
+        """Return the choices of a guide as indices [*batch, *agents, n], None if they are vectors already."""
+        lead = (*batch, *self.agents)
+        if action.shape == (*lead, self.size):
+            return None
+        n = len(self.choices)
+        if (n and action.shape == (*lead, n)) or (n == 1 and action.shape == lead):
+            return action.reshape(*lead, n)
+        raise ValueError(f"has the shape {list(action.shape)}, but must have {[*lead, self.size]}")
+
     def actions(self, vectors: Tensor) -> Tensor:
-        """Convert vectors [*batch, A] to env actions; a discrete action is the argmax."""
+        """Convert vectors [*batch, *agents, A] to env actions; a discrete action is the argmax."""
         if self.continuous:
             return vectors
-        best = vectors.argmax(-1)
-        if isinstance(self.spec, OneHot):
-            return F.one_hot(best, self.size).to(self.spec.dtype)
-        return best.reshape((*best.shape, *self.event)).to(self.spec.dtype)
+        best = torch.stack([part.argmax(-1) for part in vectors.split(self.choices, -1)], -1)
+        if self.one_hot:
+            return self._encoded(best).to(self.spec.dtype)
+        return best.reshape((*vectors.shape[: vectors.ndim - 1 - len(self.agents)], *self.event)).to(self.spec.dtype)
+
+    def _encoded(self, indices: Tensor) -> Tensor:
+        """Return the one-hot vectors of indices [..., n] side by side."""
+        parts = [F.one_hot(index, n) for index, n in zip(indices.long().unbind(-1), self.choices, strict=True)]
+        return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
     def clamp(self, vectors: Tensor) -> Tensor:
-        """Clamp vectors [*batch, A] to the bounds of the action, if it has any."""
+        """Clamp vectors [*batch, *agents, A] to the bounds of the action, if it has any."""
         return vectors if self.bounds is None else vectors.clamp(*self.bounds)
 
     def advice_spec(self, batch: torch.Size, guides: int) -> TensorSpec:
-        """Return the spec of advice [*batch, guides, A]: bounds of the action, 0 and 1 for one-hot vectors."""
-        shape, device = (*batch, guides, self.size), self.spec.device
+        """Return the spec of advice [*batch, *agents, guides, A]: bounds of the action, 0 and 1 for one-hot vectors."""
+        shape, device = (*batch, *self.agents, guides, self.size), self.spec.device
         if not self.continuous:
             return Bounded(0, 1, shape, device=device, dtype=self.dtype)
         if self.bounds is None:
             return Unbounded(shape, device=device, dtype=self.dtype)
-        low, high = (bound.expand(shape) for bound in self.bounds)
+        low, high = (bound.unsqueeze(-2).expand(shape) for bound in self.bounds)
         return Bounded(low, high, shape, device=device, dtype=self.dtype)
+
+
+def choices_of(spec: TensorSpec) -> list[int]:
+    """Return the number of choices of each discrete action of a spec, an empty list if there is none."""
+    if isinstance(spec, Binary):
+        return [2] * spec.shape[-1]
+    if isinstance(spec, MultiCategorical):
+        return spec.nvec.reshape(-1, spec.nvec.shape[-1])[0].tolist()
+    if isinstance(spec, MultiOneHot):
+        return list(spec.nvec)
+    return [int(spec.space.n)] if isinstance(spec, (Categorical, OneHot)) else []

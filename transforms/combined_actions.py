@@ -7,6 +7,8 @@ observation; learners leave the steps of the guide out of the policy loss.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
@@ -20,11 +22,7 @@ class _ActionSum(GuideTransform):
     """Base class: sum of agent and guide action, clamped to the bounds of the action."""
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Check that there is advice and that actions are continuous.
-
-        Raises:
-            ValueError: for discrete actions.
-        """
+        """Check that there is advice and that actions are continuous; raises a `ValueError` for discrete actions."""
         if not self.action_space.continuous:
             raise ValueError(
                 f"{type(self).__name__} needs continuous actions, but this env has {self.action_space.size} discrete "
@@ -45,13 +43,13 @@ class ResidualAction(_ActionSum):
 
     Args:
         scale: factor of the agent's action, a number or a schedule over the run. With 0 the guide acts alone.
-        guide: row of the advice.
+        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
     mdp_parameter = "scale"
 
-    def __init__(self, scale: float | Schedule = 1.0, guide: int = 0) -> None:
-        super().__init__(guide=guide)
+    def __init__(self, scale: float | Schedule = 1.0, **options: Any) -> None:
+        super().__init__(**options)
         self.scale = scale
 
     def _combine(self, action: Tensor, advice: Tensor) -> Tensor:
@@ -63,13 +61,13 @@ class MixedAction(_ActionSum):
 
     Args:
         weight: weight of the agent, a number or a schedule over the run. With 1 the agent acts alone.
-        guide: row of the advice.
+        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
     mdp_parameter = "weight"
 
-    def __init__(self, weight: float | Schedule, guide: int = 0) -> None:
-        super().__init__(guide=guide)
+    def __init__(self, weight: float | Schedule, **options: Any) -> None:
+        super().__init__(**options)
         self.weight = weight
 
     def _combine(self, action: Tensor, advice: Tensor) -> Tensor:
@@ -80,8 +78,10 @@ class MixedAction(_ActionSum):
 class _ActionSwitch(GuideTransform):
     """Base class: the env gets the guide's action where `agent_acts` is false."""
 
-    def __init__(self, guide: int, seed: int, *more_keys: str) -> None:
-        super().__init__(["agent_acts", *more_keys], guide=guide)
+    written: tuple[str, ...] = ("agent_acts",)
+
+    def __init__(self, seed: int = 0, **options: Any) -> None:
+        super().__init__(**options)
         self.rng = SeededGenerator(seed)
 
     def _draw(self) -> Tensor:
@@ -90,7 +90,7 @@ class _ActionSwitch(GuideTransform):
         return torch.rand(shape, generator=self.rng.generator).to(self.parent.device)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if not self.training:
+        if not self.learns:
             return tensordict
         action, advice = tensordict[self.action_key], self.action_space.actions(self.advice(tensordict))
         # `agent_acts` has one more dimension than a discrete action.
@@ -112,17 +112,16 @@ class Takeover(_ActionSwitch):
 
     Args:
         probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
-        guide: row of the advice.
-        seed: seed of the draws.
+        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
-    def __init__(self, probability: float | Schedule = 1.0, guide: int = 0, seed: int = 0) -> None:
-        super().__init__(guide, seed)
+    def __init__(self, probability: float | Schedule = 1.0, **options: Any) -> None:
+        super().__init__(**options)
         self.probability = probability
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         draw = self._draw()
-        agent = draw >= self.current(self.probability) if self.training else torch.ones_like(draw, dtype=torch.bool)
+        agent = draw >= self.current(self.probability) if self.learns else torch.ones_like(draw, dtype=torch.bool)
         return next_tensordict.set("agent_acts", agent)
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
@@ -137,17 +136,18 @@ class JumpStart(_ActionSwitch):
     Args:
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        guide: row of the advice.
-        seed: seed of the draws.
+        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
-    def __init__(self, horizon: float | Schedule, random: bool = False, guide: int = 0, seed: int = 0) -> None:
-        super().__init__(guide, seed, "guide_steps")
+    written = ("agent_acts", "guide_steps")
+
+    def __init__(self, horizon: float | Schedule, random: bool = False, **options: Any) -> None:
+        super().__init__(**options)
         self.horizon, self.random = horizon, random
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         draw = self._draw()
-        horizon = max(self.current(self.horizon), 0.0) if self.training else 0.0
+        horizon = max(self.current(self.horizon), 0.0) if self.learns else 0.0
         # Rounded down, so that 0, 1 ... horizon are equally likely.
         steps = (draw * (horizon + 1)).long() if self.random else torch.full_like(draw, horizon).long()
         return self._write(tensordict_reset, steps)

@@ -8,16 +8,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torch.nn import functional as F
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
+from coil_rl.transforms.action_space import ActionSpace, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
@@ -35,6 +36,7 @@ class DegradedAdvice(Transform):
     needs_past = False  # whether stored data of a single step are not enough
 
     def __init__(self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0) -> None:
+        key, memory_key = nested_key(key), nested_key(memory_key)
         super().__init__(in_keys=[key], out_keys=[key, memory_key] if slots else [key])
         self.key, self.memory_key, self.slots = key, memory_key, slots
         self._bounds: tuple[Tensor, Tensor] | None = None
@@ -51,11 +53,7 @@ class DegradedAdvice(Transform):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Degrade the advice in stored data of any batch size.
-
-        Raises:
-            RuntimeError: if the transform needs previous steps.
-        """
+        """Degrade the advice in stored data; raises a `RuntimeError` if the transform needs previous steps."""
         if self.needs_past:
             raise RuntimeError(f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv")
         return DegradedAdvice._call(self, tensordict)
@@ -73,11 +71,7 @@ class DegradedAdvice(Transform):
         return {self.memory_key: memory.clone()} if self.slots else {}
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add the memory.
-
-        Raises:
-            KeyError: without advice.
-        """
+        """Add the memory; raises a `KeyError` without advice."""
         if self.key not in observation_spec.keys(True, True):
             raise KeyError(
                 f"{type(self).__name__} changes {self.key!r}, but the env writes {sorted(map(str, observation_spec))}; "
@@ -290,17 +284,20 @@ class RemovedAdvice(DegradedAdvice):
 
     def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
         super().__init__(key)
-        self.action_key = action_key
+        self.action_key = nested_key(action_key)
+
+    @cached_property
+    def action_space(self) -> ActionSpace:
+        """Action space of the env; RuntimeError outside an env."""
+        return ActionSpace.of_parent(self, self.action_key)
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return zeros, for the first step."""
         return torch.zeros_like(advice)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        action = self.action_space.vectors(tensordict[self.action_key])
         advice = next_tensordict[self.key]
-        action = tensordict[self.action_key].reshape(*next_tensordict.batch_size, -1)
-        if action.shape[-1] != advice.shape[-1]:
-            action = F.one_hot(action.squeeze(-1).long(), advice.shape[-1])
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
 
 

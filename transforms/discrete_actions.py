@@ -37,7 +37,7 @@ class DiscreteActions(Transform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_cars=8), DiscreteActions(5))
+        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_envs=8), DiscreteActions(5))
         >>> env.action_spec.n, env.transform.values.tolist()
         (5, [-1.0, -0.5, 0.0, 0.5, 1.0])
     """

@@ -6,14 +6,15 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import TensorSpec
-from torchrl.envs import Transform
+from torchrl.data import Composite
+from torchrl.envs import EnvBase, Transform
 
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 
 
 class Guides(TensorDictModuleBase):
@@ -23,11 +24,12 @@ class Guides(TensorDictModuleBase):
         guides: name to guide, in the order of the rows of the advice.
         action_key: entry written by each guide, [*batch, A].
         out_key: entry for the advice, [*batch, n_guides, A].
-        trainable: require parameters in each guide.
+        trainable: require parameters and no memory in each guide.
 
     Raises:
         TypeError: if `guides` is not a mapping.
-        ValueError: without a guide, for an invalid name, or for a guide without `action_key` or parameters.
+        ValueError: without a guide, for an invalid name, or for a guide without `action_key` or parameters, or with a
+            memory that is not as in `GuideMemory`.
     """
 
     def __init__(
@@ -37,6 +39,7 @@ class Guides(TensorDictModuleBase):
         out_key: NestedKey = "guide_action",
         trainable: bool = False,
     ) -> None:
+        action_key, out_key = nested_key(action_key), nested_key(out_key)
         if not isinstance(guides, Mapping):
             raise TypeError(f"guides must be a mapping from name to guide, not {type(guides).__name__}")
         if not guides:
@@ -48,12 +51,16 @@ class Guides(TensorDictModuleBase):
                 raise ValueError(f"{name!r} cannot be the name of a guide: PyTorch reserves it; use another name")
             if trainable and next(guide.parameters(), None) is None:
                 raise ValueError(f"guide {name!r} has no parameters to train; imitate it with a network (coil-distill)")
+        self.memories = {name: memory for name, guide in guides.items() if (memory := GuideMemory(name, guide)).specs}
+        if trainable and self.memories:
+            raise ValueError(f"guide {next(iter(self.memories))!r} has a memory, and such a guide cannot be trained")
         self.in_keys = list(dict.fromkeys(key for guide in guides.values() for key in guide.in_keys))
         self.out_keys = [out_key]
         super().__init__()
         self.guides = nn.ModuleDict(guides)
         self.action_key = action_key
         self._in_keys_of = {name: guide.in_keys for name, guide in guides.items()}
+        self._input_dtype: dict[str, torch.dtype] = {}
 
     @property
     def names(self) -> list[str]:
@@ -64,18 +71,44 @@ class Guides(TensorDictModuleBase):
         """Write the advice."""
         return tensordict.set(self.out_keys[0], self.advice(tensordict))
 
-    def advice(self, tensordict: TensorDictBase, convert: Callable[[Tensor], Tensor] | None = None) -> Tensor:
+    def advice(
+        self,
+        tensordict: TensorDictBase,
+        convert: Callable[[str, Tensor, torch.Size], Tensor] | None = None,
+        memory: TensorDictBase | None = None,
+    ) -> Tensor:
         """Return the advice [*batch, n_guides, A].
 
         Args:
             tensordict: observations; each guide gets a copy of its own entries.
-            convert: applied to the action of each guide.
+            convert: applied to name, action and batch of each guide.
+            memory: by guide; replaced by what the guides remember for the next step.
         """
         rows = []
         for name, guide in self.guides.items():
-            action = guide(tensordict.select(*self._in_keys_of[name], strict=False))[self.action_key]
-            rows.append(action if convert is None else convert(action))
-        return torch.stack(rows, tensordict.batch_dims)
+            data = tensordict.select(*self._in_keys_of[name], strict=False)
+            if name in self._input_dtype:
+                data = data.apply(self._cast(name))
+            if memory is not None and name in self.memories:
+                data = guide(data.update(memory[name]))
+                memory.set(name, data["next"].select(*self.memories[name].specs))
+            else:
+                data = guide(data)
+            action = data[self.action_key]
+            rows.append(action if convert is None else convert(name, action, tensordict.batch_size))
+        return torch.stack(rows, -2)
+
+    def match_dtypes(self, tensordict: TensorDictBase) -> None:
+        """Convert from here on what a guide reads to the dtype of its parameters, if they differ."""
+        for name, guide in self.guides.items():
+            dtypes = {parameter.dtype for parameter in guide.parameters() if parameter.is_floating_point()}
+            read = tensordict.select(*self._in_keys_of[name], strict=False).values(True, True)
+            if len(dtypes) == 1 and any(value.is_floating_point() and value.dtype not in dtypes for value in read):
+                self._input_dtype[name] = dtypes.pop()
+
+    def _cast(self, name: str) -> Callable[[Tensor], Tensor]:
+        dtype = self._input_dtype[name]
+        return lambda value: value.to(dtype) if value.is_floating_point() else value
 
 
 class GuideCache:
@@ -113,16 +146,25 @@ class GuideActions(Transform):
     The agent is free to use the advice. A guide is any TensorDictModule that reads observations of the env and writes
     an action. Guides run in evaluation mode, without gradients, on a copy of the data. If all guides have the attribute
     `pure = True` (the action is a deterministic function of the guide's input entries of the same row), the advice for
-    the first states of episodes is cached. With discrete actions (`Categorical`) the advice is one-hot.
+    the first states of episodes is cached. With discrete actions the advice is one-hot; a guide may write an index or
+    a one-hot vector. Advice is clamped to the bounds of the action.
+
+    A guide may have a memory: what it reads as `k` and writes as `("next", k)`, declared by its
+    `make_tensordict_primer()`, as TorchRL's `LSTMModule` and `GRUModule` do. It is kept in the data as
+    `("guide_state", NAME, k)` and begins anew with each episode. Guides may also read `is_init` [*batch, 1], whether
+    this is the first step of an episode; `row` [*batch, 1], the number of the row; and `last_action` [*batch, A], the
+    last action that the env was given, after all transforms of it, 0 in the first step (one-hot if discrete).
 
     Args:
         guides: name to guide, in the order of the rows of the advice.
-        action_key: entry written by the guides.
-        out_key: entry for the advice, [*batch, n_guides, A] in action units.
+        action_key: entry written by the guides, and the env's action.
+        out_key: entry for the advice, [*batch, n_guides, A] in action units; with an action for each of several agents
+            [*batch, n_agents, n_guides, A].
 
     Raises:
         TypeError: if `guides` is not a mapping.
-        ValueError: without a guide, for an invalid name, or for a guide that does not write `action_key`.
+        ValueError: without a guide, for an invalid name, or for a guide that does not write `action_key`; at the first
+            step for an action of another shape, or one that is not finite.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -140,19 +182,45 @@ class GuideActions(Transform):
         out_key: NestedKey = "guide_action",
     ) -> None:
         module = Guides(guides, action_key, out_key)
+        self.supplied = [key for key in SUPPLIED if key in module.in_keys]
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
-        self.guides, self.action_key = module, action_key
-        self._cache = GuideCache() if all(getattr(guide, "pure", False) for guide in guides.values()) else None
+        self.guides, self.action_key = module, module.action_key
+        pure = all(getattr(guide, "pure", False) for guide in guides.values()) and not self.needs_past
+        self._cache = GuideCache() if pure else None
+        self._checked: set[str] = set()
 
     @cached_property
     def action_space(self) -> ActionSpace:
         """Action space of the env; RuntimeError outside an env."""
         return ActionSpace.of_parent(self, self.action_key)
 
+    @cached_property
+    def given_space(self) -> ActionSpace:
+        """Action space of the env without any transforms."""
+        env = self.parent.base_env
+        return ActionSpace(env.full_action_spec[self.action_key], env.batch_dims)
+
+    @cached_property
+    def rows(self) -> Tensor:
+        """Numbers of the rows of the env, [*batch, 1]."""
+        batch = self.parent.batch_size
+        return torch.arange(batch.numel(), device=self.parent.device).reshape(*batch, 1)
+
     @property
     def names(self) -> list[str]:
         """Names of the guides, one per row of the advice."""
         return self.guides.names
+
+    @property
+    def needs_past(self) -> bool:
+        """Whether a guide depends on earlier steps."""
+        return bool(self.supplied or self.guides.memories)
+
+    def set_container(self, container: Transform | EnvBase) -> None:
+        """Set the env, which may have other rows than an earlier one."""
+        super().set_container(container)
+        self.__dict__.pop("rows", None)
+        self._checked = set()
 
     def train(self, mode: bool = True) -> GuideActions:
         """Set the training mode; guides stay in evaluation mode."""
@@ -165,39 +233,117 @@ class GuideActions(Transform):
         return {"names": self.names}
 
     def set_extra_state(self, state: dict[str, list[str]]) -> None:
-        """Compare the names of the guides: a policy depends on their order.
-
-        Raises:
-            ValueError: for a state of other guides, or of another order.
-        """
+        """Raise a `ValueError` for a state of other guides, or of another order, on which a policy depends."""
         if state["names"] != self.names:
             raise ValueError(f"the state is of the guides {', '.join(state['names'])}, not {', '.join(self.names)}")
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the advice for stored data of the same env."""
+        """Write the advice for stored data; raises a `ValueError` if a guide depends on earlier steps."""
+        if self.needs_past:
+            raise ValueError(
+                f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have; "
+                "use them in a TransformedEnv"
+            )
         return self._call(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict.set(self.out_keys[0], self._advice(next_tensordict))
 
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.needs_past:
+            return self._call(next_tensordict)
+        # The data of the step hold the action as the env got it, after the transforms.
+        action = self.given_space.vectors(tensordict[self.action_key])
+        data = next_tensordict.select(*self.in_keys, strict=False)
+        memory = tensordict.select(*(("guide_state", name) for name in self.guides.memories))
+        return self._write(next_tensordict, *self._advice_with_past(data, memory, self.rows, action))
+
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         mask = tensordict.get("_reset", None)
         if mask is None or mask.all():
-            return self._call(tensordict_reset)
+            if not self.needs_past:
+                return self._call(tensordict_reset)
+            data = tensordict_reset.select(*self.in_keys, strict=False)
+            return self._write(tensordict_reset, *self._advice_with_past(data, None, self.rows))
         # TorchRL discards the other rows; in a large batch nearly every step resets a few rows.
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
-        data = tensordict_reset.select(*self.in_keys, strict=False)[rows]
-        advice = self._advice(data) if self._cache is None else self._cache(data, self._advice)
-        full = advice.new_zeros((*tensordict_reset.batch_size, *advice.shape[1:]))
-        return tensordict_reset.set(self.out_keys[0], full.index_put(rows, advice))
+        data, memory = tensordict_reset.select(*self.in_keys, strict=False)[rows], None
+        if self.needs_past:
+            advice, memory = self._advice_with_past(data, None, self.rows[rows])
+        else:
+            advice = self._advice(data) if self._cache is None else self._cache(data, self._advice)
+
+        def full(part: Tensor) -> Tensor:
+            return part.new_zeros((*tensordict_reset.batch_size, *part.shape[1:])).index_put(rows, part)
+
+        if memory is not None:
+            memory = memory.apply(full, batch_size=tensordict_reset.batch_size)
+        return self._write(tensordict_reset, full(advice), memory)
+
+    def _write(self, tensordict: TensorDictBase, advice: Tensor, memory: TensorDictBase | None) -> TensorDictBase:
+        if memory is not None:
+            for name in self.guides.memories:
+                tensordict.set(("guide_state", name), memory[name])
+        return tensordict.set(self.out_keys[0], advice)
 
     @torch.no_grad()
-    def _advice(self, tensordict: TensorDictBase) -> Tensor:
-        return self.guides.advice(tensordict, self.action_space.vectors)
+    def _advice(self, tensordict: TensorDictBase, memory: TensorDictBase | None = None) -> Tensor:
+        if not self._checked:
+            self.guides.match_dtypes(tensordict)
+        return self.guides.advice(tensordict, self._converted, memory)
 
-    def transform_observation_spec(self, observation_spec: TensorSpec) -> TensorSpec:
-        """Add the advice."""
+    def _advice_with_past(
+        self, data: TensorDictBase, memory: TensorDictBase | None, rows: Tensor, action: Tensor | None = None
+    ) -> tuple[Tensor, TensorDictBase]:
+        """Return advice and memory; without a memory for the first step of episodes."""
+        batch = data.batch_size
+        state = TensorDict({}, batch, device=data.device)
+        for name, own in self.guides.memories.items():
+            state.set(name, own.start(batch, data.device) if memory is None else memory["guide_state", name])
+        if action is None:
+            space = self.given_space
+            action = rows.new_zeros((*batch, *space.agents, space.size), dtype=space.dtype)
+        is_init = torch.full_like(rows, memory is None, dtype=torch.bool)
+        supplied = {"is_init": is_init, "row": rows, "last_action": action}
+        for key in self.supplied:
+            if key not in data:  # an entry of the env comes first
+                data.set(key, supplied[key])
+        return self._advice(data, state), state
+
+    def _converted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
+        try:
+            if name not in self._checked:
+                self.action_space.check_advice(action, batch)
+                self._checked.add(name)
+            return self.action_space.advice(action, batch)
+        except ValueError as error:
+            raise ValueError(f"the action of guide {name!r} {error}") from None
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the advice and the memory.
+
+        Raises:
+            ValueError: if another GuideActions has a guide of the same name with a memory, or rows are reset in part.
+        """
         observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
             self.parent.batch_size, len(self.guides.names)
         )
-        return observation_spec
+        return self._add_memory(observation_spec)
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Add the memory, which is an input of steps."""
+        if self.guides.memories:
+            state = input_spec["full_state_spec"]
+            if state is None:
+                state = Composite(shape=input_spec.shape, device=input_spec.device)
+            input_spec["full_state_spec"] = self._add_memory(state)
+        return input_spec
+
+    def _add_memory(self, spec: Composite) -> Composite:
+        for name, memory in self.guides.memories.items():
+            if ("guide_state", name) in spec.keys(True):
+                raise ValueError(f"two guides {name!r} have a memory; give them different names")
+            if "_reset" not in self.parent.reset_keys:
+                raise ValueError(f"guide {name!r} has a memory, but the env resets its agents one by one")
+            spec["guide_state", name] = memory.spec(self.parent.batch_size, self.parent.device)
+        return spec

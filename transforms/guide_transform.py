@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cached_property
 
 import torch
@@ -10,9 +10,9 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
 
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 Schedule = Callable[[float], float]
 
@@ -20,34 +20,70 @@ Schedule = Callable[[float], float]
 class GuideTransform(Transform):
     """Base class of transforms that use the advice observed by the agent; place them after `GuideActions`.
 
-    TorchRL keeps transforms in evaluation mode until `env.train()` is called. In evaluation a schedule returns its
-    final value, and changes that serve learning only are off.
+    Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a schedule returns its
+    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules.
 
     Args:
-        out_keys: entries written.
-        guide: row of the advice `guide_action`, [*batch, n_guides, A].
-
-    Attributes:
-        progress: completed fraction of the run, for schedules; set by the training loop.
-        mdp_parameter: name of the parameter that changes rewards or transitions, empty if there is none. If that
-            parameter is a schedule, stored transitions become invalid during the run.
+        guide: row of the advice, [*batch, n_guides, A].
+        action_key: entry of the action.
+        advice_key: entry of the advice.
     """
 
+    written: tuple[str, ...] = ()  # entries that the transform adds
+    # Name of the parameter that changes rewards or transitions, empty if there is none. If it is a schedule,
+    # stored transitions become invalid during the run.
     mdp_parameter: str = ""
-    action_key: NestedKey = "action"
-    advice_key: NestedKey = "guide_action"
 
-    def __init__(self, out_keys: Sequence[NestedKey] = (), *, guide: int = 0) -> None:
+    def __init__(
+        self, guide: int = 0, action_key: NestedKey = "action", advice_key: NestedKey = "guide_action"
+    ) -> None:
         if guide < 0:
             raise ValueError(f"guide={guide} must be at least 0: it is a row of the advice")
-        super().__init__(in_keys=[], out_keys=list(out_keys))
-        self.guide, self.progress = guide, 0.0
+        super().__init__(in_keys=[], out_keys=list(self.written))
+        self.guide = guide
+        self.progress: float | None = None  # completed fraction of the run, for schedules; see `set_progress`
+        self._mode_is_set = False
+        self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
+
+    def train(self, mode: bool = True) -> GuideTransform:
+        """Set the mode: training, or evaluation."""
+        super().train(mode)
+        # TorchRL calls `eval` itself while it puts a transform into an env, and it is no part of the env until then.
+        whole = getattr(self.container, "transform", None)
+        self._mode_is_set = mode or (whole is not None and any(self is part for part in whole.modules()))
+        return self
+
+    @property
+    def learns(self) -> bool:
+        """Whether the env is used for training.
+
+        Raises:
+            RuntimeError: if neither `env.train()` nor `env.eval()` has been called since the transform is in the env.
+        """
+        if not self._mode_is_set:
+            raise RuntimeError(
+                f"{type(self).__name__} acts in training only: call env.train() or env.eval() first, on the env that "
+                "has the transform; for an env inside SerialEnv or ParallelEnv in the function that makes it"
+            )
+        return self.training
 
     def current(self, value: float | Schedule) -> float:
-        """Return the current value of a number or a schedule."""
+        """Return the current value of a number or a schedule.
+
+        Raises:
+            RuntimeError: in training, if nobody has set the progress of a schedule.
+        """
         if not callable(value):
             return value
-        return value(self.progress if self.training else 1.0)
+        if not self.learns:
+            return value(1.0)
+        if self.progress is None:
+            raise RuntimeError(
+                f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run: call "
+                "coil_rl.transforms.set_progress(env, FRACTION) before each batch; for SerialEnv or ParallelEnv put "
+                "the transform around it, not inside"
+            )
+        return value(self.progress)
 
     def advice(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice of the guide, [*batch, A]."""
@@ -60,11 +96,7 @@ class GuideTransform(Transform):
         return ActionSpace.of_parent(self, self.action_key)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Check that the env writes the advice.
-
-        Raises:
-            KeyError: without this row of advice.
-        """
+        """Check that the env writes the advice; raises a `KeyError` without this row of advice."""
         spec = observation_spec.get(self.advice_key, None)
         if spec is None or self.guide >= spec.shape[-2]:
             found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
@@ -80,6 +112,13 @@ class GuideTransform(Transform):
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return next_tensordict
+
+
+def set_progress(env: EnvBase, progress: float) -> None:
+    """Set the finished share of the run, in [0, 1], for the schedules of all transforms of an env in this process."""
+    for module in env.modules():
+        if isinstance(module, GuideTransform):
+            module.progress = progress
 
 
 class SeededGenerator(nn.Module):

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.data import Composite, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule
@@ -22,7 +24,7 @@ class RewardCoupling(GuideTransform):
     Args:
         beta: weight of the distance, a number or a schedule over the run.
         norm: norm of the distance. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
-        guide: row of the advice.
+        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
 
     Raises:
         ValueError: for an unknown norm.
@@ -30,7 +32,7 @@ class RewardCoupling(GuideTransform):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl import envs, guides, transforms
-        >>> env = TransformedEnv(envs.ConeTrackEnv(envs.shipped_tracks("train"), num_cars=8))
+        >>> env = TransformedEnv(envs.ConeTrackEnv(envs.shipped_tracks("train"), num_envs=8))
         >>> env = env.append_transform(transforms.GuideActions({"middle": guides.SplineGuide()}))
         >>> env = env.append_transform(transforms.RewardCoupling(beta=0.1)).train()
         >>> after = env.rollout(3)["next"]
@@ -40,30 +42,38 @@ class RewardCoupling(GuideTransform):
 
     mdp_parameter = "beta"
 
-    def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", guide: int = 0) -> None:
+    written = ("task_reward", "guide_distance")
+
+    def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", **options: Any) -> None:
         if norm not in NORMS:
             raise ValueError(f"norm={norm!r} must be one of {', '.join(NORMS)}")
-        super().__init__(["task_reward", "guide_distance"], guide=guide)
+        super().__init__(**options)
         self.beta, self.order = beta, NORMS[norm]
 
+    @cached_property
+    def reward_key(self) -> NestedKey:
+        """Entry of the env's reward, which may be nested."""
+        key: NestedKey = self.parent.reward_key
+        return key
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        reward = next_tensordict["reward"]
+        reward = next_tensordict[self.reward_key]
         difference = self.action_space.vectors(tensordict[self.action_key]) - self.advice(tensordict)
         distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True).to(reward.dtype)
         next_tensordict.set("task_reward", reward).set("guide_distance", distance)
-        if self.training:
-            next_tensordict.set("reward", reward - self.current(self.beta) * distance)
+        if self.learns:
+            next_tensordict.set(self.reward_key, reward - self.current(self.beta) * distance)
         return next_tensordict
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         for key in self.out_keys:
-            tensordict_reset.set(key, self.parent.full_reward_spec["reward"].zero())
+            tensordict_reset.set(key, self.parent.full_reward_spec[self.reward_key].zero())
         return tensordict_reset
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add `task_reward` and `guide_distance`."""
         observation_spec = super().transform_observation_spec(observation_spec)
-        reward = self.parent.full_reward_spec["reward"]
+        reward = self.parent.full_reward_spec[self.reward_key]
         for key in self.out_keys:
             observation_spec[key] = Unbounded(reward.shape, device=reward.device, dtype=reward.dtype)
         return observation_spec

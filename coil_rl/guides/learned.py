@@ -15,7 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.errors import UserError
 from coil_rl.train.build import build_bare_env, build_transforms
-from coil_rl.train.load import load_policy
+from coil_rl.train.load import load_policy, memory_keys
 from coil_rl.train.run_folder import read_config
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
@@ -32,7 +32,8 @@ class LearnedGuide(TensorDictModuleBase):
 
     Raises:
         UserError: if the folder holds no finished run, or one that is its own guide.
-        ValueError: if the run has no policy (method=guide).
+        ValueError: if the run has no policy (method=guide), one whose advice depends on earlier steps, or one with a
+            memory behind transforms.
     """
 
     def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
@@ -43,11 +44,20 @@ class LearnedGuide(TensorDictModuleBase):
             raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
         with _guarded(folder):
             # The transforms need the specs of an env; some need at least two rows.
-            env = TransformedEnv(build_bare_env(config, {"num_cars": 2}), Compose(*build_transforms(config)))
+            env = TransformedEnv(build_bare_env(config, {"num_envs": 2}), Compose(*build_transforms(config)))
             self.policy, self.transforms = load_policy(folder, config, env, which), None
-        self.in_keys, self.out_keys = list(self.policy.in_keys), ["action"]
+        memory = memory_keys(self.policy)
+        self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
         if config.method.needs_guide or config.action:
+            if memory:
+                raise ValueError(
+                    f"{folder} has a policy with a memory behind transforms, which is no guide; train one with "
+                    "network=mlp, or with method=ppo action=continuous"
+                )
             self.transforms = env.transform
+            past = [type(part).__name__ for part in env.transform.modules() if getattr(part, "needs_past", False)]
+            if past:
+                raise ValueError(f"{folder} has {', '.join(past)}, which needs earlier steps; its policy is no guide")
             self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
         # Transforms hold a weak reference to their env; the tuple keeps it from becoming a submodule.
         self._env = (env,)
@@ -55,7 +65,7 @@ class LearnedGuide(TensorDictModuleBase):
         self.eval()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` as executed by the env."""
+        """Write `action` as executed by the env, and what the policy remembers."""
         data = tensordict.select(*self.in_keys)
         if self.transforms is not None:
             data = self.transforms(data)
@@ -63,7 +73,9 @@ class LearnedGuide(TensorDictModuleBase):
             data = self.policy(data)
         if self.transforms is not None:
             data = self.transforms.inv(data)
-        return tensordict.set("action", data["action"])
+        for key in self.out_keys:
+            tensordict.set(key, data[key])
+        return tensordict
 
 
 @contextmanager

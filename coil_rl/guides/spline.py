@@ -25,23 +25,14 @@ FAR = 1e3  # m
 
 
 class PathPlan(NamedTuple):
-    """Path through the visible cones, positions in m in the frame of the car.
+    """Path through the visible cones, positions in m in the frame of the car."""
 
-    Attributes:
-        midpoints: midpoints of left-right pairs, nearest first, [2, M, B].
-        midpoint_count: number of valid midpoints, [B].
-        path: spline through the midpoints.
-        targets: points along the path, [2, T, B]; a shorter path repeats its last point.
-        squared_distance: squared distance of the targets, [T, B] m^2.
-        excluded: 1 for targets that are reached or outside the field of view, else 0, [T, B].
-    """
-
-    midpoints: Tensor
-    midpoint_count: Tensor
-    path: Spline
-    targets: Tensor
-    squared_distance: Tensor
-    excluded: Tensor
+    midpoints: Tensor  # midpoints of left-right pairs, nearest first, [2, M, B]
+    midpoint_count: Tensor  # number of valid midpoints, [B]
+    path: Spline  # through the midpoints
+    targets: Tensor  # points along the path, [2, T, B]; a shorter path repeats its last point
+    squared_distance: Tensor  # of the targets, [T, B] m^2
+    excluded: Tensor  # 1 for targets that are reached or outside the field of view, else 0, [T, B]
 
     def nearest_target(self) -> Tensor:
         """Return the nearest target that is not excluded, [2, B]; any target if all are."""
@@ -70,7 +61,7 @@ class SplineGuide(TensorDictModuleBase):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = ConeTrackEnv(shipped_tracks("test"), num_cars=4)
+        >>> env = ConeTrackEnv(shipped_tracks("test"), num_envs=4)
         >>> env.rollout(5, SplineGuide(), break_when_any_done=False)["action"].shape
         torch.Size([4, 5, 1])
     """

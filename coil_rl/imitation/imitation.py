@@ -22,7 +22,8 @@ from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.imitation.regressors import Regressor
 from coil_rl.imitation.validation import cross_validate, scores
-from coil_rl.learners.networks import ConcatObservations, FastTensorDictModule
+from coil_rl.learners.encoders import ConcatObservations
+from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.train import checkpoint
 from coil_rl.transforms.action_space import ActionSpace
 
@@ -61,7 +62,7 @@ class Imitation:
         >>> from coil_rl.imitation import SklearnRegressor
         >>> from coil_rl.train.rollout import Rollout
         >>> from coil_rl.transforms import GuideActions
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=7, assignment="cyclic")
+        >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))
         >>> learner = Imitation(env, regressor=SklearnRegressor(LinearRegression()))
         >>> metrics = learner.update(Rollout(env, learner.policy, steps=20, keys=learner.keys).collect())

@@ -19,7 +19,7 @@ from torchrl.modules import MLP
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
 from coil_rl.imitation import archive
-from coil_rl.learners.networks import check_hidden, mlp
+from coil_rl.learners.encoders import Mlp
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -73,7 +73,7 @@ class NetworkRegressor(Regressor):
     ) -> None:
         super().__init__()
         self.learning_rate = schedule(learning_rate)
-        check_hidden(hidden)
+        Mlp(hidden)  # checks the widths
         check_range(1, epochs=epochs, minibatch=minibatch)
         check_range(0, above=True, learning_rate=self.learning_rate(0))
         check_range(0, LARGEST_SEED, seed=seed)
@@ -86,7 +86,7 @@ class NetworkRegressor(Regressor):
         )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
-            fresh.layers = mlp(inputs, outputs, self.hidden, gain=1.0)
+            fresh.layers = Mlp(self.hidden).layers(inputs, outputs, gain=1.0)
         buffers = {"x_mean": torch.zeros(inputs), "x_scale": torch.ones(inputs)}
         for name, value in (buffers | {"y_mean": torch.zeros(outputs), "y_scale": torch.zeros(outputs)}).items():
             fresh.register_buffer(name, value)

@@ -3,6 +3,7 @@
 from coil_rl.learners.a2c import A2C
 from coil_rl.learners.dqn import DQN
 from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule
+from coil_rl.learners.encoders import Cnn, Gru, Mlp
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.ppo import PPO
@@ -18,8 +19,11 @@ __all__ = [
     "TRPO",
     "AfterFrames",
     "AtConvergence",
+    "Cnn",
     "DynamicCoil",
+    "Gru",
     "KickstartLoss",
+    "Mlp",
     "NoiseDecay",
     "PhaseSchedule",
     "Reinforce",

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from torchrl.objectives import A2CLoss
 
@@ -34,7 +35,7 @@ class A2C(PPO):
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         learning_rate: float | Schedule = Linear(3e-4, 0.0),
         standardise: bool = True,
@@ -44,7 +45,7 @@ class A2C(PPO):
         super().__init__(env, in_keys, learning_rate=learning_rate, epochs=1, clip=1.0, compile=False, **options)
         self.standardise = standardise
         self.loss = A2CLoss(
-            self.policy,
+            self.head,
             self.critic,
             entropy_bonus=self.entropy(0) > 0,
             entropy_coeff=self.entropy(0),

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictSequential
-from torch import nn
+from tensordict.utils import NestedKey
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueModule
@@ -21,6 +21,7 @@ from torchrl.objectives import DQNLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp, ObservationNetwork, entry_keys, without_memory
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule, schedule
 
@@ -33,7 +34,8 @@ class DQN(OffPolicy):
     Args:
         env: the env, with discrete actions.
         in_keys: entries that the network observes.
-        hidden: widths of the hidden layers.
+        hidden: widths of the hidden layers, without `network`.
+        network: architecture of the network; None: `Mlp(hidden, "relu")`.
         action_gain: initial scale of the last weights; with 0 all action values are 0.
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic actions.
         double: whether the network, not the target network, selects the next action.
@@ -49,7 +51,7 @@ class DQN(OffPolicy):
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.train.rollout import Rollout
         >>> from coil_rl.transforms import DiscreteActions
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_cars=64), DiscreteActions(5))
+        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_envs=64), DiscreteActions(5))
         >>> dqn = DQN(env, starts=256)
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
@@ -59,9 +61,10 @@ class DQN(OffPolicy):
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         hidden: Sequence[int] = (128, 128),
+        network: Mlp | None = None,
         action_gain: float = 1.0,
         epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
@@ -74,18 +77,23 @@ class DQN(OffPolicy):
         for progress in (0, 1):
             check_range(0, 1, epsilon=self.epsilon(progress))
         spec = env.action_spec
-        if not isinstance(spec, (Categorical, OneHot)):
+        if spec.dtype.is_floating_point:
             raise ValueError(
                 "DQN needs discrete actions, but this env has continuous ones; "
                 "put the transform DiscreteActions around it: action=choices"
             )
+        if not isinstance(spec, (Categorical, OneHot)) or len(networks.action_shape(env)) != isinstance(spec, OneHot):
+            raise ValueError("DQN needs one discrete action, but this env has several at once; use PPO")
+        in_keys, network = entry_keys(in_keys), without_memory(network or Mlp(hidden, "relu"), "DQN")
         super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
-        network = networks.ObservationNetwork(env, in_keys, hidden, spec.space.n, action_gain, activation=nn.ReLU)
-        values = networks.FastTensorDictModule(network, in_keys, ["action_value"])
+        numbers = ObservationNetwork(env, in_keys, network, spec.space.n, action_gain, dtype=env.reward_spec.dtype)
+        keys = in_keys if self.normaliser is None else self.normaliser.reads(in_keys)
+        values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
         self.network = TensorDictSequential(values, QValueModule(spec=single))
         self.explorer = EGreedyModule(single, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
-        self.policy = TensorDictSequential(*self.network.module, self.explorer)
+        before = [] if self.normaliser is None else [self.normaliser]
+        self.policy = TensorDictSequential(*before, *self.network.module, self.explorer)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless rewards are tiny.
         self.set_loss(
             DQNLoss(self.network, action_space=single, double_dqn=double, delay_value=True, loss_function="l2")

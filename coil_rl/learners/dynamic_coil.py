@@ -14,12 +14,14 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import LARGEST_SEED, check_choice, check_range
 from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides
@@ -180,11 +182,12 @@ class DynamicCoil(PPO):
     """
 
     kind = "guides"
+    with_memory = False
 
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         guides: Mapping[str, TensorDictModuleBase],
         phases: Callable[[int], PhaseSchedule] = PhaseSchedule,
@@ -210,15 +213,16 @@ class DynamicCoil(PPO):
         super().__init__(env, in_keys, **ppo)
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return the guides followed by the agent, and the critic."""
         shape = torch.Size([len(self.guides), *env.action_spec.shape[len(env.batch_size) :]])
         agent_keys = [*in_keys, *self.advice.out_keys]
-        agent = networks.actor(env, agent_keys, hidden, shapes={"guide_action": shape}, **options)
+        shapes = {"guide_action": shape}
+        agent = networks.actor(env, agent_keys, network, shapes=shapes, normaliser=self.normaliser, **options)
         self.agent_parameters = list(agent.parameters())
         policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
-        return policy, networks.critic(env, in_keys, hidden)
+        return policy, networks.critic(env, in_keys, network, self.normaliser)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters of the agent, of the critic, and of each guide."""

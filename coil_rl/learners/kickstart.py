@@ -12,6 +12,7 @@ from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
 
 from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.learners.networks import Choices
 from coil_rl.schedules import Linear, Schedule, schedule
 
 EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fraction of half the range
@@ -57,6 +58,9 @@ class KickstartLoss:
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(distribution, Categorical):
             return -(advice * distribution.logits).sum(-1).mean()
+        if isinstance(distribution, Choices):  # the advice is one-hot for each choice, one beside the other
+            logits = distribution.base_dist.logits
+            return -(advice * logits[:, logits[0].isfinite()]).sum(-1).mean()
         bounded = isinstance(distribution, TanhNormal)
         if bounded:
             low, high = distribution.low, distribution.high
@@ -67,4 +71,4 @@ class KickstartLoss:
             return -distribution.log_prob(advice).mean()
         # The divergence between squashed distributions is that of the normal distributions before squashing.
         mean, base = (unit.atanh(), distribution) if bounded else (advice, distribution.base_dist)
-        return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).sum(-1).mean()
+        return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1).mean()

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import NormalParamExtractor, ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import (
+    NormalParamExtractor,
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
-from torchrl.data import Bounded, Categorical, OneHot
+from torch.distributions import Independent
+from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.modules import (
-    MLP,
+    GRUModule,
     IndependentNormal,
     OneHotCategorical,
     ProbabilisticActor,
@@ -23,133 +29,96 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from coil_rl.envs.limits import check_range
+from coil_rl.learners.encoders import IS_INIT, STATE, Gru, Mlp, ObservationNetwork, Shapes
+from coil_rl.learners.normaliser import Normaliser
 
-UNCLIPPED = "unclipped_action"
-
-
-class ConcatObservations(nn.Module):
-    """Concatenation of entries of an env, each flattened beyond the batch dimensions.
-
-    Args:
-        env: the env.
-        in_keys: the entries.
-        shapes: shapes of entries that the env does not write, without the batch dimensions.
-
-    Attributes:
-        width: D, length of the concatenated vector.
-
-    Raises:
-        KeyError: if the env has no such entry.
-    """
-
-    def __init__(self, env: EnvBase, in_keys: Sequence[str], shapes: Mapping[str, torch.Size] | None = None) -> None:
-        super().__init__()
-        spec, batch_dims, extra = env.observation_spec, len(env.batch_size), shapes or {}
-        available = [*(key for key in spec.keys(True, True) if isinstance(key, str)), *extra]
-        missing = [key for key in in_keys if key not in available]
-        if missing:
-            raise KeyError(f"the env has no entry {', '.join(missing)} to observe; it has {', '.join(available)}")
-        event_shapes = [extra[key] if key in extra else spec[key].shape[batch_dims:] for key in in_keys]
-        self.event_dims = [len(shape) for shape in event_shapes]
-        self.width = sum(shape.numel() for shape in event_shapes)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Concatenate inputs [*batch, ...] to [*batch, D]."""
-        flat = [
-            x.unsqueeze(-1) if dims == 0 else x.flatten(-dims) for x, dims in zip(inputs, self.event_dims, strict=True)
-        ]
-        return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
-
-
-def check_hidden(hidden: Sequence[int]) -> None:
-    """Raise a `ValueError` for hidden layers that are empty, or too large for the memory of a typical machine."""
-    check_range(0, 16, hidden_layers=len(hidden))
-    for width in hidden:
-        check_range(1, 4096, hidden=width)
-
-
-def mlp(
-    inputs: int,
-    outputs: int,
-    hidden: Sequence[int],
-    gain: float,
-    device: torch.device | None = None,
-    activation: type[nn.Module] = nn.Tanh,
-) -> MLP:
-    """Return a tanh network with orthogonal weights and zero biases, or a ReLU network with PyTorch's initial weights.
-
-    `gain` scales the weights of the last layer.
-    """
-    check_hidden(hidden)
-    layers = MLP(inputs, outputs, num_cells=list(hidden), activation_class=activation, device=device)
-    if activation is nn.Tanh:
-        linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
-        for layer in linear:
-            nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
-            nn.init.zeros_(layer.bias)
-    else:
-        with torch.no_grad():
-            for parameter in layers[-1].parameters():
-                parameter.mul_(gain)
-    return layers
-
-
-class ObservationNetwork(nn.Module):
-    """An `mlp` that reads concatenated entries of an env; arguments as for `ConcatObservations` and `mlp`."""
-
-    def __init__(
-        self,
-        env: EnvBase,
-        in_keys: Sequence[str],
-        hidden: Sequence[int],
-        outputs: int,
-        gain: float,
-        shapes: Mapping[str, torch.Size] | None = None,
-        activation: type[nn.Module] = nn.Tanh,
-    ) -> None:
-        super().__init__()
-        self.concat = ConcatObservations(env, in_keys, shapes)
-        self.layers = mlp(self.concat.width, outputs, hidden, gain, env.device, activation)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Map inputs [*batch, ...] to [*batch, outputs]."""
-        out: Tensor = self.layers(self.concat(*inputs))
-        return out
+UNCLIPPED, REMEMBERED = "unclipped_action", "remembered"
+DEFAULT = Mlp()
 
 
 class GlobalScaleHead(nn.Module):
-    """Normal distribution with a mean from a network and a standard deviation that is the same in every state."""
+    """Normal distribution with a mean from a network and a standard deviation that is the same in every state.
 
-    def __init__(self, network: ObservationNetwork, size: int, scale: float) -> None:
+    Args:
+        network: its outputs are the numbers of an action.
+        event: shape of an action.
+        scale: initial standard deviation.
+    """
+
+    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
         super().__init__()
-        self.network = network
-        self.log_scale = nn.Parameter(torch.full((size,), math.log(scale), device=network.layers[-1].weight.device))
+        self.network, self.event = network, event
+        self.log_scale = nn.Parameter(torch.full(event, math.log(scale), device=network.layers[-1].weight.device))
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation, [*batch, A] each."""
-        loc = self.network(*inputs)
-        return loc, self.log_scale.exp().expand_as(loc)
+        """Return mean and standard deviation, [*batch, *event] each."""
+        loc = shaped(self.network(*inputs), self.event)
+        return loc, self.log_scale.exp().to(loc.dtype).expand_as(loc)
 
 
 class GaussianHead(nn.Module):
     """Normal distribution with mean and standard deviation from a network; an output of 0 gives `scale`."""
 
-    def __init__(self, network: ObservationNetwork, scale: float) -> None:
+    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
         super().__init__()
-        self.network = network
+        self.network, self.event = network, event
         self.split = NormalParamExtractor(f"biased_softplus_{scale}", scale_lb=1e-3)
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation, [*batch, A] each."""
+        """Return mean and standard deviation, [*batch, *event] each."""
         loc, scale = self.split(self.network(*inputs))
-        return loc, scale
+        return shaped(loc, self.event), shaped(scale, self.event)
+
+
+class ChoicesHead(nn.Module):
+    """Logits of several choices at once from a network, padded with minus infinity to the longest choice.
+
+    Args:
+        network: its outputs are the logits of all choices, each of as many as the longest one has.
+        event: shape of an action, one index for each choice.
+        options: number of options of each choice, of this shape.
+    """
+
+    valid: Tensor
+
+    def __init__(self, network: ObservationNetwork, event: torch.Size, options: Tensor) -> None:
+        super().__init__()
+        self.network, self.event = network, event
+        longest = torch.arange(int(options.max()), device=options.device)
+        self.register_buffer("valid", longest < options.unsqueeze(-1), persistent=False)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Return the logits, [*batch, *event, n]."""
+        return shaped(self.network(*inputs), self.valid.shape).masked_fill(~self.valid, -torch.inf)
+
+
+class Choices(Independent):
+    """Distribution of several independent choices: that of each given by logits [*batch, *event, n].
+
+    Args:
+        logits: of the options.
+        event_dims: number of dimensions of an action, one index for each choice.
+    """
+
+    def __init__(self, logits: Tensor, event_dims: int) -> None:
+        super().__init__(CategoricalDistribution(logits=logits), event_dims)
+
+    @property
+    def deterministic_sample(self) -> Tensor:
+        """The most probable choices."""
+        mode: Tensor = self.base_dist.mode
+        return mode
+
+
+def shaped(vectors: Tensor, event: torch.Size) -> Tensor:
+    """Return vectors [*batch, n] as [*batch, *event]."""
+    return vectors.reshape(*vectors.shape[:-1], *event)
 
 
 class FastTensorDictModule(TensorDictModuleBase):
     """A `TensorDictModule` with less overhead per call: no dispatch, no search for optional packages."""
 
-    def __init__(self, module: nn.Module, in_keys: Sequence[str], out_keys: Sequence[str]) -> None:
+    def __init__(self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]) -> None:
         self.in_keys, self.out_keys = list(in_keys), list(out_keys)
         super().__init__()
         self.module = module
@@ -165,78 +134,181 @@ class FastTensorDictModule(TensorDictModuleBase):
 class ClippedNormal(SafeProbabilisticModule):
     """Sample of a normal distribution, clipped to the bounds of an action.
 
-    It writes `unclipped_action`, the sample, with `action_log_prob`, and `action`, which the env executes.
+    It writes `unclipped_action`, the sample, with `action_log_prob`, and the action, which the env executes.
     """
 
-    def __init__(self, low: Tensor, high: Tensor) -> None:
+    def __init__(self, low: Tensor, high: Tensor, action_key: NestedKey = "action") -> None:
         super().__init__(
-            ["loc", "scale"], [UNCLIPPED], distribution_class=IndependentNormal, return_log_prob=True,
-            log_prob_key="action_log_prob",
+            ["loc", "scale"], [UNCLIPPED], distribution_class=IndependentNormal,
+            distribution_kwargs={"event_dim": low.ndim}, return_log_prob=True, log_prob_key="action_log_prob",
         )  # fmt: skip
-        self.low, self.high = low, high
+        self.low, self.high, self.action_key = low, high, action_key
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Keys of the entries that `forward` writes."""
-        return [*super().out_keys, "action"]
+        return [*super().out_keys, self.action_key]
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
         """Write the sample and the action."""
         tensordict = super().forward(tensordict, *args, **options)
-        return tensordict.set("action", tensordict[UNCLIPPED].clamp(self.low, self.high))
+        return tensordict.set(self.action_key, tensordict[UNCLIPPED].clamp(self.low, self.high))
+
+
+def action_spec(env: EnvBase) -> TensorSpec:
+    """Return the spec of the action of an env.
+
+    Raises:
+        ValueError: if the env has several entries for actions, or none that a policy can choose.
+    """
+    if len(env.action_keys) != 1:
+        names = ", ".join(map(str, env.action_keys))
+        raise ValueError(f"this env has the actions {names}, but a policy chooses one; take another env")
+    spec = env.full_action_spec[env.action_key]
+    numbers = isinstance(spec, (Bounded, Unbounded)) and spec.dtype.is_floating_point
+    options = isinstance(spec, (Categorical, MultiCategorical, OneHot)) and not isinstance(spec, MultiOneHot)
+    if not (numbers or options):
+        raise ValueError(
+            f"the action of this env is {type(spec).__name__} of {spec.dtype}, but a policy chooses numbers (Bounded, "
+            "Unbounded), one of several options (Categorical, OneHot) or several such (MultiCategorical); transform it"
+        )
+    return spec
 
 
 def actor(
     env: EnvBase,
-    in_keys: Sequence[str],
-    hidden: Sequence[int] = (64, 64),
+    in_keys: Sequence[NestedKey],
+    network: Mlp = DEFAULT,
     scale: float = 0.5,
     gain: float = 0.01,
     *,
-    shapes: Mapping[str, torch.Size] | None = None,
+    shapes: Shapes | None = None,
     state_dependent_scale: bool = False,
     squash: bool = True,
+    normaliser: Normaliser | None = None,
 ) -> ProbabilisticTensorDictSequential:
     """Return a stochastic policy for the actions of an env.
 
-    Its distribution is a tanh-squashed normal for bounded actions (without `squash` a normal whose samples are clipped,
-    see `ClippedNormal`), a normal for unbounded ones and a categorical for discrete ones. Its deterministic action is
-    the mode. It writes `action` and `action_log_prob`.
+    Its distribution is a tanh-squashed normal for bounded actions (without `squash`, or if a bound is infinite, a
+    normal whose samples are clipped, see `ClippedNormal`), a normal for unbounded ones, a categorical for
+    discrete ones, and several of these for several choices. Its deterministic action is the mode. It writes the action,
+    and its logarithmic probability as `action_log_prob`.
 
     The initial standard deviation before squashing is `scale`; with `state_dependent_scale` it is an output of the
     network, for continuous actions only. `gain` scales the initial weights of the last layer. `shapes` are as for
-    `ConcatObservations`.
+    `ConcatObservations`. A network with a memory also writes its next state, see `Gru`.
+
+    Raises:
+        ValueError: for an action of another kind, or a network with a memory that the env does not carry.
+        KeyError: if the env has no such entry.
     """
-    spec = env.action_spec
-    common = dict(spec=spec, return_log_prob=True, log_prob_key="action_log_prob")
-    if isinstance(spec, (Categorical, OneHot)):
-        logits = ObservationNetwork(env, in_keys, hidden, spec.space.n, gain, shapes)
-        module = FastTensorDictModule(logits, in_keys, ["logits"])
+    spec, key, event = action_spec(env), env.action_key, action_shape(env)
+    keys = in_keys if normaliser is None else normaliser.reads(in_keys)
+    before: list[TensorDictModuleBase] = [] if normaliser is None else [normaliser]
+    if isinstance(network, Gru):
+        before += memory(env, in_keys, keys, network, shapes)
+        in_keys = keys = [REMEMBERED]
+        shapes, network = {REMEMBERED: torch.Size([network.state])}, network.after
+
+    def network_of(outputs: int) -> ObservationNetwork:
+        dtype = spec.dtype if spec.dtype.is_floating_point else None
+        return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
+
+    def policy(head: nn.Module, parameters: list[str], distribution: type, **options: Any) -> Any:
+        actions = ProbabilisticActor(
+            FastTensorDictModule(head, keys, parameters), parameters, [key], spec=spec, distribution_class=distribution,
+            distribution_kwargs=options, return_log_prob=True, log_prob_key="action_log_prob",
+        )  # fmt: skip
+        return ProbabilisticTensorDictSequential(*before, *actions.module) if before else actions
+
+    if isinstance(spec, OneHot) or (isinstance(spec, Categorical) and not event):
         distribution = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
-        return ProbabilisticActor(module, ["logits"], distribution_class=distribution, **common)
-    size = spec.shape[-1]
-    network = ObservationNetwork(env, in_keys, hidden, 2 * size if state_dependent_scale else size, gain, shapes)
-    head = GaussianHead(network, scale) if state_dependent_scale else GlobalScaleHead(network, size, scale)
-    module = FastTensorDictModule(head, in_keys, ["loc", "scale"])
+        return policy(network_of(spec.space.n), ["logits"], distribution)
+    if not spec.dtype.is_floating_point:
+        options = option_counts(spec, event)
+        choices = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
+        return policy(choices, ["logits"], Choices, event_dims=len(event))
+    size = event.numel()
+    gaussian = GaussianHead if state_dependent_scale else GlobalScaleHead
+    head = gaussian(network_of(2 * size if state_dependent_scale else size), event, scale)
     if not isinstance(spec, Bounded):
-        return ProbabilisticActor(module, ["loc", "scale"], distribution_class=IndependentNormal, **common)
-    event = tuple(0 for _ in spec.shape[:-1])
-    low, high = spec.space.low[event], spec.space.high[event]
-    if not squash:
-        return ProbabilisticTensorDictSequential(module, ClippedNormal(low, high))
-    bounds = {"low": low, "high": high, "tanh_loc": False}
-    return ProbabilisticActor(
-        module, ["loc", "scale"], distribution_class=TanhNormal, distribution_kwargs=bounds, **common
+        return policy(head, ["loc", "scale"], IndependentNormal, event_dim=len(event))
+    first = (0,) * len(env.batch_size)
+    low, high = spec.space.low[first], spec.space.high[first]
+    if squash and (high - low).isfinite().all():
+        return policy(head, ["loc", "scale"], TanhNormal, low=low, high=high, event_dims=len(event), tanh_loc=False)
+    module = FastTensorDictModule(head, keys, ["loc", "scale"])
+    return ProbabilisticTensorDictSequential(*before, module, ClippedNormal(low, high, key))
+
+
+def memory(
+    env: EnvBase, in_keys: Sequence[NestedKey], read: Sequence[NestedKey], network: Gru, shapes: Shapes | None
+) -> list[TensorDictModuleBase]:
+    """Return the modules of a policy that concatenate entries, read as `read`, and remember them: `remembered` [*B, H].
+
+    Raises:
+        ValueError: if the env does not carry the state.
+    """
+    carried = {key: spec.shape[len(env.batch_size) :] for key, spec in env.observation_spec.items(True, True)}
+    if IS_INIT not in carried or carried.get(STATE) != (1, network.state):
+        raise ValueError(
+            "the env does not carry the memory of the network; put the network's env_transforms() around the env"
+        )
+    entries = network.observations(env, in_keys, shapes)
+    gru = GRUModule(
+        entries.width, network.state, device=env.device,
+        in_keys=["concatenated", STATE, IS_INIT], out_keys=[REMEMBERED, ("next", STATE)],
+    )  # fmt: skip
+    return [FastTensorDictModule(entries, read, ["concatenated"]), gru]
+
+
+def split_memory(
+    policy: ProbabilisticTensorDictSequential,
+) -> tuple[TensorDictSequential | None, ProbabilisticTensorDictSequential]:
+    """Return the part of a policy that writes `remembered`, None without a memory, and the part after it."""
+    modules = list(policy.module)
+    for count, module in enumerate(modules, start=1):
+        if isinstance(module, GRUModule):
+            return TensorDictSequential(*modules[:count]), ProbabilisticTensorDictSequential(*modules[count:])
+    return None, policy
+
+
+def action_shape(env: EnvBase) -> torch.Size:
+    """Return the shape of an action of an env without the batch dimensions."""
+    shape: torch.Size = env.full_action_spec[env.action_key].shape[len(env.batch_size) :]
+    return shape
+
+
+def option_counts(spec: Categorical | MultiCategorical, event: torch.Size) -> Tensor:
+    """Return the number of options of each choice of an action, [*event]."""
+    if isinstance(spec, MultiCategorical):
+        counts: Tensor = spec.nvec.reshape(-1, event[-1])[0].expand(event)
+        return counts.to(spec.device)
+    return torch.full(event, spec.space.n, device=spec.device)
+
+
+def critic(
+    env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp = DEFAULT, normaliser: Normaliser | None = None
+) -> TensorDictModuleBase:
+    """Return a state-value network; it writes `state_value` [*batch, 1]. Of a memory it reads the stored state."""
+    if isinstance(network, Gru):
+        in_keys, network = [*in_keys, STATE], network.after
+    values = ObservationNetwork(env, in_keys, network, 1, gain=1.0, dtype=env.full_reward_spec[env.reward_key].dtype)
+    if normaliser is None:
+        return FastTensorDictModule(values, in_keys, ["state_value"])
+    return TensorDictSequential(normaliser, FastTensorDictModule(values, normaliser.reads(in_keys), ["state_value"]))
+
+
+def action_critic(
+    env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp = DEFAULT, normaliser: Normaliser | None = None
+) -> FastTensorDictModule:
+    """Return an action-value network for continuous actions; it writes `state_action_value` [*batch, 1].
+
+    It reads entries that have been normalised already.
+    """
+    keys: list[NestedKey] = [*in_keys, "action"]
+    values = ObservationNetwork(
+        env, keys, network, 1, 1.0, {"action": action_shape(env)}, env.full_reward_spec[env.reward_key].dtype
     )
-
-
-def critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> FastTensorDictModule:
-    """Return a state-value network; it writes `state_value` [*batch, 1]."""
-    return FastTensorDictModule(ObservationNetwork(env, in_keys, hidden, 1, gain=1.0), in_keys, ["state_value"])
-
-
-def action_critic(env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int] = (64, 64)) -> FastTensorDictModule:
-    """Return an action-value network for continuous actions; it writes `state_action_value` [*batch, 1]."""
-    keys, shapes = [*in_keys, "action"], {"action": env.action_spec.shape[-1:]}
-    network = ObservationNetwork(env, keys, hidden, 1, 1.0, shapes)
-    return FastTensorDictModule(network, keys, ["state_action_value"])
+    read = keys if normaliser is None else normaliser.reads(keys)
+    return FastTensorDictModule(values, read, ["state_action_value"])

@@ -12,18 +12,23 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torch.nn import functional as F
 from torchrl.envs import EnvBase
+from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import ClipPPOLoss, LossModule
 from torchrl.objectives.value import GAE
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
 from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp, entry_keys, without_memory
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
+from coil_rl.learners.normaliser import normaliser
 from coil_rl.schedules import Linear, Schedule, schedule
 
 
@@ -34,10 +39,15 @@ class PPO:
     the policy learns from the agent's steps only, and the critic from all. Subclasses override `loss`, `losses`,
     `build_networks`, `parameter_groups` and `set_learning_rates`.
 
+    A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
+    anew from the state that was stored in the first step of each row; then their steps are a minibatch as any other.
+
     Args:
         env: the env, for its specs.
         in_keys: entries that policy and critic observe.
-        hidden: widths of the hidden layers of both networks.
+        hidden: widths of the hidden layers of both networks, without `network`.
+        network: architecture of both networks; None: `Mlp(hidden)`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0 everywhere.
         squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds are clipped.
@@ -58,30 +68,35 @@ class PPO:
     Attributes:
         kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions)
             or "guides" (guides besides an agent).
+        with_memory: whether the learner can train a network with a memory.
         policy: writes `action` and `action_log_prob`.
+        head: the part of the policy after its memory; all of it without one.
         critic: writes `state_value`.
         keys: entries that a batch must have.
 
     Raises:
-        ValueError: for a value out of range.
+        ValueError: for a value out of range, or an action that no policy can choose.
         KeyError: if the env has no such entry.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.train.rollout import Rollout
-        >>> env = ConeTrackEnv(shipped_tracks("train"), num_cars=64)
+        >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=64)
         >>> ppo = PPO(env)
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
     kind: ClassVar[str] = "agent"
+    with_memory: ClassVar[bool] = True
 
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
+        normalise: bool | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
@@ -107,14 +122,20 @@ class PPO:
         check_range(0, LARGEST_SEED, seed=seed)
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
         self.critic_coefficient, self.auxiliary, self.noise = critic, list(auxiliary), noise
+        in_keys = entry_keys(in_keys)
+        network = network or Mlp(hidden)
+        if not self.with_memory:
+            without_memory(network, type(self).__name__)
+        self.normaliser = normaliser(env, in_keys, normalise)
         self.policy, self.critic = self.build_networks(
-            env, in_keys, hidden, scale=action_scale, gain=action_gain, squash=squash
+            env, in_keys, network, scale=action_scale, gain=action_gain, squash=squash
         )
+        self.memory, self.head = networks.split_memory(self.policy)
         if noise:
             noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss: LossModule = ClipPPOLoss(
-            self.policy,
+        self.loss: LossModule = ClippedLoss(
+            self.head,
             self.critic,
             clip_epsilon=clip,
             entropy_bonus=self.entropy(0) > 0,
@@ -131,19 +152,23 @@ class PPO:
         self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=1e-5, fused=True)
         self.generator = torch.Generator().manual_seed(seed)
         self.guide_may_act = "agent_acts" in env.observation_spec
-        self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else "action"
+        self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
+        self.reward_key = unravel_key(("next", env.reward_key))
         read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), self.sample_key, "action_log_prob"]
         read += [key for auxiliary_loss in self.auxiliary for key in auxiliary_loss.keys]
         read += ["agent_acts"] if self.guide_may_act else []
-        self.keys = [*read, *(("next", key) for key in (*in_keys, "reward", "done", "terminated"))]
+        valued = dict.fromkeys([*in_keys, *self.critic.in_keys])
+        after = [unravel_key(("next", key)) for key in (*valued, "done", "terminated")]
+        self.keys: list[NestedKey] = [*read, *after, self.reward_key]
         self.keys += [noise.key] if noise else []
         self.minibatch_keys = [*read, "advantage", "value_target"]
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return policy and critic; `options` are those of `networks.actor`."""
-        return networks.actor(env, in_keys, hidden, **options), networks.critic(env, in_keys, hidden)
+        policy = networks.actor(env, in_keys, network, normaliser=self.normaliser, **options)
+        return policy, networks.critic(env, in_keys, network, self.normaliser)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
@@ -173,36 +198,61 @@ class PPO:
             if "loss_entropy" in losses:
                 total = total + losses["loss_entropy"]
             for auxiliary in self.auxiliary:
-                losses[f"loss_{auxiliary.name}"] = auxiliary(self.policy, minibatch)
+                losses[f"loss_{auxiliary.name}"] = auxiliary(self.head, minibatch)
                 total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
             self.step(total)
             reports.append(losses.detach())
         names = list(reports[0].keys())
         means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
-        return means | {"learning_rate": self.learning_rate(progress)} | self.limit_noise(batch, progress)
+        return means | {"learning_rate": self.learning_rate(progress)} | self.finish(batch, progress)
 
-    def limit_noise(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Apply the noise schedule, if there is one; returns the metric `noise`, the policy's standard deviation."""
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Do what follows an update: learn the statistics of the observations, and apply the noise schedule, if any.
+
+        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
+
+        Returns:
+            With a schedule the metric `noise`, the policy's standard deviation.
+        """
+        if self.normaliser is not None:
+            self.normaliser.learn(batch)
         return {"noise": self.noise.apply(batch, progress)} if self.noise else {}
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
-        """Apply the schedules and compute advantages; returns the rows to learn from, [B * T]."""
+        """Apply the schedules and compute advantages; returns the rows to learn from, [B * T], with a memory [B, T]."""
         self.set_learning_rates(progress)
         if getattr(self.loss, "entropy_bonus", False):
             self.loss.entropy_coeff.fill_(self.entropy(progress))
+        if self.reward_key != ("next", "reward"):  # several agents: their rewards are summed
+            reward = batch[self.reward_key]
+            batch["next", "reward"] = reward.sum(tuple(range(batch.ndim, reward.ndim)))[..., None]
         self.advantage(batch)
-        rows = batch.select(*self.minibatch_keys).reshape(-1)
+        rows = batch.select(*self.minibatch_keys)
+        rows = rows.reshape(-1) if self.memory is None else rows.reshape(-1, batch.shape[-1])
         # Some losses of TorchRL read the sample of the policy, others `action`.
         return rows.set("action", rows[self.sample_key])
 
     def draw_minibatches(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
         """Yield the minibatches of all passes over the rows, each pass in a random order."""
         size = len(rows) // self.minibatches
-        if size < 2:  # one advantage cannot be standardised
-            raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {len(rows)} frames to each")
+        if self.memory is not None and size < 1:
+            raise UserError(
+                f"minibatches={self.minibatches} are more than the {len(rows)} envs, but with a memory each needs all "
+                "steps of an env; take fewer minibatches or more envs"
+            )
+        if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
+            raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {rows.numel()} frames to each")
         for _ in range(self.epochs):
             order = torch.randperm(len(rows), generator=self.generator)[: size * self.minibatches]
-            yield from rows[order.to(rows.device)].split(size)
+            yield from map(self.remember, rows[order.to(rows.device)].split(size))
+
+    def remember(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the steps of whole rows [N, T] with `remembered`, [N * T]; without a memory, the minibatch."""
+        if self.memory is None:
+            return minibatch
+        with set_recurrent_mode(True):
+            remembered = self.memory(minibatch.select(*self.memory.in_keys))[networks.REMEMBERED]
+        return minibatch.copy().set(networks.REMEMBERED, remembered).reshape(-1)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
@@ -232,7 +282,8 @@ class PPO:
 
     def step(self, loss: Tensor) -> None:
         """Take one step of the optimiser."""
-        self.optimiser.zero_grad()
+        for parameter in self.parameters:  # as `zero_grad`, which takes as long as the step
+            parameter.grad = None
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
         self.optimiser.step()
@@ -255,6 +306,49 @@ class PPO:
         self.generator.set_state(state["generator"])
         if self.noise:
             self.noise.load_state_dict(state["noise"])
+
+
+class ClippedLoss(ClipPPOLoss):
+    """TorchRL's loss of the clipped objective, with the same numbers, in less time.
+
+    It leaves out the searches for options that are not used here, which take longer than small networks do.
+    """
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch [N] and TorchRL's other values, scalars."""
+        rows = tensordict.copy()
+        advantage, target = rows["advantage"], rows["value_target"]
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
+        *modules, last = self.actor_network.module
+        for module in modules:
+            rows = module(rows)
+        distribution = last.get_dist(rows)
+        log_ratio = (distribution.log_prob(rows["action"]) - rows["action_log_prob"]).unsqueeze(-1)
+        ratio, clipped = log_ratio.exp(), log_ratio.clamp(*self._clip_bounds)
+        gain = torch.minimum(ratio * advantage, clipped.exp() * advantage)
+        value = self.critic_network(rows)["state_value"]
+        error = F.mse_loss(target, value, reduction="none")
+        with torch.no_grad():
+            weights = log_ratio.squeeze(-1)
+            size = (2 * weights.logsumexp(0) - (2 * weights).logsumexp(0)).exp()
+            unexplained = torch.var(target - value, correction=0, dim=0)
+            variance = torch.var(target, correction=0, dim=0) + torch.finfo(target.dtype).eps
+        losses = {
+            "loss_objective": -gain.mean(),
+            "clip_fraction": (clipped != log_ratio).to(ratio.dtype).mean(),
+            "kl_approx": (-log_ratio.detach()).mean(),
+        }
+        if self.entropy_bonus:
+            entropy = self._get_entropy(distribution, advantage.shape[:-1])
+            losses |= {"entropy": entropy.detach().mean(), "loss_entropy": self._weighted_loss_entropy(entropy).mean()}
+        losses |= {
+            "loss_critic": (self.critic_coeff * error).mean(),
+            "explained_variance": 1.0 - unexplained / variance,
+            "ESS": size / len(weights),
+            "max_ratio": ratio.detach().max(),
+            "mean_ratio": ratio.detach().mean(),
+        }
+        return TensorDict(losses)
 
 
 class Advantages:

@@ -18,11 +18,13 @@ from typing import Any, Literal
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from torchrl.objectives import ReinforceLoss
 
 from coil_rl.envs.limits import check_choice
 from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.ppo import PPO, standardise
 
 
@@ -40,7 +42,7 @@ class Reinforce(PPO):
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         baseline: Literal["critic", "none"] = "critic",
         standardise: bool = True,
@@ -52,15 +54,15 @@ class Reinforce(PPO):
         super().__init__(
             env, in_keys, gae_lambda=1.0, epochs=1, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options
         )
-        self.loss = ReinforceLoss(self.policy, self.critic, loss_critic_type="l2", functional=False)
+        self.loss = ReinforceLoss(self.head, self.critic, loss_critic_type="l2", functional=False)
 
     def build_networks(
-        self, env: EnvBase, in_keys: Sequence[str], hidden: Sequence[int], **options: Any
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return policy and baseline."""
         if self.baseline == "critic":
-            return super().build_networks(env, in_keys, hidden, **options)
-        return networks.actor(env, in_keys, hidden, **options), ZeroCritic(in_keys)
+            return super().build_networks(env, in_keys, network, **options)
+        return networks.actor(env, in_keys, network, normaliser=self.normaliser, **options), ZeroCritic(in_keys)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N], with the names of its other losses."""
@@ -75,7 +77,7 @@ class Reinforce(PPO):
 class ZeroCritic(TensorDictModuleBase):
     """A critic that writes 0 as `state_value` [*batch, 1]."""
 
-    def __init__(self, in_keys: Sequence[str]) -> None:
+    def __init__(self, in_keys: Sequence[NestedKey]) -> None:
         self.in_keys, self.out_keys = list(in_keys), ["state_value"]
         super().__init__()
 

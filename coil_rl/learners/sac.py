@@ -11,11 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from tensordict.nn import ProbabilisticTensorDictSequential
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from torchrl.objectives import SACLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp, entry_keys, without_memory
 from coil_rl.learners.off_policy import OffPolicy
 
 
@@ -27,11 +30,12 @@ class SAC(OffPolicy):
     Args:
         env: the env, with continuous actions.
         in_keys: entries that policy and critics observe.
-        hidden: widths of the hidden layers of all networks.
+        hidden: widths of the hidden layers of all networks, without `network`.
+        network: architecture of all networks; None: `Mlp(hidden)`.
         action_scale: initial standard deviation of the policy, before squashing.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0.
         temperature: initial alpha.
-        target_entropy: of the policy, for actions in the unit of the env; None: minus the length of the action.
+        target_entropy: of the policy, for actions in the unit of the env; None: minus the number of its dimensions.
         tau: step of the target networks towards the critics after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average.
         options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large `max_grad_norm`:
@@ -47,9 +51,10 @@ class SAC(OffPolicy):
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         temperature: float = 0.2,
@@ -66,13 +71,18 @@ class SAC(OffPolicy):
                 "SAC needs continuous actions, but this env has discrete ones; "
                 "use action=continuous, or a learner for discrete actions, such as DQN"
             )
+        in_keys, network = entry_keys(in_keys), without_memory(network or Mlp(hidden), "SAC")
         super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
-        self.policy = networks.actor(env, in_keys, hidden, action_scale, action_gain, state_dependent_scale=True)
+        self.policy = networks.actor(
+            env, in_keys, network, action_scale, action_gain, state_dependent_scale=True, normaliser=self.normaliser
+        )
+        # Minibatches are normalised once, for all networks.
+        actor = self.policy if self.normaliser is None else ProbabilisticTensorDictSequential(*self.policy.module[1:])
         loss = SACLoss(
-            self.policy,
-            [networks.action_critic(env, in_keys, hidden) for _ in range(2)],
+            actor,
+            [networks.action_critic(env, in_keys, network, self.normaliser) for _ in range(2)],
             alpha_init=temperature,
-            target_entropy=float(-spec.shape[-1] if target_entropy is None else target_entropy),
+            target_entropy=float(-networks.action_shape(env).numel() if target_entropy is None else target_entropy),
             loss_function="l2",
         )
         loss.target_entropy  # noqa: B018  becomes part of the state at the first access

@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal, kl_divergence
 from torch.nn import functional as F
@@ -21,6 +22,7 @@ from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
 from coil_rl.envs.limits import check_range
+from coil_rl.learners.networks import Choices
 from coil_rl.learners.ppo import PPO, standardise
 
 
@@ -38,10 +40,12 @@ class TRPO(PPO):
         options: as for `PPO`; auxiliary losses are part of the objective.
     """
 
+    with_memory = False
+
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         max_kl: float = 0.03,
         damping: float = 0.1,
@@ -79,7 +83,7 @@ class TRPO(PPO):
             self.step(error)
             errors.append(error.detach())
         means = {"loss_critic": float(torch.stack(errors).mean()), "learning_rate": self.learning_rate(progress)}
-        return {name: float(value) for name, value in report.items()} | means | self.limit_noise(batch, progress)
+        return {name: float(value) for name, value in report.items()} | means | self.finish(batch, progress)
 
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.
@@ -135,8 +139,10 @@ def unsquashed(distribution: Any) -> Distribution:
     """Return the distribution before squashing; squashing does not change KL divergences."""
     if isinstance(distribution, Categorical):
         return Categorical(logits=distribution.logits)
+    if isinstance(distribution, Choices):
+        return distribution
     normal = distribution if isinstance(distribution, TanhNormal) else distribution.base_dist
-    return Independent(Normal(normal.loc, normal.scale), 1)
+    return Independent(Normal(normal.loc, normal.scale), len(distribution.event_shape))
 
 
 def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, iterations: int) -> Tensor:

@@ -1,1 +1,6 @@
-"""Analysis of how much a trained agent uses the advice of each guide, and where on the track."""
+"""Analysis of how much a trained agent uses the advice of each guide, and where."""
+
+from coil_rl.listening.sections import TrackSections
+from coil_rl.listening.whole_episode import WholeEpisode
+
+__all__ = ["TrackSections", "WholeEpisode"]

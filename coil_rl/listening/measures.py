@@ -16,6 +16,13 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 ADVICE = "guide_action"
 
+# Title and axis label of the picture of each measure.
+PICTURES = {
+    "intervention": ("Effect of other advice on the action", "change of the action"),
+    "agreement": ("Difference between action and advice", "|action - advice|"),
+    "gradient": ("Effect of small changes of the advice on the action", "|da / dg|"),
+}
+
 Act = Callable[[TensorDictBase], Tensor]
 """Maps states [N] with `guide_action` to actions [N, A]; it may write to the states, which are copies."""
 

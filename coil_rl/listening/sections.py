@@ -1,16 +1,25 @@
-"""Sections of a track: straight, left turn, right turn, turn entry and turn exit."""
+"""Sections of a track: straight, left turn, right turn, turn entry and turn exit; and maps of advice."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
+from tensordict import TensorDictBase
 from torch import Tensor
 
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.track import AS_COMPLEX, Track, resample
+from coil_rl.listening.measures import PICTURES
+from coil_rl.report import draw_listening_map, write_csv
+
+if TYPE_CHECKING:
+    from coil_rl.listening.survey import Survey
 
 Array = NDArray[np.float64]
 
@@ -58,39 +67,105 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
 class TrackSections:
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
-    Cars refer to tracks by index; `turn_radius` and `approach` are those of `classify`, in m.
+    The env writes `info` with the index of the `track` and the `pose` of each car, as `ConeTrackEnv` does.
 
-    Attributes:
-        lines: the middle lines, [P, 2] m each.
-        sections: of their points, [P] each, indices in SECTIONS.
+    Args:
+        tracks: of the env, in its order.
+        turn_radius: as for `classify`, in m.
+        approach: as for `classify`, in m.
+        bin: m of track per value of the maps, rounded so that their number on a track is whole.
     """
 
+    names = SECTIONS
+
     def __init__(
-        self,
-        tracks: Sequence[Track],
-        *,
-        turn_radius: float = 10.0,
-        approach: float = 4.0,
-        device: torch.device | str = "cpu",
+        self, tracks: Sequence[Track], *, turn_radius: float = 10.0, approach: float = 4.0, bin: float = 1.0
     ) -> None:
-        self.tracks = list(tracks)
-        self.lines = [smooth_line(track) for track in tracks]
-        self.sections = [classify(line, turn_radius, approach) for line in self.lines]
+        check_range(0.5, 1000, turn_radius=turn_radius)
+        check_range(0.1, 100, approach=approach, bin=bin)
+        self.tracks, self.bin = list(tracks), bin
+        self.lines = [smooth_line(track) for track in tracks]  # [P, 2] m each
+        self.sections = [classify(line, turn_radius, approach) for line in self.lines]  # [P] each, indices in SECTIONS
         points = np.full((len(self.lines), max(map(len, self.lines)), 2), 1e6)  # padded with points far away
         section = np.zeros(points.shape[:2], dtype=np.int64)
         for index, (line, of_points) in enumerate(zip(self.lines, self.sections, strict=True)):
             points[index, : len(line)], section[index, : len(line)] = line, of_points
-        self._points = torch.as_tensor(points, dtype=torch.float32, device=device)
-        self._section = torch.as_tensor(section, device=device)
+        self._points, self._section = torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(section)
 
-    def nearest(self, track: Tensor, position: Tensor) -> Tensor:
-        """Return the nearest point of the middle line [B], for tracks [B] and positions [B, 2] m."""
-        return (self._points[track] - position.unsqueeze(-2)).square().sum(-1).argmin(-1)
+    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
+        """Return the index of the `track` and of the nearest `point` of its middle line, [B] each, of a state [B]."""
+        track, position = state["info", "track"].squeeze(-1), state["info", "pose"][..., :2]
+        points = self._points.to(position)[track]
+        return {"track": track, "point": (points - position.unsqueeze(-2)).square().sum(-1).argmin(-1)}
 
-    def section(self, track: Tensor, position: Tensor) -> Tensor:
-        """Return the section as an index in SECTIONS [B], for tracks [B] and positions [B, 2] m."""
-        return self.section_at(track, self.nearest(track, position))
+    def section(self, place: TensorDictBase) -> Tensor:
+        """Return the section of each place as an index in SECTIONS, [B]."""
+        return self._section.to(place["track"].device)[place["track"], place["point"]]
 
-    def section_at(self, track: Tensor, point: Tensor) -> Tensor:
-        """Return the section as an index in SECTIONS [B], for tracks [B] and points of their middle lines [B]."""
-        return self._section[track, point]
+    def draw(self, data: Survey, folder: Path) -> None:
+        """Draw a map of the tracks for each measure, and write the table along the tracks as `listening.csv`."""
+        table = self.table(data)
+        for measure, (title, label) in PICTURES.items():
+            if not np.isnan(data.measures[measure]).all():
+                lines, values = self.measure_on_lines(data, table, measure)
+                suffix = "" if measure == "intervention" else f"_{measure}"
+                path = folder / f"listening{suffix}.png"
+                draw_listening_map(self.tracks, lines, values, path, label=label, title=title)
+        write_csv(table, folder / "listening.csv")
+
+    def table(self, data: Survey) -> list[dict[str, Any]]:
+        """Return one row per guide and bin of each track with a visited state.
+
+        Returns:
+            Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m), `curvature` (1/m) and
+            `section` of the bin's middle, number of `states`, and means of `agreement`, `intervention` and `gradient`.
+        """
+        rows = []
+        for index, track in enumerate(self.tracks):
+            line, on_track = self.lines[index], data.place["track"] == index
+            bins = self._bins(line)
+            _, first, lengths = np.unique(bins, return_index=True, return_counts=True)
+            middle = first + lengths // 2
+            step, bend = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1), curvature(line)
+            bin_of_state = bins[data.place["point"][on_track]]
+            states = np.bincount(bin_of_state, minlength=len(first))
+            for slot, guide in enumerate(data.guides):
+                sums = {
+                    name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in data.measures.items()
+                }
+                for k in np.flatnonzero(states).tolist():
+                    x, y = line[middle[k]].tolist()
+                    rows.append({
+                        "track": track.name, "guide": guide, "bin": k, "from": float(step[: first[k]].sum()),
+                        "x": x, "y": y, "curvature": float(bend[middle[k]]),
+                        "section": SECTIONS[self.sections[index][middle[k]]], "states": int(states[k]),
+                        **{name: float(of_bins[k] / states[k]) for name, of_bins in sums.items()},
+                    })  # fmt: skip
+        return rows
+
+    def measure_on_lines(
+        self, data: Survey, table: Sequence[Mapping[str, Any]], measure: str
+    ) -> tuple[list[Array], dict[str, list[Array]]]:
+        """Return the line [T, 2] m of the last car of each track, and by guide the measure [T] at its points, by bins.
+
+        `table` is the result of the method of that name.
+        """
+        means = {(row["track"], row["guide"], row["bin"]): row[measure] for row in table}
+        lines: list[Array] = []
+        values: dict[str, list[Array]] = {guide: [] for guide in data.guides}
+        for middle_line, track in zip(self.lines, self.tracks, strict=True):
+            cars = [car for car, episode in enumerate(data.result.episodes) if episode["case"] == track.name]
+            line = data.result.histories["pose"][cars[-1]][:, :2]
+            line = line[: max(1, len(line) - 1)]  # the last point is the position after the last measured state
+            nearest = ((line[:, None] - middle_line) ** 2).sum(-1).argmin(1)
+            bins = self._bins(middle_line)[nearest].tolist()
+            lines.append(line)
+            for guide in data.guides:
+                values[guide].append(np.array([means.get((track.name, guide, k), np.nan) for k in bins]))
+        return lines, values
+
+    def _bins(self, line: Array) -> NDArray[np.int64]:
+        """Return the bin of each point of a closed line [P]: numbers from 0, bins of about equal length."""
+        total = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
+        count = min(len(line), max(1, round(total / self.bin)))
+        return np.arange(len(line)) * count // len(line)

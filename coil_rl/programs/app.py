@@ -66,6 +66,7 @@ class NewFolders(Callback):
 def _record(config: DictConfig, key: str) -> None:
     try:
         folder = Path(str(OmegaConf.select(config, key))).absolute()
+        folder /= str(OmegaConf.select(config, "hydra.output_subdir") or "")
     except OmegaConfBaseException:
         return  # Hydra raises the same error next
     _new_folders[:] = [place for place in (folder, *folder.parents) if not os.path.exists(place)]
@@ -143,13 +144,15 @@ def program(name: str) -> Iterator[None]:
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
     try:
         yield
-    except Exception as error:
+    except (Exception, KeyboardInterrupt) as error:
+        # A library may raise an error of its own on the way out of an interrupt.
+        if _interrupts or isinstance(error, KeyboardInterrupt):
+            reasons = map(str, error.args) if isinstance(error, KeyboardInterrupt) else ()
+            print(f"{name}: {'; '.join(['interrupted', *reasons])}", file=sys.stderr)
+            sys.exit(130)
         if not is_no_bug(error):
             raise
         refuse(name, error)
-    except KeyboardInterrupt as stop:
-        print(f"{name}: {'; '.join(['interrupted', *map(str, stop.args)])}", file=sys.stderr)
-        sys.exit(130)
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:

@@ -1,4 +1,4 @@
-"""`coil-evaluate`: evaluate the policy of a run beside its guides, or guides alone, on the test tracks."""
+"""`coil-evaluate`: evaluate the policy of a run beside its guides, or guides alone."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from coil_rl.programs import app
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
 OF_A_RUN = ("run", "track", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
+OWN = ("repeats", "policy", "gif", "advice")  # keys of `evaluation` that belong to the command, not to the run
+OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 if TYPE_CHECKING:
     from torch import nn
@@ -37,22 +39,35 @@ def evaluate(config: DictConfig) -> float:
 def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
     """Return the configuration of a run with the requested evaluation, and its policy.
 
-    The tracks are those of the run unless the command line gives others.
+    Everything is as in the run but for what the command line gives.
 
     Raises:
-        UserError: if the folder holds no complete run.
+        UserError: if the folder holds no complete run, or one without tracks although tracks are given.
     """
+    from coil_rl.errors import UserError
     from coil_rl.train.build import build_env
     from coil_rl.train.check import check_values
     from coil_rl.train.load import load_policy
     from coil_rl.train.run_folder import read_config
 
-    if HydraConfig.initialized() and "track" not in dict(app.overrides()):
-        requested.track = read_config(run, "run").track
+    config = read_config(run, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] |= resolved["degrade"]
-    config = read_config(run, "run", {key: resolved[key] for key in ("track", "evaluation", "device")})
+    changed = list(OWN)
+    for key, text in app.overrides() if HydraConfig.initialized() else ():
+        if key == "track":
+            if not config.track:
+                raise UserError(f"{text} has no effect: run={run} has no tracks; leave it out")
+            config.track = resolved["track"]
+            changed += OF_A_TRACK
+        elif key == "evaluation":
+            changed.append(text.lstrip("+~").partition("=")[0].partition(".")[2])
+    values = OmegaConf.create(resolved["evaluation"])
+    for key in filter(None, changed):
+        OmegaConf.update(config.evaluation, key, OmegaConf.select(values, key), merge=False, force_add=True)
+    if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
+        config.evaluation.env["cases"] = config.evaluation.cases
     check_values(config)
     if config.method.observes is None:
         return config, None

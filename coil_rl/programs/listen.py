@@ -1,4 +1,4 @@
-"""`coil-listen`: how much a trained agent uses the advice of each guide, and where on the track."""
+"""`coil-listen`: how much a trained agent uses the advice of each guide, and where."""
 
 from __future__ import annotations
 
@@ -21,16 +21,11 @@ COLUMNS = {
     "completed": ("completed", ".0%"),
 }
 NOTES = """
-Means over the states of deterministic episodes on the test tracks, in action units. intervention: change of the action
-when the guide's advice is replaced by its advice in another state. return lost and completed: with the guide's advice
+Means over the states of deterministic episodes in all cases, in action units. intervention: change of the action when
+the guide's advice is replaced by its advice in another state. return lost and completed: with the guide's advice
 replaced by its mean in that section. """
 CONTINUOUS_NOTE = "gradient: |da/dg|."
 DISCRETE_NOTE = "Actions are discrete: |a - g| and intervention are 0\nfor the same action and 1.414 for any other."
-MAPS = {
-    "intervention": ("listening.png", "Effect of other advice on the action", "change of the action"),
-    "agreement": ("listening_agreement.png", "Difference between action and advice", "|action - advice|"),
-    "gradient": ("listening_gradient.png", "Effect of small changes of the advice on the action", "|da / dg|"),
-}
 
 
 def listen(config: DictConfig) -> None:
@@ -40,12 +35,13 @@ def listen(config: DictConfig) -> None:
     from tqdm import tqdm
 
     from coil_rl.files import write_text
+    from coil_rl.listening import WholeEpisode
     from coil_rl.listening import survey as surveys
     from coil_rl.listening.measures import split_policy
-    from coil_rl.listening.sections import TrackSections
     from coil_rl.programs.evaluate import restore
-    from coil_rl.report import draw_listening_map, markdown_table, write_csv
+    from coil_rl.report import markdown_table, write_csv
     from coil_rl.train.build import build, build_env
+    from coil_rl.train.evaluate_run import build_evaluation, build_pictures
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
@@ -56,33 +52,31 @@ def listen(config: DictConfig) -> None:
         split_policy(agent)
     except ValueError as error:
         raise UserError(f"the agent of run={config.run} does not use advice: {error}") from error
-    tracks = build(run.track.test, "track.test")
-    sections = TrackSections(tracks, turn_radius=config.turn_radius, approach=config.approach, device=config.device)
-    cars = len(tracks) * run.evaluation.repeats
+    node = run.evaluation.sections
+    sections: surveys.Sections = build(node, "evaluation.sections") if node else WholeEpisode()
+    evaluation = build_evaluation(run, build_pictures(run))
+    rows = len(evaluation.cases) * run.evaluation.repeats
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)  # for guides with random actions
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
-        env = build_env(run, {**run.evaluation.env, "num_cars": cars})
-        data = surveys.survey(env, agent, sections, donors=config.donors, seed=config.seed, tick=bar.update)
-        removed = surveys.ablations(len(data.guides))
+        env = build_env(run, {**run.evaluation.env, "num_envs": rows})
+        data = surveys.survey(env, agent, sections, evaluation, donors=config.donors, seed=config.seed, tick=bar.update)
+        removed = surveys.ablations(len(data.guides), len(sections.names))
         bar.set_postfix_str("one guide removed")
-        env = build_env(run, {**run.evaluation.env, "num_cars": cars * len(removed)})
+        env = build_env(run, {**run.evaluation.env, "num_envs": rows * len(removed)})
         mean_advice = data.advice.mean(0)
-        episodes = surveys.drive_ablated(env, agent, sections, removed, mean_advice, tick=bar.update)
-    table = surveys.table_by_section(data, dict(zip(removed, episodes, strict=True)))
-    columns, notes = dict(COLUMNS), NOTES + CONTINUOUS_NOTE
+        episodes = surveys.drive_ablated(env, agent, sections, evaluation, removed, mean_advice, tick=bar.update)
+    table = surveys.table_by_section(data, sections, evaluation, dict(zip(removed, episodes, strict=True)))
+    columns = {key: column for key, column in COLUMNS.items() if key in table[0]}
+    notes = NOTES + CONTINUOUS_NOTE
     if np.isnan(data.measures["gradient"]).all():
         del columns["gradient"]
         notes = NOTES + DISCRETE_NOTE
     page = f"{markdown_table(table, columns)}\n{notes}"
     write_text(folder / "listening.md", page)
     write_csv(table, folder / "listening_sections.csv")
-    for measure, (name, title, label) in MAPS.items():
-        if measure in columns:
-            lines, values = surveys.measure_on_lines(data, sections, measure, config.bin)
-            draw_listening_map(tracks, lines, values, folder / name, label=label, title=title)
-    write_csv(surveys.table_along_track(data, sections, config.bin), folder / "listening.csv")
+    sections.draw(data, folder)
     print(f"{page}\n\n{_summary(run.label, table)}; see {folder}")
 
 
@@ -91,17 +85,15 @@ def _summary(label: str, table: list[dict[str, Any]]) -> str:
     means = {row["guide"]: row["intervention"] for row in table if row["section"] == "everywhere"}
     best = max(means, key=lambda guide: means[guide])
     rows = [row for row in table if row["guide"] == best and row["section"] != "everywhere"]
-    where = max(rows, key=lambda row: row["intervention"])
+    where = max(rows, key=lambda row: row["intervention"], default=None)
+    there = f", and by {where['intervention']:.4f} in the section {where['section']}" if where else ""
     others = "".join(f"; {guide} changes it by {change:.4f}" for guide, change in means.items() if guide != best)
-    return (
-        f"{label} depends most on {best}: other advice of it changes the action by {means[best]:.4f}, "
-        f"and by {where['intervention']:.4f} in the section {where['section']}{others}"
-    )
+    return f"{label} depends most on {best}: other advice of it changes the action by {means[best]:.4f}{there}{others}"
 
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    used = ("run", "track", "evaluation", "donors", "turn_radius", "approach", "bin")
+    used = ("run", "track", "evaluation", "donors")
     app.check_used(used, f"run={config.run} has its own configuration")
     app.check_run(config)
 

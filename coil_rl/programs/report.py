@@ -48,8 +48,8 @@ def report(config: DictConfig) -> None:
 
     folder = folders[0]
     write_text(folder / "report.md", text)
-    tracks = {actions: comparison.track_table() for actions, comparison in compared.items()}
-    for name, by_actions in {"report.csv": tables, "report_tracks.csv": tracks}.items():
+    cases = {actions: comparison.case_table() for actions, comparison in compared.items()}
+    for name, by_actions in {"report.csv": tables, "report_cases.csv": cases}.items():
         rows = [{"actions": actions} | row for actions, table in by_actions.items() for row in table]
         write_csv(rows, folder / name)
     panels = {f"{kind} actions": _intervals(comparison) for kind, comparison in compared.items()}

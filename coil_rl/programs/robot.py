@@ -26,7 +26,7 @@ def robot(config: DictConfig) -> None:
 
     from coil_rl.envs.robot.drives import record_labelling_drives
     from coil_rl.robot.drivers import record
-    from coil_rl.train.build import build
+    from coil_rl.train.evaluate_run import build_evaluation
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
@@ -41,7 +41,7 @@ def robot(config: DictConfig) -> None:
             with open_dict(config):
                 loader = "coil_rl.robot.classifier.load_classifier"
                 config.env.perception.classifier = {"_target_": loader, "path": str(folder / "cones.json")}
-        robots = config.evaluation.repeats * len(build(config.track.test, "track.test"))
+        robots = config.evaluation.repeats * len(build_evaluation(config).cases)
         record(_drivers(config, robots), folder / STEPS["drive"], robots)
     if "table" in config.steps:
         config.recordings = config.recordings or [str(folder / STEPS["drive"])]
@@ -66,7 +66,7 @@ def _drivers(config: DictConfig, robots: int) -> Iterator[Driver]:
     from coil_rl.train.evaluate_run import driver_names
     from coil_rl.train.run_folder import read_config
 
-    overrides = {**config.evaluation.env, "num_cars": robots}
+    overrides = {**config.evaluation.env, "num_envs": robots}
     guides = build_guides(config)
     for number, (display_name, (key, guide)) in enumerate(zip(driver_names(guides), guides.items(), strict=True)):
         name = f"{number:02d}_{display_name}".replace(" ", "_")
@@ -84,6 +84,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.reproduce import Result
     from coil_rl.train.build import build
     from coil_rl.train.check import check as check_common
+    from coil_rl.train.evaluate_run import build_evaluation
 
     used = ("preset", "track", "env", "guide", "degrade", "evaluation")
     own = ("steps", "runs", "recordings", "table_6", "figure_25")
@@ -95,7 +96,7 @@ def check(config: DictConfig) -> None:
     for step in config.steps:
         if (folder / STEPS[step]).exists():
             raise UserError(f"{folder} already holds {STEPS[step]}; choose another folder with hydra.run.dir=FOLDER")
-    drivers = _drivers(config, len(build(config.track.test, "track.test"))) if "drive" in config.steps else ()
+    drivers = _drivers(config, len(build_evaluation(config).cases)) if "drive" in config.steps else ()
     for driver in drivers:
         env, _ = driver.make_env_and_policy()
         if not isinstance(env.base_env, SimulatedRobotEnv):

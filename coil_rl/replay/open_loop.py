@@ -29,36 +29,24 @@ Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering of one policy at each of N scans, [N] each.
+    """Steering of one policy at each of N scans, [N] each."""
 
-    `action` is the steering that reaches the robot, as a fraction of the maximum, positive to the left; `omega` the
-    turn rate at that steering, radians/s; `smoothness` |a - a_avg|, as in the cone world.
-    """
-
-    action: Floats
-    omega: Floats
-    smoothness: Floats
+    action: Floats  # the steering that reaches the robot, as a fraction of the maximum, positive to the left
+    omega: Floats  # radians/s, the turn rate at that steering
+    smoothness: Floats  # |a - a_avg|, as in the cone world
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Result for one recording of N scans.
-
-    Attributes:
-        cones, count: [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first; and [N, 2].
-        observation: [N, 20].
-        valid: [N, 2] whether each side is valid in the scan.
-        steering: by policy; `recorded_steering` is last, as `RECORDED`, if the recording has commands.
-        max_steering: radians of an action of 1.
-    """
+    """Result for one recording of N scans."""
 
     recording: Recording
-    cones: NDArray[np.float32]
-    count: NDArray[np.int64]
-    observation: NDArray[np.float32]
-    valid: NDArray[np.bool_]
-    steering: dict[str, Steering]
-    max_steering: float
+    cones: NDArray[np.float32]  # [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first
+    count: NDArray[np.int64]  # [N, 2], of the cones
+    observation: NDArray[np.float32]  # [N, 20]
+    valid: NDArray[np.bool_]  # [N, 2] whether each side is valid in the scan
+    steering: dict[str, Steering]  # by policy; `recorded_steering` is last, as `RECORDED`, if there are commands
+    max_steering: float  # radians of an action of 1
 
     @property
     def both_valid(self) -> NDArray[np.bool_]:

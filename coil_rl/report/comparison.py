@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -12,8 +12,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
-from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, PER_STEP, TERM, Run
+from coil_rl.report.runs import DRIVER, GUIDE, Run
 from coil_rl.report.statistics import Estimate, count_of_seeds, estimate, holm, wins
+from coil_rl.train.measures import Measure
 
 Array = NDArray[np.float64]
 
@@ -22,26 +23,17 @@ LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Evaluations of one driver over seeds.
+    """Evaluations of one driver over seeds."""
 
-    Attributes:
-        name: display name: the label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if
-            several guides share it.
-        advice: modification of the advice; empty for none.
-        table: indexed by (seed, track); for a guide the seeds number its different evaluations.
-        is_guide: whether the driver is a guide.
-        guide: the best guide of an agent.
-        needs_guide: whether the agent needs the guide during evaluation; None if that does not apply.
-        reference: rewards that scores are divided by, [tracks]; None: scores are rewards.
-    """
-
+    # The label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if several guides share it.
     name: str
-    advice: str
-    table: pd.DataFrame
+    advice: str  # modification of the advice; empty for none
+    table: pd.DataFrame  # indexed by (seed, case); for a guide the seeds number its different evaluations
     is_guide: bool = False
-    guide: Group | None = None
-    needs_guide: bool | None = None
-    reference: Array | None = None
+    guide: Group | None = None  # the best one of an agent
+    needs_guide: bool | None = None  # during evaluation; None if that does not apply
+    measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)  # definitions of those in the table
+    reference: Array | None = None  # rewards that scores are divided by, [cases]; None: scores are rewards
 
     @property
     def title(self) -> str:
@@ -49,9 +41,9 @@ class Group:
         return f"{self.name}, {self.advice}" if self.advice else self.name
 
     @property
-    def tracks(self) -> tuple[str, ...]:
-        """Names of the tracks."""
-        return tuple(self.table.index.unique("track"))
+    def cases(self) -> tuple[str, ...]:
+        """Names of the cases."""
+        return tuple(self.table.index.unique("case"))
 
     @property
     def seeds(self) -> int | None:
@@ -61,16 +53,16 @@ class Group:
 
     @property
     def scores(self) -> Array:
-        """Rewards divided by those of the reference on the same track, [seeds, tracks]."""
+        """Rewards divided by those of the reference in the same case, [seeds, cases]."""
         return self.by_seed("score").to_numpy()
 
     def by_seed(self, measure: str) -> pd.DataFrame:
-        """Return one of MEASURES, or "score", with seeds as rows and tracks as columns."""
+        """Return the reward, a measure, or "score", with seeds as rows and cases as columns."""
         index, score = self.table.index.unique("seed"), measure == "score"
         values = self.table["reward" if score else measure].to_numpy().reshape(len(index), -1)
         if score and self.reference is not None:
             values = values / self.reference
-        return pd.DataFrame(values, index, self.tracks)
+        return pd.DataFrame(values, index, self.cases)
 
     @cached_property
     def score(self) -> Estimate:
@@ -80,26 +72,33 @@ class Group:
     @property
     def rank(self) -> tuple[float, float]:
         """Sort key: the completed share, then the mean score, the best first."""
-        return -float(np.nan_to_num(self.table["completed"].mean())), -self.score.mean
+        completed = self.table["completed"].mean() if "completed" in self.table else 0.0
+        return -float(np.nan_to_num(completed)), -self.score.mean
 
     @property
     def crashes(self) -> str | None:
-        """Number of seeds that crashed on any track, with the interval of its share; tracks for a single guide."""
-        crashed = self.by_seed("crashed")
-        if crashed.isna().to_numpy().any():
+        """Number of seeds that crashed in any case, with the interval of its share; cases for a single guide."""
+        if not self.has("crashed"):
             return None
+        crashed = self.by_seed("crashed")
         if self.seeds is None:
-            return f"{int((crashed > 0).to_numpy().sum())} of {len(self.tracks)} tracks"
+            return f"{int((crashed > 0).to_numpy().sum())} of {len(self.cases)} cases"
         return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
 
-    def means(self, track: int | None = None) -> dict[str, float]:
-        """Return the mean of each measure over seeds and tracks, or one track; the smallest for `clearance`."""
-        rows = self.table if track is None else self.table.xs(self.tracks[track], level="track")
-        means = {measure: float(rows[measure].mean()) for measure in MEASURES}
-        return means | {"clearance": float(rows["clearance"].min())}
+    def has(self, measure: str) -> bool:
+        """Return whether a measure is known in all cases."""
+        return measure in self.table and not self.table[measure].isna().to_numpy().any()
+
+    def means(self, case: int | None = None) -> dict[str, float]:
+        """Return reward and measures over seeds and cases, or one case: means, of minima the smallest."""
+        rows = self.table if case is None else self.table.xs(self.cases[case], level="case")
+        means = {"reward": float(rows["reward"].mean())}
+        return means | {
+            name: measure.pool(rows[name].tolist()) for name, measure in self.measures.items() if name in rows
+        }
 
     def parts(self, prefix: str) -> dict[str, float]:
-        """Return the mean of each column with a prefix, PER_STEP or TERM, over the seeds and tracks that have it."""
+        """Return the mean of each column with a prefix, PER_STEP or TERM, over the seeds and cases that have it."""
         columns = [column for column in self.table if column.startswith(prefix)]
         return {column: float(self.table[column].mean()) for column in columns}
 
@@ -128,22 +127,21 @@ class Comparison:
             difference = pairs.difference if pairs else Estimate(np.nan)
             rows.append({
                 "driver": group.name, "advice": group.advice, "guide": group.guide.name if group.guide else None,
-                "seeds": group.seeds, "completed": means.pop("completed"), "crashes": group.crashes,
+                "seeds": group.seeds, "completed": means.pop("completed", None), "crashes": group.crashes,
                 "score": group.score.mean, "low": group.score.low, "high": group.score.high, **means,
                 "difference": difference.mean, "difference_low": difference.low, "difference_high": difference.high,
                 "p": difference.p, "better": pairs.better if pairs else None, "needs_guide": group.needs_guide,
-                **group.parts(TERM), **group.parts(PER_STEP),
             })  # fmt: skip
         for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
             row["p"] = float(p)
         return rows
 
-    def track_table(self) -> list[dict[str, Any]]:
-        """Return one row per driver and track."""
+    def case_table(self) -> list[dict[str, Any]]:
+        """Return one row per driver and case."""
         return [
-            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "track": track} | group.means(index)
+            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "case": case} | group.means(index)
             for group in (*self.guides, *self.agents)
-            for index, track in enumerate(group.tracks)
+            for index, case in enumerate(group.cases)
         ]
 
     def _pairs(self, group: Group, against: str | None) -> Paired | None:
@@ -156,16 +154,17 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     """Group the finished runs, at least one, by label; `actions` of the agents are "deterministic" or "sampled".
 
     Raises:
-        UserError: if two runs have the same label and seed, or runs of one label differ in tracks.
+        UserError: if two runs have the same label and seed, or runs of one label differ in cases.
     """
     finished = [run for run in runs if run.finished]
     names = dict.fromkeys(run.label for run in finished)
     labels = {label: _join_runs([run for run in finished if run.label == label]) for label in names}
     is_guide = {label: frame["driver"].str.split().str[0] == GUIDE for label, frame in labels.items()}
-    guides = _group_guides({label: frame[is_guide[label]] for label, frame in labels.items()})
+    measures = {name: measure for run in reversed(finished) for name, measure in run.measures.items()}
+    guides = _group_guides({label: frame[is_guide[label]] for label, frame in labels.items()}, measures)
     references = _references([group for of_label in guides.values() for group in of_label], finished)
     unique = dict.fromkeys(group for of_label in guides.values() for group in of_label)
-    normalised = {group: replace(group, reference=references.get(group.tracks)) for group in unique}
+    normalised = {group: replace(group, reference=references.get(group.cases)) for group in unique}
     guides = {label: [normalised[group] for group in of_label] for label, of_label in guides.items()}
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
@@ -173,10 +172,10 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
         rows = frame[~is_guide[label] & (frame["actions"] == actions)]
         guide = next(iter(guides.get(label, ())), None)
         variants = [
-            Group(label, advice, _index(label, variant), False, guide, None if advice else needs_guide[label])
+            Group(label, advice, _index(label, variant), False, guide, None if advice else needs_guide[label], measures)
             for advice, variant in rows.groupby("advice", sort=False)
         ]
-        variants = [replace(variant, reference=references.get(variant.tracks)) for variant in variants]
+        variants = [replace(variant, reference=references.get(variant.cases)) for variant in variants]
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
     best = {group.name: group.rank for group in reversed(agents)}  # the first group of a label: unaltered advice
     agents.sort(key=lambda group: (best[group.name], group.name))
@@ -184,19 +183,21 @@ def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
 
 
 def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
-    """Return by tracks the rewards of the best guide; where it crashes or earns nothing, its mean over the others.
+    """Return by cases the rewards of the best guide; where it crashes or earns nothing, its mean over the others.
 
-    The result is empty if a run drove tracks on which no guide earns anything: scores of all runs are to be alike.
+    The result is empty if a run drove cases in which no guide earns anything: scores of all runs are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
     for guide in sorted(guides, key=lambda group: group.rank):
         rewards = guide.by_seed("reward").mean()
-        earned = rewards[(rewards > 0) & ~(guide.by_seed("crashed") > 0).any()]
+        earned = rewards[rewards > 0]
+        if guide.has("crashed"):
+            earned = earned[~(guide.by_seed("crashed") > 0).any()]
         if len(earned):
             references.setdefault(
-                guide.tracks, rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
+                guide.cases, rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
             )
-    return references if all(tuple(run.evaluation["track"].unique()) in references for run in runs) else {}
+    return references if all(tuple(run.evaluation["case"].unique()) in references for run in runs) else {}
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
@@ -213,17 +214,17 @@ def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
 
 
 def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
-    """Index the evaluations of one driver by seed and track."""
-    tracks = rows.groupby("seed")["track"].agg(tuple).unique()
-    if len(tracks) > 1:
+    """Index the evaluations of one driver by seed and case."""
+    cases = rows.groupby("seed")["case"].agg(tuple).unique()
+    if len(cases) > 1:
         raise UserError(
-            f"runs of {name} drove different tracks ({', '.join(tracks[0])}, and {', '.join(tracks[1])}); "
+            f"runs of {name} were evaluated in different cases ({', '.join(cases[0])}, and {', '.join(cases[1])}); "
             "evaluate them on the same ones, or give them their own labels (coil-train label=TEXT)"
         )
-    return rows.set_index(["seed", "track"]).drop(columns=list(DRIVER), errors="ignore")
+    return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
-def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
+def _group_guides(labels: dict[str, pd.DataFrame], measures: Mapping[str, Measure]) -> dict[str, list[Group]]:
     """Return the guides of each label, best first.
 
     Every run evaluates its guides: equal results of one guide count once, and labels share a guide if the results of
@@ -233,7 +234,7 @@ def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
     for label, frame in labels.items():
         for name, rows in frame.groupby("driver", sort=False):
             seeds = [seed_rows for _, seed_rows in rows.groupby("seed", sort=False)]
-            results = {(*seed_rows["track"], *seed_rows["reward"].round(3)): seed_rows for seed_rows in seeds}
+            results = {(*seed_rows["case"], *seed_rows["reward"].round(3)): seed_rows for seed_rows in seeds}
             for other, other_labels, other_results in guides:
                 fewer, more = sorted((results.keys(), other_results.keys()), key=len)
                 if other == name and fewer <= more:
@@ -250,7 +251,9 @@ def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
             listed = f"{', '.join(shared_by[:LABELS_IN_NAME])} and {len(shared_by) - LABELS_IN_NAME} more"
         table = pd.concat([rows.assign(seed=number) for number, rows in enumerate(results.values())])
         table = _index(f"the guide of {shared_by[0]}", table)
-        group = Group(name if names.count(name) == 1 else f"{name} ({listed})", "", table, is_guide=True)
+        group = Group(
+            name if names.count(name) == 1 else f"{name} ({listed})", "", table, is_guide=True, measures=measures
+        )
         for label in shared_by:
             groups.setdefault(label, []).append(group)
     return {label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()}
@@ -260,16 +263,16 @@ def _group_guides(labels: dict[str, pd.DataFrame]) -> dict[str, list[Group]]:
 class Paired:
     """Difference between two drivers with the same seeds."""
 
-    difference: Estimate  # of a measure, mean over tracks
-    better: float  # share of seeds and tracks with a higher value, ties counting half
+    difference: Estimate  # of a measure, mean over cases
+    better: float  # share of seeds and cases with a higher value, ties counting half
 
 
 def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
-    """Compare two drivers seed by seed by the score or by one of MEASURES; a single guide has one value for all seeds.
+    """Compare two drivers seed by seed by the score or by a measure; a single guide has one value for all seeds.
 
-    The result is None without common tracks and seeds, or if the measure has NaN.
+    The result is None without common cases and seeds, or if the measure has NaN.
     """
-    if group.tracks != other.tracks or (other.is_guide and other.seeds is not None):
+    if group.cases != other.cases or (other.is_guide and other.seeds is not None):
         return None
     ours, theirs = group.by_seed(measure), other.by_seed(measure)
     if not other.is_guide:

@@ -1,4 +1,4 @@
-"""Markdown page of `coil-report`: tables of drivers, tracks, tasks and training, and how to read them."""
+"""Markdown page of `coil-report`: tables of drivers, cases, parts of the reward and training, and how to read them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
 from coil_rl.report.table import markdown_table
 
-MAX_TRACKS = 8  # in a table
+MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 
 COLUMNS = {
@@ -27,11 +27,8 @@ COLUMNS = {
     "p": ("p", ".3f"),
     "better": ("better than {other}", ".0%"),
     "reward": ("reward", ".1f"),
-    "lap_time": ("lap (s)", ".2f"),
-    "smoothness": ("smoothness", ".3f"),
-    "clearance": ("smallest clearance (m)", ".2f"),
-    "needs_guide": ("guide at test time", ""),
 }
+NEEDS_GUIDE = {"needs_guide": ("guide at test time", "")}
 LEARNING_COLUMNS = {
     "label": ("return in the cases of the evaluation", ""),
     "seeds": ("seeds", ""),
@@ -54,7 +51,17 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
     hidden = {"advice"} if not any(row["advice"] for row in rows) else set()
     hidden |= {"difference cell", "p", "better"} if against is None else set()
     hidden |= set() if comparison.normalised else {"reward"}
+    hidden |= {key for key in ("completed", "crashes") if all(row[key] is None for row in rows)}
+    measures = {
+        name: each for group in (*comparison.guides, *comparison.agents) for name, each in group.measures.items()
+    }
     columns = {key: (text.format(**names), spec) for key, (text, spec) in COLUMNS.items() if key not in hidden}
+    columns |= {
+        name: (measure.title, measure.format)
+        for name, measure in measures.items()
+        if measure.title and name not in ("completed", "crashed") and not name.startswith(PER_STEP)
+    }
+    columns |= NEEDS_GUIDE
     cells = [
         {
             "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
@@ -67,13 +74,14 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
         *_parts(comparison, TERM, "term of the reward", ".1f"),
         *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
     ]
-    return "\n\n".join([f"## {heading}", table, *parts, _tracks(comparison)])
+    return "\n\n".join([f"## {heading}", table, *parts, _cases(comparison)])
 
 
 def guide_training(runs: Sequence[Run]) -> list[str]:
     """Return the table of guides' own returns before and after training; no table if no guide was trained."""
     rows: list[dict[str, Any]] = []
-    for label, curves in _curves(runs):
+    for label, of_label in _trained(runs):
+        curves = [run.curve for run in of_label]
         row: dict[str, Any] = {"label": label, "seeds": len(curves)}
         for key in dict.fromkeys(key for curve in curves for key in curve[0] if key.startswith(GUIDE_RETURN)):
             returns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
@@ -87,8 +95,7 @@ def guide_training(runs: Sequence[Run]) -> list[str]:
 def training(runs: Sequence[Run]) -> list[str]:
     """Return the table of evaluation curves, means over seeds; no table if nothing was trained."""
     rows: list[dict[str, Any]] = []
-    for label in dict.fromkeys(run.label for run in runs if run.curve):
-        of_label = [run for run in runs if run.label == label and run.curve]
+    for label, of_label in _trained(runs):
         numbers = [learning(run) for run in of_label]
         seconds = [run.seconds for run in of_label if run.seconds is not None]
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
@@ -110,13 +117,13 @@ def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     )
     if normalised:
         text += (
-            " Reward / guide's: each reward is divided by the best guide's on the same track (where it crashes or "
+            " Reward / guide's: each reward is divided by the best guide's in the same case (where it crashes or "
             "earns nothing, by its mean over the others)."
         )
     if against is not None:
         text += (
             f" Difference to {_other(against)}: of the same seed, p after Holm's correction for all rows (of sign "
-            f"flips from {SIGN_FLIP_SEEDS} seeds on, of a t test with fewer); better: the share of seeds and tracks "
+            f"flips from {SIGN_FLIP_SEEDS} seeds on, of a t test with fewer); better: the share of seeds and cases "
             "with more."
         )
     return text + " Sampled actions also measure the noise of exploration." * sampled
@@ -129,10 +136,10 @@ def progress(finished: int, started: int) -> str:
     return f"{finished} of {started} runs that were started are finished; repeat their command to finish the others."
 
 
-def _curves(runs: Sequence[Run]) -> Iterator[tuple[str, list[Sequence[dict[str, float]]]]]:
-    """Yield each label with the learning curves of its runs."""
+def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
+    """Yield each label with its runs that have a learning curve."""
     for label in dict.fromkeys(run.label for run in runs if run.curve):
-        yield label, [run.curve for run in runs if run.label == label and run.curve]
+        yield label, [run for run in runs if run.label == label and run.curve]
 
 
 def _other(against: str | None) -> str:
@@ -148,10 +155,10 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
     return [markdown_table(rows, columns)] if rows else []
 
 
-def _tracks(comparison: Comparison) -> str:
+def _cases(comparison: Comparison) -> str:
     groups = (*comparison.guides, *comparison.agents)
-    names = list(dict.fromkeys(track for group in groups for track in group.tracks))
-    if len(names) > MAX_TRACKS:
-        return f"The rewards on each of the {len(names)} tracks are in report_tracks.csv."
+    names = list(dict.fromkeys(case for group in groups for case in group.cases))
+    if len(names) > MAX_CASES:
+        return f"The rewards in each of the {len(names)} cases are in report_cases.csv."
     rows = [{"driver": group.title} | group.by_seed("reward").mean().to_dict() for group in groups]
     return markdown_table(rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names})

@@ -4,54 +4,44 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 import pandas as pd
 import yaml
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.train.measures import Measure, measures_of
 from coil_rl.train.trust import read_yaml
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
-DRIVER = ("driver", "advice", "actions", "track")
-MEASURES = ("reward", "lap_time", "smoothness", "completed", "crashed", "clearance")
+DRIVER = ("driver", "advice", "actions", "case")
 EVALUATION, SELECTION = "evaluation", "selection"  # sets of cases: for reports, and for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
-PER_STEP = "per_step_"  # prefix of the columns of tasks
-TERM = "reward_"  # prefix of the columns of the terms of the reward
+PER_STEP = "per_step_"  # prefix of the measures of tasks
+TERM = "reward_"  # prefix of the measures of the terms of the reward
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One training run.
-
-    Attributes:
-        folder: of the run.
-        label: name shared by the seeds of one method.
-        seed: of the run.
-        needs_guide: whether the agent needs the guide during evaluation; None without an agent.
-        evaluation: one row per driver and track, empty until the run is finished: `driver` ("guide", "guide NAME" for
-            one of several, or the label), `advice` (its modification, such as "zeroed"; empty for none), `actions`
-            ("deterministic" or "sampled"), `track`, MEASURES, for each task `per_step_TASK`, and for each term of the
-            reward `reward_TERM`.
-        curve: rows of metrics.csv; empty if nothing was trained.
-        guide_returns: mean return of each guide in the cases of the evaluation, if it was measured.
-        seconds: duration of the training; None if unknown, as for an interrupted run.
-    """
+    """One training run."""
 
     folder: Path
-    label: str
+    label: str  # shared by the seeds of one method
     seed: int
-    needs_guide: bool | None
+    needs_guide: bool | None  # whether the agent needs the guide during evaluation; None without an agent
+    # One row per driver and case, empty until the run is finished: `driver` ("guide", "guide NAME" for one of several,
+    # or the label), `advice` (its modification, such as "zeroed"; empty for none), `actions` ("deterministic" or
+    # "sampled"), `case`, `reward`, and the measures.
     evaluation: pd.DataFrame = field(default_factory=pd.DataFrame, repr=False)
-    curve: Sequence[dict[str, float]] = field(default=(), repr=False)
-    guide_returns: Mapping[str, float] = field(default_factory=dict)
-    seconds: float | None = None
+    measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)  # definitions by name
+    curve: Sequence[dict[str, float]] = field(default=(), repr=False)  # rows of metrics.csv; empty without training
+    guide_returns: Mapping[str, float] = field(default_factory=dict)  # mean of each guide in the evaluation, if known
+    seconds: float | None = None  # duration of the training; None if unknown, as for an interrupted run
 
     @property
     def finished(self) -> bool:
@@ -91,6 +81,8 @@ def _read_run(folder: Path) -> Run:
         if not isinstance(config, DictConfig):
             raise ValueError("a list")
         run = Run(folder, str(config["label"]), int(config["seed"]), config["method"]["needs_guide"])
+        nodes = OmegaConf.select(config, "evaluation.measures") or {}
+        measures = measures_of({name: node for name, node in nodes.items()})
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split("\n    full_key")[0].split())
         raise UserError(
@@ -110,16 +102,20 @@ def _read_run(folder: Path) -> Run:
         with file_of_a_run(path := folder / f"{name}.json", remedy):
             numbers[name] = _read_numbers(path)
     guide_returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
-    return Run(folder, run.label, run.seed, run.needs_guide, evaluation, curve, guide_returns, seconds)
+    return replace(
+        run, evaluation=evaluation, measures=measures, curve=curve, guide_returns=guide_returns, seconds=seconds
+    )
 
 
 def _read_evaluation(path: Path) -> pd.DataFrame:
     frame = _read_csv(path)
-    numbers = [*MEASURES, *(column for column in frame if column.startswith((PER_STEP, TERM)))]
+    numbers = ["reward", *(column for column in frame if column not in (*DRIVER, "reward"))]
     frame = frame[[*DRIVER, *numbers]].astype(dict.fromkeys(numbers, float))
-    frame = frame[frame["track"] != "mean"]
+    frame = frame[frame["case"] != "mean"]
     if frame.empty:
         raise ValueError("no rows")
+    if frame.duplicated(list(DRIVER)).any():
+        raise ValueError("two rows of one driver in the same case")
     return frame
 
 

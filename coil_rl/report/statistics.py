@@ -89,12 +89,12 @@ def count_of_seeds(count: int, seeds: int) -> str:
 
 
 def wins(x: ArrayLike, y: ArrayLike) -> Array:
-    """Return 1 where x scores more than y for the same seed and track, 0.5 for ties, 0 otherwise.
+    """Return 1 where x scores more than y for the same seed and case, 0.5 for ties, 0 otherwise.
 
-    x is [seeds, tracks]; y is the same, or [1, tracks] for a score shared by all seeds.
+    x is [seeds, cases]; y is the same, or [1, cases] for a score shared by all seeds.
     """
     first, second = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if first.ndim != 2 or second.ndim != 2 or second.shape not in (first.shape, (1, first.shape[1])):
-        raise ValueError(f"x and y must be [seeds, tracks] of the same seeds; got {first.shape} and {second.shape}.")
+        raise ValueError(f"x and y must be [seeds, cases] of the same seeds; got {first.shape} and {second.shape}.")
     won: Array = (first > second) + 0.5 * (first == second)
     return won

@@ -38,10 +38,6 @@ class TrackPlot:
         title: above the legend.
         dpi: pixels per inch.
         groups: number of groups of equally many tracks; each group begins a row.
-
-    Attributes:
-        scale: inches per metre.
-        offsets: [tracks, 2] m, from the coordinates of each track to those of the axes.
     """
 
     def __init__(
@@ -65,7 +61,7 @@ class TrackPlot:
             rows = [row for group in grouped for row in np.array_split(group, -(-len(group) // TRACKS_PER_ROW))]
             widths = [style.WIDTH - 2 * style.MARGIN - (len(row) - 1) * GAP for row in rows]
             fits = [width / sizes[row, 0].sum() for width, row in zip(widths, rows, strict=True)]
-            self.scale = float(min(*fits, MAX_TRACK_HEIGHT / sizes[:, 1].max()))
+            self.scale = float(min(*fits, MAX_TRACK_HEIGHT / sizes[:, 1].max()))  # inches per metre
             self.figure.set_size_inches(style.WIDTH, 3.0)
             header = style.draw_header(self.figure, [*legend, *_cone_handles()], title) + 0.12
             heights = [NAME_HEIGHT + self.scale * float(sizes[row, 1].max()) for row in rows]
@@ -75,7 +71,7 @@ class TrackPlot:
             xlim, ylim = (0, style.WIDTH / self.scale), (0, height / self.scale)
             self.axes = self.figure.add_axes((0, 0, 1, 1), xlim=xlim, ylim=ylim)
             self.axes.axis("off")
-            self.offsets = np.empty((len(tracks), 2))
+            self.offsets = np.empty((len(tracks), 2))  # m, from the coordinates of each track to those of the axes
             top = header
             for row, row_height in zip(rows, heights, strict=True):
                 free = (style.WIDTH - 2 * style.MARGIN - self.scale * sizes[row, 0].sum()) / len(row)

@@ -35,19 +35,12 @@ MAX_POSES = 1000  # in one call, to limit the memory
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A recorded drive.
+    """A recorded drive."""
 
-    Attributes:
-        method: display name of the driver.
-        row: its measures without `smoothness`; `seed` is that of its run, None if there is no run.
-        line: [M, 2] m, positions of the robot.
-        track: the track, if the recording has it.
-    """
-
-    method: str
-    row: Row
-    line: Array
-    track: Track | None
+    method: str  # display name of the driver
+    row: Row  # its measures without `smoothness`; `seed` is that of its run, None if there is no run
+    line: Array  # [M, 2] m, positions of the robot
+    track: Track | None  # None if the recording has none
 
 
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:

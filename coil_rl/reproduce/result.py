@@ -15,13 +15,9 @@ NO_RUNS: Runs = MappingProxyType({})
 
 
 class Result(ABC):
-    """A table, figure or claim of the paper; the constructor takes its options and checks them.
+    """A table, figure or claim of the paper; the constructor takes its options and checks them."""
 
-    Attributes:
-        experiments: experiments whose runs it needs; empty if it needs no training.
-    """
-
-    experiments: Sequence[str] = ()
+    experiments: Sequence[str] = ()  # whose runs it needs; empty if it needs no training
 
     @abstractmethod
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -53,11 +49,7 @@ class WorldsResult(Result):
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
-    """Return the runs of each label.
-
-    Raises:
-        UserError: if a label has no run.
-    """
+    """Return the runs of each label; raises a `UserError` if a label has no run."""
     available = [run for of_experiment in runs.values() for run in of_experiment]
     selected = {label: [run for run in available if run.label == label] for label in labels}
     for label, of_label in selected.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -65,73 +66,59 @@ as drivers without a complete lap are compared by clearance only. Intervals: t o
 Clopper-Pearson; a single seed has none and decides nothing."""
 
 
+@dataclass(eq=False)
 class Table6(Result):
     """Smoothness, laps, crashes and lines of several drivers, from recordings.
 
     A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide and
     the agents of runs drive the simulated robot and are recorded next to the page; existing recordings are reused.
 
-    Args:
-        experiments: experiments whose agents drive if there are no recordings.
-        recordings: MCAP files, rosbag2 directories or folders of MCAP files; or lists of them by driver name.
-        labels: labels of the runs that drive, with the guide of the first of them.
-        repeats: drives of each driver, which differ by the LiDAR noise.
-        laps: laps of a drive.
-        scan: topic of the LiDAR.
-        odometry: topic of the odometry; None to integrate the commands instead.
-        command: topic of the robot's commands, or of another policy's, such as a replay's.
-        car_length: L of the robot, m.
-        max_steering: degrees of an action of 1.
-        seed: of the LiDAR.
-
     Raises:
         UserError: if there are neither recordings nor experiments.
         RecordingError: for an unusable recording.
     """
 
-    def __init__(
-        self,
-        experiments: Sequence[str] = (),
-        recordings: Sequence[str] | Mapping[str, Sequence[str]] = (),
-        *,
-        labels: Sequence[str] = ("oil", "ppo", "coil"),
-        repeats: int = 3,
-        laps: int = 3,
-        scan: str = "/scan",
-        odometry: str | None = "/odom",
-        command: str | None = "/cmd_vel",
-        car_length: float = 2 / 7,
-        max_steering: float = 80.0,
-        seed: int = 0,
-    ) -> None:
-        check_range(1, repeats=repeats, laps=laps)
-        if not labels:
+    experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings
+    # MCAP files, rosbag2 directories or folders of MCAP files; or lists of them by driver name.
+    recordings: Sequence[str] | Mapping[str, Sequence[str]] = ()
+    _: KW_ONLY
+    labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs that drive, with the guide of the first of them
+    repeats: int = 3  # drives of each driver, which differ by the LiDAR noise
+    laps: int = 3  # laps of a drive
+    scan: str = "/scan"  # topic of the LiDAR
+    odometry: str | None = "/odom"  # topic of the odometry; None to integrate the commands instead
+    command: str | None = "/cmd_vel"  # topic of the robot's commands, or of another policy's, such as a replay's
+    car_length: float = 2 / 7  # L of the robot, m
+    max_steering: float = 80.0  # degrees of an action of 1
+    seed: int = 0  # of the LiDAR
+
+    def __post_init__(self) -> None:
+        check_range(1, repeats=self.repeats, laps=self.laps)
+        if not self.labels:
             raise ValueError("labels=[] leaves the guide alone; give at least one")
-        by_name = recordings if isinstance(recordings, Mapping) else {"": recordings}
+        by_name = self.recordings if isinstance(self.recordings, Mapping) else {"": self.recordings}
         files = [(name, file) for name, paths in by_name.items() for path in paths for file in _files(Path(path))]
-        self.recordings = [read_recording(file, scan, odometry, command) for _, file in files]
+        self.read = [read_recording(file, self.scan, self.odometry, self.command) for _, file in files]
         # Measured here, so that a bad recording fails before any training.
-        self.drives = [measure(found, name) for (name, _), found in zip(files, self.recordings, strict=True)]
-        if recordings and not files:
-            raise UserError(f"recordings={recordings} has no MCAP file; give some, or none to let the runs drive")
-        if not files and not experiments:
+        self.drives = [measure(found, name) for (name, _), found in zip(files, self.read, strict=True)]
+        if self.recordings and not files:
+            raise UserError(f"recordings={self.recordings} has no MCAP file; give some, or none to let the runs drive")
+        if not files and not self.experiments:
             raise UserError("recordings=[] and experiments=[] give no driver; give one of them")
-        self.experiments = [] if files else list(experiments)
-        self.labels, self.repeats, self.laps, self.seed = list(labels), repeats, laps, seed
-        self.car_length, self.max_steering = car_length, max_steering
+        self.experiments = [] if files else list(self.experiments)
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         if self.experiments:
             own = {experiment: runs[experiment] for experiment in self.experiments}
-            self.recordings = self._record(own, stem.with_name(f"{stem.name}_drives"))
-            self.drives = [measure(recording) for recording in self.recordings]
+            self.read = self._record(own, stem.with_name(f"{stem.name}_drives"))
+            self.drives = [measure(recording) for recording in self.read]
         rows = [
             {**drive.row, "smoothness": smoothness(recording, self.car_length, self.max_steering)}
-            for drive, recording in zip(self.drives, self.recordings, strict=True)
+            for drive, recording in zip(self.drives, self.read, strict=True)
         ]
         write_csv(rows, stem.with_suffix(".csv"))
-        suffix = " (simulated)" if any(recording.simulated for recording in self.recordings) else ""
+        suffix = " (simulated)" if any(recording.simulated for recording in self.read) else ""
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
         return robot_page(rows, suffix, self.max_steering)
 
@@ -143,7 +130,7 @@ class Table6(Result):
     def _drivers(self, runs: Runs) -> Iterator[Driver]:
         """Yield the guide of the first run, and the agent of each run."""
         make_env = partial(
-            SimulatedRobotEnv, num_cars=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
+            SimulatedRobotEnv, num_envs=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
             max_steering=self.max_steering, seed=self.seed,
         )  # fmt: skip
         selected = [run for of_label in runs_by_label(self.labels, runs).values() for run in of_label]

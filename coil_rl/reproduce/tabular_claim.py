@@ -8,6 +8,7 @@ of a few; the guide always observes the state.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -50,46 +51,33 @@ exactly, with the 95 % (Wilson) interval of the last share. The paper: at least 
 would be 100 %. Plain: Q-learning without advice."""
 
 
+@dataclass(eq=False)
 class TabularCoil(Result):
-    """Tabular COIL with guides of different quality.
+    """Tabular COIL with guides of different quality."""
 
-    Args:
-        worlds: number of random worlds; world k has the seed k.
-        states: of each world.
-        actions: of each world.
-        classes: number of state classes; the agent that observes classes does not observe the state.
-        noise: probability of a random action of the noisy guide.
-        epsilon: see `q_learning`.
-        power: see `q_learning`.
-        episode_steps: length of an episode.
-        steps: numbers of steps after which the policies are evaluated.
-    """
+    worlds: int = 20  # number of random worlds; world k has the seed k
+    states: int = 12  # of each world
+    actions: int = 3  # of each world
+    classes: int = 4  # of states; the agent that observes classes does not observe the state
+    noise: float = 0.2  # probability of a random action of the noisy guide
+    epsilon: float = 0.2  # see `q_learning`
+    power: float = 0.6  # see `q_learning`
+    episode_steps: int = 50  # length of an episode
+    steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000)  # after which the policies are evaluated
 
-    def __init__(
-        self,
-        worlds: int = 20,
-        states: int = 12,
-        actions: int = 3,
-        classes: int = 4,
-        noise: float = 0.2,
-        epsilon: float = 0.2,
-        power: float = 0.6,
-        episode_steps: int = 50,
-        steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000),
-    ) -> None:
-        check_range(1, worlds=worlds, actions=actions, classes=classes)
-        if states < max(3, classes):
-            raise ValueError(f"states={states} must be at least 3, and at least classes={classes}")
-        check_range(0, 1, noise=noise)
-        if not steps or list(steps) != sorted(set(steps)) or steps[0] < 1:
-            raise ValueError(f"steps={list(steps)} must be increasing integers from 1")
-        self.worlds, self.states, self.actions, self.classes = worlds, states, actions, classes
-        self.steps = tuple(steps)
-        self.learn = partial(q_learning, epsilon=epsilon, power=power, episode_steps=episode_steps)
+    def __post_init__(self) -> None:
+        check_range(1, worlds=self.worlds, actions=self.actions, classes=self.classes)
+        if self.states < max(3, self.classes):
+            raise ValueError(f"states={self.states} must be at least 3, and at least classes={self.classes}")
+        check_range(0, 1, noise=self.noise)
+        self.steps = tuple(self.steps)
+        if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
+            raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")
+        self.learn = partial(q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps)
         self.learn(toymaker(), 0, np.random.default_rng(0))  # checks its options
         self.guides: Mapping[str, Callable[[MDP], Array]] = {
             "optimal": optimal_guide,
-            f"noisy ({noise:.0%})": partial(noisy_guide, noise=noise),
+            f"noisy ({self.noise:.0%})": partial(noisy_guide, noise=self.noise),
             "random": random_guide,
             "worst": worst_guide,
         }

@@ -25,11 +25,7 @@ SHARES = (0.1, 0.05, 0.02, 0.01, 0.001)
 
 
 class Table1(Result):
-    """Q of the toymaker, by value iteration.
-
-    Args:
-        tolerance: largest error of Q.
-    """
+    """Q of the toymaker, by value iteration; `tolerance` is the largest error of Q."""
 
     def __init__(self, tolerance: float = 1e-9) -> None:
         check_range(0, above=True, tolerance=tolerance)
@@ -74,11 +70,7 @@ class Table1(Result):
 
 
 class Figure6(Result):
-    """V of both states after each step of value iteration.
-
-    Args:
-        iterations: number of iterations to show.
-    """
+    """V of both states after each of the first `iterations` steps of value iteration."""
 
     def __init__(self, iterations: int = 160) -> None:
         check_range(1, iterations=iterations)

@@ -9,7 +9,7 @@ from typing import Any
 
 from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
 from coil_rl.report.comparison import Group, compare, paired
-from coil_rl.report.runs import DRIVER, GUIDE, MEASURES, TERM, Run
+from coil_rl.report.runs import GUIDE, TERM, Run
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
 
@@ -86,7 +86,7 @@ class Table5(WorldsResult):
     def _row(self, group: Group, groups: Sequence[Group]) -> dict[str, Any]:
         """Return the measures of a driver, and its comparison with the guide and with `against`."""
         _, spec = _score(groups)
-        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means(), **group.parts(TERM)}
+        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means()}
         row |= {"crashes": group.crashes, "score cell": group.score.cell(spec)}
         others = {other.name: other for other in groups if other.name != group.name}
         row |= {"difference": None, "better": None, "over_guide": None}
@@ -158,7 +158,7 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
 
 def _track_table(groups: Sequence[Group], name: str) -> str:
     """Return the mean reward by driver and track, with the completed share where it is below 1."""
-    tracks = groups[0].tracks
+    tracks = groups[0].cases
     if len(tracks) > MAX_TRACK_COLUMNS:
         return f"The numbers of each of the {len(tracks)} tracks are in {name}.csv."
     rows = []
@@ -188,7 +188,7 @@ def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> 
 
 def _episodes(run: Run) -> list[dict[str, Any]]:
     """Return the CSV rows of a run, one per driver and track."""
-    rows = run.evaluation[[*DRIVER, *MEASURES]].to_dict("records")
+    rows = run.evaluation.to_dict("records")
     return [{"label": run.label, "seed": run.seed} | row for row in rows]
 
 

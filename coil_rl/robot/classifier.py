@@ -52,20 +52,15 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class LabelledClusters:
-    """N clusters with their true cones.
+    """N clusters with their true cones."""
 
-    The features [N, 3] m are width, depth and girth; `drive`, `scan` and `cone` [N] are indices of the drive, of the
-    scan in the drive, and of the cone on its track; `distance` [N] m is that of the centroid; `visibility` [N] is the
-    share of the cone's beams that no nearer cone blocks.
-    """
-
-    features: Array
+    features: Array  # [N, 3] m: width, depth and girth
     thick: Flags
-    drive: Integers
-    scan: Integers
-    cone: Integers
-    distance: Array
-    visibility: Array
+    drive: Integers  # index of the drive, [N] as the following
+    scan: Integers  # index of the scan in the drive
+    cone: Integers  # index of the cone on its track
+    distance: Array  # m, of the centroid
+    visibility: Array  # share of the cone's beams that no nearer cone blocks
 
 
 @dataclass(frozen=True)
@@ -177,11 +172,7 @@ def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) ->
 
 
 def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
-    """Read a file of `save_classifier`.
-
-    Raises:
-        UserError: if it is missing, or not a cone classifier.
-    """
+    """Read a file of `save_classifier`; raises a `UserError` if it is missing, or not a cone classifier."""
     try:
         classifier = ConeClassifier(**json.loads(Path(path).read_text(encoding="utf-8")))
     except OSError as error:

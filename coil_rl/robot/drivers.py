@@ -19,16 +19,11 @@ from coil_rl.train.load import load_policy_in_env, weights_file
 
 @dataclass(frozen=True)
 class Driver:
-    """A guide or an agent that can drive robots.
+    """A guide or an agent that can drive robots."""
 
-    Attributes:
-        name: first part of the names of its recordings.
-        about: notes in its recordings: its display name as `policy`, and what distinguishes it from other drivers.
-        make_env_and_policy: returns the robots, with the transforms of the policy, and the policy.
-    """
-
-    name: str
-    about: Mapping[str, str]
+    name: str  # first part of the names of its recordings
+    about: Mapping[str, str]  # notes in its recordings: its display name as `policy`, and what tells it from others
+    # Returns the robots, with the transforms of the policy, and the policy.
     make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]]
 
 

@@ -25,9 +25,6 @@ class Simulator:
         mdp: the world.
         rng: random generator.
         episode_steps: maximum length of an episode; None for no limit. A terminal state also ends an episode.
-
-    Attributes:
-        state: the current state.
     """
 
     def __init__(self, mdp: MDP, rng: Generator, episode_steps: int | None = None) -> None:
@@ -44,11 +41,7 @@ class Simulator:
         self.state, self.steps = bisect_right(self._start, self.rng.random()), 0
 
     def step(self, action: int) -> tuple[float, int]:
-        """Take an action.
-
-        Returns:
-            The reward and the next state. After the end of an episode, `state` is already the next start state.
-        """
+        """Return the reward and the next state of an action; after an episode `state` is the next start state."""
         next_state = bisect_right(self._next[self.state][action], self.rng.random())
         reward = self._rewards[self.state][action][next_state]
         self.state, self.steps = next_state, self.steps + 1
@@ -83,20 +76,11 @@ def sample_transitions(
 
 
 class ModelEstimate:
-    """Maximum-likelihood estimate of P and R from transitions (equations 50 and 51).
-
-    Args:
-        states: S.
-        actions: A.
-
-    Attributes:
-        counts: [S, A, S], number of observed transitions.
-        rewards: [S, A, S], sum of their rewards.
-    """
+    """Maximum-likelihood estimate of P and R from transitions (equations 50 and 51), for S states and A actions."""
 
     def __init__(self, states: int, actions: int) -> None:
-        self.counts: Array = np.zeros((states, actions, states))
-        self.rewards: Array = np.zeros((states, actions, states))
+        self.counts: Array = np.zeros((states, actions, states))  # number of observed transitions
+        self.rewards: Array = np.zeros((states, actions, states))  # sum of their rewards
 
     def add(self, transitions: Transitions) -> None:
         """Count more transitions."""
@@ -116,11 +100,7 @@ class ModelEstimate:
         return np.divide(self.rewards, self.counts, out=np.zeros_like(self.rewards), where=self.counts > 0)
 
     def mdp(self, gamma: float) -> MDP:
-        """Return the estimate as a world to plan in.
-
-        Raises:
-            ValueError: if an action has no sample in some state.
-        """
+        """Return the estimate as a world to plan in; raises a `ValueError` if an action has no sample in some state."""
         missing = np.argwhere(self.counts.sum(axis=2) == 0)
         if len(missing):
             state, action = missing[0]
@@ -133,17 +113,11 @@ class ModelEstimate:
 
 @dataclass(frozen=True)
 class QLearningResult:
-    """The learned Q; O is the number of observations, which are the states unless specified otherwise.
+    """The learned Q; O is the number of observations, which are the states unless specified otherwise."""
 
-    Attributes:
-        Q: [O, A].
-        visits: [O, A], number of updates of each pair.
-        history: [K, O, A], Q after each of the requested numbers of steps.
-    """
-
-    Q: Array
-    visits: Integers
-    history: Array
+    Q: Array  # [O, A]
+    visits: Integers  # [O, A], number of updates of each pair
+    history: Array  # [K, O, A], Q after each of the requested numbers of steps
 
     @property
     def policy(self) -> Integers:

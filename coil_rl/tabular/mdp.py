@@ -25,9 +25,6 @@ class MDP:
         states: their names, for tables and messages; numbers by default.
         actions: their names.
 
-    Attributes:
-        r: [S, A], expected reward of an action in a state.
-
     Raises:
         ValueError: if the arrays are no Markov decision process, naming the entry.
 
@@ -65,7 +62,7 @@ class MDP:
         self.start: Array = np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
         if self.start.shape != (count,) or (self.start < 0).any() or not np.isclose(self.start.sum(), 1):
             raise ValueError(f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}")
-        self.r: Array = (self.P * self.R).sum(axis=2)
+        self.r: Array = (self.P * self.R).sum(axis=2)  # [S, A], expected reward of an action in a state
 
     @property
     def terminal(self) -> NDArray[np.bool_]:
@@ -128,10 +125,7 @@ def toymaker(gamma: float = 0.95) -> MDP:
     """Return Howard's toymaker (1960), the paper's first example, small enough to solve by hand.
 
     The toy is successful or not, and the toymaker advertises or not. Advertising costs reward now and makes a
-    successful toy more likely.
-
-    Args:
-        gamma: discount factor; below 20/29, about 0.69, advertising does not pay.
+    successful toy more likely; with a discount factor below 20/29, about 0.69, it does not pay.
     """
     P = [[[0.5, 0.5], [0.8, 0.2]], [[0.4, 0.6], [0.7, 0.3]]]
     R = [[[9.0, 3.0], [4.0, 4.0]], [[3.0, -7.0], [1.0, -19.0]]]

@@ -17,19 +17,12 @@ TIE = 1e-9  # smaller differences of Q are rounding
 
 @dataclass(frozen=True)
 class PlanningResult:
-    """An optimal policy and its values.
+    """An optimal policy and its values."""
 
-    Attributes:
-        policy: [S] actions.
-        V: [S], value of each state.
-        Q: [S, A], value of each action, followed by the policy.
-        history: [K + 1, S], V before and after each of the K iterations.
-    """
-
-    policy: Integers
-    V: Array
-    Q: Array
-    history: Array
+    policy: Integers  # [S] actions
+    V: Array  # [S], value of each state
+    Q: Array  # [S, A], value of each action, followed by the policy
+    history: Array  # [K + 1, S], V before and after each of the K iterations
 
 
 def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> Array:

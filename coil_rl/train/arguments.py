@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from types import NoneType
+from typing import Any, get_args
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
@@ -13,6 +14,7 @@ from pydantic_core import SchemaError
 
 from coil_rl.errors import UserError, did_you_mean
 
+PLAIN = (bool, int, float, str, NoneType)
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -55,6 +57,8 @@ def _check_type(value: Any, annotation: Any, name: str) -> None:
     except (PydanticUserError, SchemaError):  # an annotation that cannot be checked
         return
     if (known := _known(value, list)) is _TARGET:
+        if all(part in PLAIN for part in get_args(annotation) or [annotation]):
+            raise UserError(f"{name} must be a plain value, not a node with _target_")
         return
     try:
         adapter.validate_python(known)

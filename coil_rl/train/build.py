@@ -8,6 +8,7 @@ from typing import Any
 import hydra.utils
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
@@ -113,7 +114,7 @@ def _transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> En
 
 
 def build_transforms(config: DictConfig, advice: str | None = None) -> list[Transform]:
-    """Return the transforms of the method, of `degrade` if the method has any, of `advice` and of `action`."""
+    """Return the transforms of method, `degrade` if the method has any, `advice`, `action` and network."""
     transforms = build_all(config.method.transforms, "method.transforms")
     if transforms:
         transforms += build_all(config.degrade, "degrade")
@@ -121,6 +122,8 @@ def build_transforms(config: DictConfig, advice: str | None = None) -> list[Tran
         transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
     if config.action:
         transforms.append(build(config.action, "action", Transform))
+    if network := OmegaConf.select(config, "learner.network"):  # one with a memory needs an env that carries it
+        transforms += getattr(build(network, "learner.network"), "env_transforms", list)()
     return transforms
 
 
@@ -136,17 +139,17 @@ def build_guided_env(
 
     Args:
         config: with `env`, `guide` and `degrade`.
-        overrides: of `env`, with `num_cars`: the number of cars for each guide. Those of the first guide come first.
+        overrides: of `env`, with `num_envs`: the number of rows for each guide. Those of the first guide come first.
         guides: instead of those of the configuration.
 
     Raises:
         UserError: as `build_env`.
     """
     guides = guides or build_guides(config)
-    cars = overrides["num_cars"]
-    env = build_bare_env(config, {**overrides, "num_cars": cars * len(guides)})
+    count = overrides["num_envs"]
+    env = build_bare_env(config, {**overrides, "num_envs": count * len(guides)})
     env = _transformed(env, [GuideActions(guides), *build_all(config.degrade, "degrade")], "degrade")
-    return env, FollowAdvice(env, [guide for guide in range(len(guides)) for _ in range(cars)])
+    return env, FollowAdvice(env, [guide for guide in range(len(guides)) for _ in range(count)])
 
 
 def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
@@ -170,17 +173,22 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 def cases_node(config: DictConfig, cases: str, drivers: int = 1) -> dict[str, Any]:
     """Return the overrides of `env` for a set of cases of the evaluation curve, all of them for each driver."""
     curve = config.evaluation.curve
-    return {**curve.env, **curve.cases[cases], "num_cars": drivers * curve.cars}
+    return {**curve.env, **curve.cases[cases], "num_envs": drivers * curve.num_envs}
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
-    """Return the learner of a configuration, which observes `method.observes` and `also_observes` of an env.
+    """Return the learner of a configuration, which observes `observes` and `method.observes` of an env.
 
     `guides` are for a learner that trains guides.
     """
     arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
-    keys = [*config.method.observes, *config.also_observes]
-    return build(config.learner, "learner", env=env, in_keys=keys, **arguments)
+    return build(config.learner, "learner", env=env, in_keys=observed_keys(config), **arguments)
+
+
+def observed_keys(config: DictConfig) -> list[NestedKey]:
+    """Return the keys of the entries that the agent of a configuration observes."""
+    keys = [*config.observes, *(config.method.observes or ())]
+    return [key if isinstance(key, str) else tuple(key) for key in keys]
 
 
 def learner_kind(config: DictConfig) -> str:
@@ -192,6 +200,12 @@ def learner_kind(config: DictConfig) -> str:
 def trains_guides(config: DictConfig) -> bool:
     """Return whether the learner of a configuration trains guides besides the agent."""
     return learner_kind(config) == "guides"
+
+
+def what_guides_see(config: DictConfig) -> dict[str, str]:
+    """Return by name the attribute `sees` of the guides that may know more than an agent."""
+    guides = {name: getattr(_target(node.get("_target_"), name), "sees", "") for name, node in config.guide.items()}
+    return {name: sees for name, sees in guides.items() if sees}
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
@@ -206,5 +220,7 @@ def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
             "# @package guide.NAME, or give +guide.NAME._target_"
         )
     if not config.guide:
-        raise UserError("guide: there is none; give at least one, as in guide=spline")
+        raise UserError(
+            f"guide: there is none, but method={config.method.name} needs one; give guide=NAME, or method=ppo"
+        )
     return {name: build(node, f"guide.{name}", TensorDictModuleBase) for name, node in config.guide.items()}

@@ -17,9 +17,11 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from pydantic import TypeAdapter, ValidationError
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.train.arguments import validation_message
 from coil_rl.train.build import (
@@ -33,11 +35,14 @@ from coil_rl.train.build import (
     cases_node,
     check_node,
     learner_kind,
+    observed_keys,
     trains_guides,
 )
 from coil_rl.train.config import TrainConfig
 from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
-from coil_rl.train.evaluation import INFO
+from coil_rl.train.evaluate_run import build_evaluation, build_pictures
+from coil_rl.train.measures import measures_of
+from coil_rl.transforms import GuideActions
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -46,6 +51,7 @@ KINDS = {
     "guides": ("improves its guides", "dynamic_coil"),
 }
 LARGEST_BATCH = 2**28
+EPISODE_REWARD = "episode_reward"  # written by a transform of every env
 
 
 def check(config: DictConfig) -> None:
@@ -61,21 +67,18 @@ def check_parts(config: DictConfig) -> None:
     has_agent = trains and config.method.observes is not None
     if has_agent:
         _check_learner_kind(config)
-    tracks = {}
-    for split in ("train", "test") if trains else ("test",):
-        tracks[split] = len(build(config.track.get(split), f"track.{split}"))
-        if not tracks[split]:
-            raise UserError(f"track.{split} gives no tracks; give at least one")
+    pictures = build_pictures(config)
+    cases = len(build_evaluation(config, pictures).cases)
     if trains or OmegaConf.select(config, "run") is None:
-        _check_guides(config, tracks)
+        _check_drivers(config, cases, [key for picture in pictures for key in picture.record.values()])
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
             raise UserError(f"label={config.label} cannot be used: it must not be empty, begin with guide or contain /")
-        _check_training(config, tracks["train"])
+        _check_training(config)
         if config.method.transforms:
             for advice in config.evaluation.advice:
-                _check_drive(config, "test", tracks["test"], partial(build_env, advice=advice))
+                _check_cases(config, cases, partial(build_env, advice=advice))
 
 
 def check_values(config: DictConfig) -> None:
@@ -91,8 +94,8 @@ def check_values(config: DictConfig) -> None:
         raise UserError(validation_message(error, values)) from None
     for name in ("budget", "proxy.budget"):
         budget = OmegaConf.select(config, name)
-        if isinstance(budget, DictConfig) and (frames := budget.cars * budget.steps) > LARGEST_BATCH:
-            raise UserError(f"{name}.cars x {name}.steps={frames} must be at most {LARGEST_BATCH}")
+        if isinstance(budget, DictConfig) and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH:
+            raise UserError(f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}")
     for name in ("device", "env.device"):
         if isinstance(device := OmegaConf.select(config, name), str):
             _check_device(name, device)
@@ -125,71 +128,96 @@ def _check_learner_kind(config: DictConfig) -> None:
         )
 
 
-def _check_guides(config: DictConfig, tracks: dict[str, int]) -> None:
-    env = _evaluation_env(config)
+def _check_drivers(config: DictConfig, cases: int, recorded: Iterable[NestedKey]) -> None:
+    env = _evaluation_env(config, recorded)
+    if not config.guide and not config.method.needs_guide and "advice" not in config.method.transforms:
+        return
     guides = build_guides(config)
     for name, guide in guides.items():
         check_guide_in_env(guide, env, f"guide.{name}")
     build_all(config.degrade, "degrade")
     if config.degrade:
-        for split, count in tracks.items():
-            _check_drive(config, split, count, partial(build_guided_env, guides=guides))
+        _check_cases(config, cases, partial(build_guided_env, guides=guides))
 
 
-def _evaluation_env(config: DictConfig) -> EnvBase:
-    """Return the env with one car, or raise a `UserError` if drivers cannot be evaluated in it."""
+def _evaluation_env(config: DictConfig, recorded: Iterable[NestedKey]) -> EnvBase:
+    """Return the env with one row, or raise a `UserError` if policies cannot be evaluated in it."""
     name = config.env.get("_target_", "it")
-    # First, because methods and evaluation set further keys of envs with tracks.
-    if "tracks" not in config.env:
+    if "num_envs" not in config.env:
         raise UserError(
-            f"env: {name} has no key tracks, so nothing can drive in it; choose another env "
-            "(for the steering of policies on a recording: coil-replay recording=FILE)"
+            f"env: {name} has no key num_envs, so no policy can act in it; choose another env "
+            "(for the actions of policies on a recording: coil-replay recording=FILE)"
         )
     check_node(config.env, "env")
-    env = build_bare_env(config, {**config.evaluation.env, "num_cars": 1})
-    missing = [f"info.{key}" for key in INFO if ("info", key) not in env.observation_spec.keys(True)]
-    if missing or (config.evaluation.gif and not hasattr(env, "rate")):
-        needs = f"entries {', '.join(missing)}" if missing else "attribute rate (steps per second) for evaluation.gif"
-        raise UserError(f"env: {name} lacks the {needs}; the evaluation reads them")
+    env = build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
+    measured = {
+        f"evaluation.measures.{name}": key
+        for name, measure in measures_of(config.evaluation.measures).items()
+        for key in (measure.entry, measure.where)
+        if key is not None
+    }
+    for name, key in measured.items():
+        _check_entry(env, key, name)
+    for key in recorded:
+        _check_entry(env, key, "evaluation.pictures")
     return env
 
 
+def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an env does not write an entry; `name` is the key of the configuration that names it."""
+    specs = (env.observation_spec, env.full_reward_spec, env.full_done_spec)
+    known = {_dotted(each): each for spec in specs for each in spec.keys(True)} | {EPISODE_REWARD: EPISODE_REWARD}
+    if _dotted(key) not in known:
+        raise UserError(
+            f"{name}={_dotted(key)} is no entry of the env; it has "
+            f"{', '.join(sorted(known))}{did_you_mean(_dotted(key), known)}"
+        )
+
+
 def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
-    """Raise a `UserError` if the env lacks an entry that the guide reads, or the guide's action has a wrong shape."""
-    data = env.reset()
-    for key in guide.in_keys:
-        if key not in data.keys(True):
-            raise UserError(f"{name}: it reads {key}, but the env has only {', '.join(map(_dotted, data.keys()))}")
-    shape, expected = guide(data)["action"].shape, env.action_spec.shape
-    if shape != expected:
-        raise UserError(f"{name}: its action has the shape {list(shape)}, but the env takes {list(expected)}")
-
-
-def _check_drive(config: DictConfig, split: str, tracks: int, build_drive: Callable[..., Any]) -> None:
-    # Some ways to degrade advice need several cars, and an evaluation has one car a track.
+    """Raise a `UserError` if the env lacks an entry that the guide reads, or the guide's action does not fit."""
     try:
-        build_drive(config, {**config.evaluation.env, "num_cars": tracks})
+        transform = GuideActions({"guide": guide})
+        memory = (key for each in transform.guides.memories.values() for key in each.specs)
+        known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
+        for key in guide.in_keys:
+            if key not in known:
+                has = ", ".join(map(_dotted, env.observation_spec.keys()))
+                raise UserError(f"{name}: it reads {_dotted(key)}, but the env has only {has}")
+        advised = TransformedEnv(env, transform)
+        advised.step(FollowAdvice(advised)(advised.reset()))
+        advised.state_dict()  # a state that no checkpoint can hold is refused before the training
+    except (KeyError, TypeError, ValueError) as error:
+        problem = str(error.args[0] if error.args else error).replace("the action of guide 'guide'", "its action")
+        raise UserError(f"{name}: {problem}") from error
+
+
+def _check_cases(config: DictConfig, cases: int, build_drive: Callable[..., Any]) -> None:
+    # Some ways to degrade advice need several rows, and an evaluation has one row a case.
+    try:
+        build_drive(config, {**config.evaluation.env, "num_envs": cases})
     except UserError as error:
-        raise UserError(f"track.{split} has {tracks} tracks, with one car each: {error}") from error
+        raise UserError(f"each case of the evaluation has one row, {cases} in all: {error}") from error
 
 
-def _check_training(config: DictConfig, tracks: int) -> None:
-    if not config.method.observes:
-        raise UserError("method.observes=[]: the agent has no observations; give some, or null for no agent")
+def _check_training(config: DictConfig) -> None:
+    if not observed_keys(config):
+        raise UserError("observes=[]: the agent has no observations; give the entries of the env that it observes")
     env = build_env(config, config.training.env)
     if trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
     guides = build_guides(config) if trains_guides(config) else {}
     check_proxies(config, guides_without_parameters(guides))
     learner = build_learner(config, env, guides_with_untrained_proxies(config) if guides else None)
-    frames = config.budget.cars * config.budget.steps
+    frames = config.budget.num_envs * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)
     if 2 * minibatches > frames:
         raise UserError(
             f"learner.minibatches={minibatches} leaves less than 2 frames to each minibatch, too few to standardise "
-            f"advantages; a batch has budget.cars x budget.steps = {frames} frames"
+            f"advantages; a batch has budget.num_envs x budget.steps = {frames} frames"
         )
-    if tracks == 1 and getattr(learner, "validate", False) and learner.group_key is not None:
+    grouped = config.track and getattr(learner, "validate", False) and learner.group_key is not None
+    if grouped and len(build(config.track.train, "track.train")) == 1:
         raise UserError(
             "track.train gives one track, which cannot be left out to validate; set learner.group_key=null, "
             "or learner.validate=false"
@@ -215,17 +243,12 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
 
 
 def _check_watch(config: DictConfig, env: EnvBase) -> None:
-    known = {_dotted(key) for spec in (env.observation_spec, env.full_reward_spec) for key in spec.keys(True)}
     groups = ("episode", "step")
     for group, keys in config.watch.items():
         if group not in groups:
             raise UserError(f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}")
         for name, key in keys.items():
-            if _dotted(key) not in known:
-                raise UserError(
-                    f"watch.{group}.{name}={list(key)} is no entry of the env; it has "
-                    f"{', '.join(sorted(known))}{did_you_mean(_dotted(key), known)}"
-                )
+            _check_entry(env, key, f"watch.{group}.{name}")
 
 
 def _dotted(key: str | Iterable[Any]) -> str:

@@ -16,6 +16,8 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import ConfigDict, Field, GetPydanticSchema
 from pydantic_core import core_schema
 
+from coil_rl.train.measures import REDUCTIONS
+
 LARGEST = 2**63 - 1
 # Keys in which two runs with the same numbers may differ.
 IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust", "proxy.folder")
@@ -30,7 +32,7 @@ def one_of(*choices: str) -> GetPydanticSchema:
 Seed = Annotated[int, Field(ge=0, le=LARGEST)]
 Positive = Annotated[int, Field(ge=1, le=LARGEST)]
 Threads = Annotated[int, Field(ge=1, le=1024)]
-Cars = Annotated[int, Field(ge=1, le=2**20)]
+Envs = Annotated[int, Field(ge=1, le=2**20)]
 Steps = Annotated[int, Field(ge=1, le=2**16)]
 Repeats = Annotated[int, Field(ge=1, le=10_000)]
 WhichPolicy = Annotated[str, one_of("last", "best")]
@@ -44,10 +46,10 @@ class NodeConfig:
 
 @dataclass
 class BudgetConfig(NodeConfig):
-    """Amount of experience: frames in total, and cars and steps per batch."""
+    """Amount of experience: frames in total, and envs in parallel and steps of each per batch."""
 
     frames: Positive = 1
-    cars: Cars = MISSING
+    num_envs: Envs = MISSING
     steps: Steps = 1
 
 
@@ -55,27 +57,48 @@ class BudgetConfig(NodeConfig):
 class CurveConfig(NodeConfig):
     """Evaluation of the policies that a run keeps, see `coil_rl.train.curve`.
 
-    `cars` is the number of cases in a set; `env` and, by the name of a set, `cases` are overrides of the env.
+    `num_envs` is the number of cases in a set; `env` and, by the name of a set, `cases` are overrides of the env.
     """
 
     points: Annotated[int, Field(ge=1, le=1000)] = 16
     batches: Annotated[int, Field(ge=1, le=1000)] = 1
-    cars: Cars = 1
+    num_envs: Envs = 1
     env: dict[str, Any] = field(default_factory=dict)
     cases: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 @dataclass
 class TrainingConfig(NodeConfig):
-    """Overrides of `env` in training."""
+    """Overrides of `env` in training, and `imitation_env` for methods that imitate a guide."""
 
     env: dict[str, Any] = field(default_factory=dict)
+    imitation_env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class MeasureConfig(NodeConfig):
+    """A measure of an episode, see `coil_rl.train.measures.Measure`."""
+
+    entry: Any = MISSING
+    reduction: Annotated[str, one_of(*REDUCTIONS)] = "mean"
+    where: Any = None
+    at_least: float | None = None
+    at_most: float | None = None
+    title: str = ""
+    format: str = ".1f"
 
 
 @dataclass
 class EvaluationConfig(NodeConfig):
-    """Evaluation of a policy."""
+    """Evaluation of a policy.
 
+    `cases` is their number, or a node that gives their names; `sections` are those of coil-listen.
+    """
+
+    cases: Any = 1
+    measures: dict[str, MeasureConfig] = field(default_factory=dict)
+    pictures: dict[str, Any] = field(default_factory=dict)
+    sections: dict[str, Any] | None = None
     env: dict[str, Any] = field(default_factory=dict)
     curve: CurveConfig = field(default_factory=CurveConfig)
     advice: dict[str, Any] = field(default_factory=dict)
@@ -87,10 +110,13 @@ class EvaluationConfig(NodeConfig):
 
 @dataclass
 class MethodConfig(NodeConfig):
-    """Observations and transforms of the agent, and the kind of its learner. `observes: null` means no agent."""
+    """Transforms of the agent, the kind of its learner, and what it observes besides the env's entries.
+
+    `observes: null` means no agent.
+    """
 
     name: str = MISSING
-    observes: list[str] | None = MISSING
+    observes: list[Any] | None = MISSING
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
     learner: Annotated[str, one_of("agent", "imitation", "guides")] = "agent"
@@ -123,19 +149,20 @@ class ProgramConfig(NodeConfig):
 
 @dataclass
 class DrivingConfig(ProgramConfig):
-    """Configuration that all programs share that drive cars."""
+    """Configuration that all programs share that drive."""
 
-    preset: dict[str, Any] = MISSING
-    track: dict[str, Any] = MISSING
+    preset: dict[str, Any] = field(default_factory=dict)
+    track: dict[str, Any] = field(default_factory=dict)
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
     degrade: dict[str, Any] = field(default_factory=dict)
     method: MethodConfig = field(default_factory=MethodConfig)
-    also_observes: list[str] = field(default_factory=list)
+    observes: list[Any] = field(default_factory=lambda: ["observation"])
     action: dict[str, Any] = field(default_factory=dict)
     budget: BudgetConfig = field(default_factory=BudgetConfig)
     training: TrainingConfig = field(default_factory=TrainingConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    watch: dict[str, dict[str, Any]] = field(default_factory=dict)
     seed: Seed = 0
     device: str = "cpu"
     threads: Threads = 2
@@ -151,7 +178,6 @@ class TrainConfig(DrivingConfig):
     learner: dict[str, Any] = MISSING
     logger: dict[str, Any] | None = None
     proxy: ProxyConfig | None = None
-    watch: dict[str, dict[str, list[str]]] = field(default_factory=dict)
     checkpoint_every: Positive = 10
     existing: Annotated[str, one_of("refuse", "resume")] = "refuse"
     resume: str | None = None
@@ -170,9 +196,6 @@ class ListenConfig(DrivingConfig):
 
     run: str = MISSING
     donors: Repeats = 16
-    turn_radius: Annotated[float, Field(ge=0.5, le=1000)] = 10.0
-    approach: Annotated[float, Field(ge=0.1, le=100)] = 4.0
-    bin: Annotated[float, Field(ge=0.1, le=100)] = 1.0
 
 
 @dataclass

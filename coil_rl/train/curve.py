@@ -19,7 +19,9 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.train import checkpoint
-from coil_rl.train.evaluation import episodes
+from coil_rl.train.evaluation import Totals, episodes
+from coil_rl.train.load import memory_keys
+from coil_rl.train.measures import Measure
 
 POLICIES = "policies"  # subfolder with the kept policies
 
@@ -100,22 +102,22 @@ def measures(
     These are the `return`, the sum of the rewards of the task, and those of `watch`; `tick` is called after every step.
     """
     watch = watch or {}
-    at_end = {"return": ("episode_reward",), **{name: tuple(key) for name, key in watch.get("episode", {}).items()}}
-    over_steps = {name: tuple(key) for name, key in watch.get("step", {}).items()}
-    sums: dict[str, Tensor] = {}
-    steps: Tensor | float = 0.0
+    at_end, over_steps = watch.get("episode", {}), watch.get("step", {})
+    totals = Totals(
+        {"return": Measure("episode_reward", "last")}
+        | {name: Measure.of(key, reduction="last") for name, key in at_end.items()}
+        | {name: Measure.of(key, reduction="mean") for name, key in over_steps.items()}
+    )
     for after, running in episodes(env, policy, tick=tick):
-        weights = {name: running & after["done"] for name in at_end} | dict.fromkeys(over_steps, running)
-        for name, key in (at_end | over_steps).items():
-            sums[name] = sums.get(name, 0) + torch.where(weights[name], after[key], 0).double()
-        steps = steps + running
-    return {name: (value / steps if name in over_steps else value).squeeze(-1) for name, value in sums.items()}
+        totals.add(after, running)
+    return totals.results()
 
 
 def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> TensorDictModuleBase:
     """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
     tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
-    return StackedPolicies(policy, states) if tensors == set(policy.state_dict()) else PoliciesInTurn(policy, states)
+    stacked = tensors == set(policy.state_dict()) and not memory_keys(policy)
+    return StackedPolicies(policy, states) if stacked else PoliciesInTurn(policy, states)
 
 
 class PoliciesInTurn(TensorDictModuleBase):
@@ -123,16 +125,18 @@ class PoliciesInTurn(TensorDictModuleBase):
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
         self.policies = torch.nn.ModuleList(copy.deepcopy(policy) for _ in states)
         for each, state in zip(self.policies, states, strict=True):
             each.load_state_dict(state)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of the policy of each row."""
+        """Write the `action` of the policy of each row, and what that policy remembers."""
         parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
-        actions = [policy(part)["action"] for policy, part in zip(self.policies, parts, strict=True)]
-        return tensordict.set("action", torch.cat(actions))
+        parts = [policy(part) for policy, part in zip(self.policies, parts, strict=True)]
+        for key in self.out_keys:
+            tensordict.set(key, torch.cat([part[key] for part in parts]))
+        return tensordict
 
 
 class StackedPolicies(TensorDictModuleBase):

@@ -36,17 +36,17 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
     Raises:
         UserError: if the key `proxy` of the training run describes no network.
     """
-    if config.proxy is None or not config.proxy.method.observes:
+    if config.proxy is None or config.proxy.method.observes is None:
         raise UserError("proxy.method.observes: a proxy needs observations; give proxy=network")
     resolved: Any = OmegaConf.to_container(config, resolve=True)
     guide, proxy = {name: resolved["guide"][name]}, resolved["proxy"]
     values = {
-        **{key: resolved[key] for key in ("preset", "track", "device", "threads")},
+        **{key: resolved[key] for key in ("preset", "track", "observes", "device", "threads")},
         **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
-        "env": resolved["env"] | proxy["env"],
+        "env": resolved["env"] | resolved["training"]["imitation_env"] | proxy["env"],
         "guide": guide,
         "label": f"proxy of {name}",
-        "evaluation": {"env": resolved["evaluation"]["env"], "gif": False},
+        "evaluation": {key: resolved["evaluation"][key] for key in ("cases", "measures", "env")} | {"gif": False},
         "existing": "resume",
     }
     merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)

@@ -1,90 +1,131 @@
-"""Evaluation of a run: its agent and its guides on the test tracks, as tables and figures."""
+"""Evaluation of a run: its agent and its guides in all cases, as tables and figures."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Mapping, Sequence
-from functools import lru_cache
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coil_rl.errors import file_of_a_run
+from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import write_text
-from coil_rl.report import animate_lines, draw_lines, markdown_table, write_csv
-from coil_rl.report.runs import PER_STEP
-from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node
-from coil_rl.train.evaluation import EvaluationResult, evaluate_policy, summarise
+from coil_rl.report import Returns, markdown_table, write_csv
+from coil_rl.report.pictures import Picture
+from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node, what_guides_see
+from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.measures import Measure, measures_of, summarise
 
-COLUMNS = {
-    "driver": ("driver", ""),
-    "advice": ("advice", ""),
-    "actions": ("actions", ""),
-    "track": ("track", ""),
-    "reward": ("reward", ".1f"),
-    "lap_time": ("lap (s)", ".2f"),
-    "smoothness": ("smoothness", ".3f"),
-    "completed": ("completed", ".0%"),
-    "crashed": ("crashed", ".0%"),
-    "clearance": ("clearance (m)", ".2f"),
-}
+COLUMNS = {"driver": ("driver", ""), "advice": ("advice", ""), "actions": ("actions", ""), "case": ("case", "")}
+COLUMNS |= {"reward": ("reward", ".1f")}
+MAX_CASES = 8  # in the table for people
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation consists of: the names of its cases, its measures, and the entries that pictures need."""
+
+    cases: Sequence[str]
+    measures: Mapping[str, Measure]
+    record: Mapping[str, NestedKey]
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
+
+    def drive(self, env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> EvaluationResult:
+        """Evaluate a policy on an env whose rows are the cases, perhaps several times; see `evaluate_policy`."""
+        return evaluate_policy(env, policy, cases=self.cases, measures=self.measures, record=self.record, **options)
+
+
+def build_evaluation(config: DictConfig, pictures: Iterable[Picture] = ()) -> Evaluation:
+    """Return the evaluation of a configuration.
+
+    Raises:
+        UserError: for cases that are neither a number nor names, or without one.
+    """
+    cases = config.evaluation.cases
+    names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
+    names = list(map(str, range(names))) if isinstance(names, int) else names
+    if not isinstance(names, (list, tuple, ListConfig)) or not names:
+        raise UserError(f"evaluation.cases={cases} must be at least 1, or the names of the cases")
+    record = {name: key for picture in pictures for name, key in picture.record.items()}
+    return Evaluation(list(map(str, names)), measures_of(config.evaluation.measures), record)
+
+
+def build_pictures(config: DictConfig) -> list[Picture]:
+    """Return the pictures of a configuration; without any, the returns."""
+    nodes = config.evaluation.pictures.items()
+    return [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node] or [Returns()]
 
 
 def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int) -> None:
-    """Evaluate and write `episodes.csv`, `lines.png`, `lines.gif`, `evaluation.md` (means) and, last, `evaluation.csv`.
+    """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 
-    Each guide drives each track once. An agent drives it once with deterministic actions, `evaluation.repeats` times
+    Each guide drives each case once. An agent drives it once with deterministic actions, `evaluation.repeats` times
     with sampled ones if it samples, and once with each advice of `evaluation.advice` instead of its own.
 
     The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
     """
-    tracks = build(config.track.test, "track.test")
-    names = [track.name for track in tracks]
+    pictures = build_pictures(config)
+    evaluation = build_evaluation(config, pictures)
+    count = len(evaluation.cases)
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []
     drives: dict[str, EvaluationResult] = {}
 
     def add(result: EvaluationResult, driver: str, advice: str = "", actions: str = "deterministic") -> None:
         label = {"driver": driver, "advice": advice, "actions": actions}
-        table.extend(label | row for row in summarise(result.episodes))
+        table.extend(label | row for row in summarise(result.episodes, evaluation.measures))
         episodes.extend(label | row for row in result.episodes)
         if actions == "deterministic":
             drives[f"{driver}, {advice}" if advice else driver] = result
 
-    for driver, result in drive_guides(config, config.evaluation.env, names).items():
+    for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
         add(result, driver)
     torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         for advice, repeats in [] if agent is None else _plan(config, agent):
             bar.set_postfix_str(", ".join(filter(None, (config.label, advice))))
-            # Deterministic and sampling cars in one batch: the time of a step hardly depends on its size.
-            cars = torch.arange((1 + repeats) * len(tracks), device=config.device)
-            env = build_env(config, {**config.evaluation.env, "num_cars": len(cars)}, advice=advice)
-            sampled = repeats > 0 and cars >= len(tracks)
-            result = evaluate_policy(env, agent, sampled=sampled, names=names, tick=bar.update)
-            add(result[: len(tracks)], config.label, advice)
+            # Deterministic and sampling rows in one batch: the time of a step hardly depends on its size.
+            rows = torch.arange((1 + repeats) * count, device=config.device)
+            env = build_env(config, {**config.evaluation.env, "num_envs": len(rows)}, advice=advice)
+            watching = pictures if not advice else []
+            tick = partial(_tick, env, watching, bar.update)
+            result = evaluation.drive(env, agent, sampled=repeats > 0 and rows >= count, tick=tick)
+            add(result[:count], config.label, advice)
             if repeats:
-                add(result[len(tracks) :], config.label, advice, "sampled")
+                add(result[count:], config.label, advice, "sampled")
     write_csv(episodes, folder / "episodes.csv")
-    lines = {driver: result.lines for driver, result in drives.items()}
-    crashed = {driver: [row["crashed"] for row in result.episodes] for driver, result in drives.items()}
-    draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
-    if config.evaluation.gif:
-        rate = next(iter(drives.values())).rate
-        animate_lines(tracks, lines, folder / "lines.gif", rate=rate, crashed=crashed)
+    for picture in pictures:
+        picture.draw(drives, folder)
     columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
-    tasks = {key: key.removeprefix(PER_STEP) for key in table[0] if key.startswith(PER_STEP)}
-    columns |= {key: (f"{task} (a step)", ".3f") for key, task in tasks.items()}
-    write_text(folder / "evaluation.md", markdown_table(table, columns))
+    columns |= {name: (measure.title, measure.format) for name, measure in evaluation.measures.items() if measure.title}
+    few = count <= MAX_CASES
+    page = [markdown_table(table if few else [row for row in table if row["case"] == "mean"], columns)]
+    page += [] if few else [f"Means of {count} cases; all are in evaluation.csv."]
+    sees = what_guides_see(config).items()
+    page += [f"guide.{name} sees: {what}; it may know more than the agent." for name, what in sees]
+    write_text(folder / "evaluation.md", "\n\n".join(page))
     write_csv(table, folder / "evaluation.csv")
 
 
+def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) -> None:
+    update()
+    for picture in pictures:
+        picture.watch(env)
+
+
 def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, int]]:
-    """Return the kinds of advice, each with the number of sampled episodes a track."""
+    """Return the kinds of advice, each with the number of sampled episodes a case."""
     plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)]
     if config.method.transforms:
         plan += [(advice, 0) for advice in config.evaluation.advice]
@@ -95,39 +136,42 @@ def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic agent, or else of its guide."""
     with file_of_a_run(path := folder / "evaluation.csv", "remove the file, and evaluate again"):
         with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if (row["track"], row["actions"]) == ("mean", "deterministic")]
+            rows = [row for row in csv.DictReader(file) if (row["case"], row["actions"]) == ("mean", "deterministic")]
         last = [row for row in rows if not row["advice"]][-1]
-        reward, completed = float(last["reward"]), float(last["completed"])
+        reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
         page = (folder / "evaluation.md").read_text().rstrip()
     print(page)
-    print(f"{last['driver']}: mean test reward {reward:.1f}, {completed:.0%} completed; see {folder}")
+    share = "" if math.isnan(completed) else f", {completed:.0%} completed"
+    print(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
     return reward
 
 
 def drive_guides(
     config: DictConfig,
     overrides: Mapping[str, Any],
-    names: Sequence[str],
+    evaluation: Evaluation,
     guides: Mapping[str, TensorDictModuleBase] | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Evaluate each guide of a run alone, once on each of the tracks `names`; return the results by `driver_names`.
+    """Evaluate each guide of a run alone, once in each case; return the results by `driver_names`.
 
     `overrides` are of `env`. `guides` replace those of the configuration, whose results are cached.
     """
     if not guides:
         nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
-        return dict(_drive_configured(OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), tuple(names)))
-    env, policy = build_guided_env(config, {**overrides, "num_cars": len(names)}, guides)
+        if not nodes["guide"]:
+            return {}
+        return dict(_drive_configured(OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), evaluation))
+    env, policy = build_guided_env(config, {**overrides, "num_envs": len(evaluation.cases)}, guides)
     with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
-        result = evaluate_policy(env, policy, names=names, tick=bar.update)
+        result = evaluation.drive(env, policy, tick=bar.update)
     return dict(zip(driver_names(guides), result.split(len(guides)), strict=True))
 
 
 # The runs of a sweep share their guides.
 @lru_cache(maxsize=64)
-def _drive_configured(nodes: str, names: tuple[str, ...]) -> dict[str, EvaluationResult]:
+def _drive_configured(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationResult]:
     config: Any = OmegaConf.create(nodes)
-    return drive_guides(config, {}, names, build_guides(config))
+    return drive_guides(config, {}, evaluation, build_guides(config))
 
 
 def driver_names(guides: Iterable[str]) -> list[str]:

@@ -1,10 +1,10 @@
-"""Evaluation of policies: one episode on every row of an env, its measures, and their means."""
+"""Evaluation of policies: one episode on every row of an env, reduced to its measures."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,33 +12,27 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import expand_as_right
+from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.report.runs import MEASURES, PER_STEP
-
-INFO = ("track", "lap_time", "crashed", "clearance", "smoothness", "pose")  # entries of `info` that are evaluated
+from coil_rl.train.measures import Measure
 
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Episodes of a policy, one per car.
+    """Episodes of a policy, one per row of the env.
 
     Attributes:
-        episodes: `track`, `reward` (sum), `steps`, `lap_time` s (mean of the completed laps, NaN without one), `laps`,
-            `completed`, `crashed`, `smoothness` (mean |a - a_avg|) and `clearance` m (minimum). An env without `info`
-            gives `reward` and `steps` only, one with tasks (`info`, `task`) also `steps_TASK` and `reward_TASK`.
-        lines: positions of each car, [steps, 2] m.
-        smoothness: |a - a_avg| of each car, [steps].
+        episodes: `case`, `reward` (sum), `steps`, and the measures.
+        histories: recorded entries of the steps of each episode, [steps, ...].
         rate: control steps per second, the attribute `rate` of the env; NaN for an env without it.
     """
 
     episodes: list[dict[str, Any]]
-    lines: list[NDArray[np.float64]]
-    smoothness: list[NDArray[np.float64]]
-    rate: float
+    histories: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    rate: float = float("nan")
 
     @property
     def mean_reward(self) -> float:
@@ -46,13 +40,14 @@ class EvaluationResult:
         return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
 
     def split(self, parts: int) -> list[EvaluationResult]:
-        """Return consecutive parts of equally many cars."""
+        """Return consecutive parts of equally many episodes."""
         size = len(self.episodes) // parts
         return [self[end - size : end] for end in range(size, len(self.episodes) + 1, size)]
 
-    def __getitem__(self, cars: slice) -> EvaluationResult:
-        """Return the episodes of some cars."""
-        return EvaluationResult(self.episodes[cars], self.lines[cars], self.smoothness[cars], self.rate)
+    def __getitem__(self, rows: slice) -> EvaluationResult:
+        """Return the episodes of some rows."""
+        histories = {name: history[rows] for name, history in self.histories.items()}
+        return EvaluationResult(self.episodes[rows], histories, self.rate)
 
 
 @torch.no_grad()
@@ -61,23 +56,118 @@ def evaluate_policy(
     policy: TensorDictModuleBase,
     *,
     sampled: bool | Tensor = False,
-    names: Sequence[str] = (),
+    measures: Mapping[str, Measure] | None = None,
+    record: Mapping[str, NestedKey] | None = None,
+    cases: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
 ) -> EvaluationResult:
-    """Run one episode on every row of an env [B], with its transforms in evaluation mode.
+    """Run one episode on every row of an env, with its transforms in evaluation mode.
 
     Args:
-        env: batched env.
+        env: of any batch size, also of none.
         policy: writes the action.
         sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B] for each row.
-        names: of the tracks.
+        measures: by name.
+        record: entries after each step to keep, by name.
+        cases: names of the cases; row i is case i modulo their number. By default rows are numbered.
         tick: called after every step.
     """
-    history = [
-        _record(after) | {"running": running} for after, running in episodes(env, policy, sampled=sampled, tick=tick)
-    ]
-    steps = {key: torch.stack([row[key] for row in history]).squeeze(-1).cpu().double().numpy() for key in history[0]}
-    return _measure(steps, names, getattr(env, "rate", float("nan")))
+    measures = {"reward": Measure("reward", "sum"), **(measures or {})}
+    totals, history = Totals(measures), []
+    for after, running in episodes(env, policy, sampled=sampled, tick=tick):
+        totals.add(after, running)
+        if record:
+            history.append([after[key] for key in record.values()])
+    steps = totals.steps.tolist()
+    columns = {name: values.tolist() for name, values in totals.results().items()}
+    rows = range(len(steps))
+    return EvaluationResult(
+        [
+            {
+                "case": cases[row % len(cases)] if cases else str(row), "reward": columns["reward"][row],
+                "steps": steps[row], **{name: columns[name][row] for name in measures if name != "reward"},
+            }
+            for row in rows
+        ],
+        _histories(record or {}, history, steps, env.batch_dims),
+        getattr(env, "rate", float("nan")),
+    )  # fmt: skip
+
+
+def _histories(
+    record: Mapping[str, NestedKey], history: Sequence[Sequence[Tensor]], steps: Sequence[int], batch_dims: int
+) -> dict[str, list[NDArray[np.float64]]]:
+    """Return the recorded entries by name and row, each as long as its episode."""
+    histories = {}
+    for name, entries in zip(record, zip(*history, strict=True), strict=bool(history)):
+        flat = torch.stack([entry.reshape(len(steps), *entry.shape[batch_dims:]) for entry in entries])
+        values = (flat.squeeze(-1) if flat.ndim > 2 else flat).cpu().double().numpy()
+        histories[name] = [values[:count, row] for row, count in enumerate(steps)]
+    return histories
+
+
+class Totals:
+    """Measures of the episodes of all rows of an env, reduced step by step.
+
+    Args:
+        measures: by name.
+
+    Attributes:
+        steps: number of steps of each episode so far, [rows].
+    """
+
+    def __init__(self, measures: Mapping[str, Measure]) -> None:
+        self.measures, self.steps = dict(measures), torch.zeros((), dtype=torch.int64)
+        names = itertools.groupby(sorted(measures, key=lambda name: measures[name].reduction), self._reduction)
+        self.groups = {reduction: list(group) for reduction, group in names}
+        self.state: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def _reduction(self, name: str) -> str:
+        return self.measures[name].reduction
+
+    def add(self, after: TensorDictBase, running: Tensor) -> None:
+        """Add the entries after a step of the rows that are `running`, one flag a row."""
+        running = running.reshape(-1)
+        self.steps = self.steps.to(running.device) + running.long()
+        for reduction, names in self.groups.items():
+            group = [self.measures[name] for name in names]
+            values = torch.stack([after[measure.entry].reshape(-1).double() for measure in group])
+            mask = running.expand_as(values)
+            if any(measure.where for measure in group):
+                mask = mask & torch.stack([running if m.where is None else after[m.where].reshape(-1) for m in group])
+            if reduction in ("any", "count", "mean_nonzero"):
+                mask = mask & (values != 0)
+            extreme = reduction in ("min", "max", "last")
+            empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
+            value, count = self.state.get(reduction, empty)
+            if reduction == "last":
+                value = torch.where(mask, values, value)
+            elif reduction in ("min", "max"):
+                best = torch.fmin if reduction == "min" else torch.fmax
+                value = best(value, torch.where(mask, values, torch.nan))
+            else:
+                value = value + torch.where(mask, values, 0.0)
+            self.state[reduction] = value, count + mask
+
+    def results(self) -> dict[str, Tensor]:
+        """Return the measures by name, [rows] each: numbers (float64) or flags (bool)."""
+        results = {}
+        for reduction, names in self.groups.items():
+            values, counts = self.state[reduction]
+            if reduction in ("mean", "mean_nonzero"):
+                values = values / counts
+            elif reduction == "count":
+                values = counts
+            for name, number, count in zip(names, values, counts, strict=True):
+                measure = self.measures[name]
+                if measure.reduction == "any":
+                    number = count > 0
+                if measure.at_least is not None:
+                    number = number >= measure.at_least
+                elif measure.at_most is not None:
+                    number = number <= measure.at_most
+                results[name] = number
+        return results
 
 
 def episodes(
@@ -87,7 +177,7 @@ def episodes(
     sampled: bool | Tensor = False,
     tick: Callable[[], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
-    """Yield the entries after each step of one episode on every row, and whether the row was still in it, [B, 1].
+    """Yield the entries after each step of one episode on every row, and whether the row was still in it, [*B, 1].
 
     Arguments as for `evaluate_policy`.
     """
@@ -112,72 +202,3 @@ def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | 
         return deterministic.set("action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"]))
     with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
         return policy(carrier)
-
-
-def _record(after: TensorDictBase) -> dict[str, Tensor]:
-    record = {"reward": after["reward"]}
-    if "info" in after:
-        info = after["info"]
-        record |= {key: info[key] for key in INFO}
-        record["finished"] = after["terminated"] & ~info["crashed"]
-        if "task" in info:
-            record |= {f"steps_{name}": active for name, active in info["task"].items()}
-    return record
-
-
-def _measure(steps: dict[str, NDArray[np.float64]], names: Sequence[str], rate: float) -> EvaluationResult:
-    episodes, lines, smoothness = [], [], []
-    for car, running in enumerate(steps["running"].astype(bool).T):
-        own = {key: values[running, car] for key, values in steps.items()}
-        row: dict[str, Any] = {"reward": own["reward"].sum(), "steps": int(running.sum())}
-        if "track" in own:
-            track = int(own["track"][0])
-            laps = own["lap_time"][own["lap_time"] > 0]
-            row |= {
-                "track": names[track] if names else str(track),
-                "laps": len(laps),
-                "lap_time": float(laps.mean()) if len(laps) else float("nan"),
-                "completed": bool(own["finished"].any()),
-                "crashed": bool(own["crashed"].any()),
-                "smoothness": float(own["smoothness"].mean()),
-                "clearance": float(own["clearance"].min()),
-            }
-            lines.append(own["pose"][:, :2])
-            smoothness.append(own["smoothness"])
-            for key, active in own.items():
-                if key.startswith("steps_"):
-                    row |= {key: int(active.sum()), f"reward_{key[6:]}": (active * own["reward"]).sum()}
-        episodes.append(row)
-    return EvaluationResult(episodes, lines, smoothness, rate)
-
-
-def summarise(episodes: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the means of each track in the order of the episodes, then their mean as the track `mean`.
-
-    `completed` and `crashed` become shares, `lap_time` is the mean of the episodes that have one, and `clearance` the
-    minimum. With tasks, `per_step_TASK` is the mean reward of a step in a task, over all steps on a track.
-    """
-    tracks = {episode["track"]: [e for e in episodes if e["track"] == episode["track"]] for episode in episodes}
-    rows = [_mean(track, group) | _per_step(group) for track, group in tracks.items()]
-    tasks = {key: _nan_mean([row[key] for row in rows]) for key in rows[0] if key.startswith(PER_STEP)}
-    return [*rows, _mean("mean", rows) | tasks]
-
-
-def _per_step(episodes: Sequence[dict[str, Any]]) -> dict[str, float]:
-    means = {}
-    for task in (key.removeprefix("steps_") for key in episodes[0] if key.startswith("steps_")):
-        steps, reward = (sum(row[f"{key}_{task}"] for row in episodes) for key in ("steps", "reward"))
-        means[f"{PER_STEP}{task}"] = reward / steps if steps else float("nan")
-    return means
-
-
-def _nan_mean(values: Sequence[float]) -> float:
-    numbers = [value for value in values if not np.isnan(value)]
-    return float(np.mean(numbers)) if numbers else float("nan")
-
-
-def _mean(track: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    columns = {key: np.array([row[key] for row in rows], dtype=float) for key in MEASURES}
-    means = {key: float(values.mean()) for key, values in columns.items()}
-    means |= {"lap_time": _nan_mean([row["lap_time"] for row in rows])}
-    return {"track": track, **means, "clearance": float(columns["clearance"].min())}

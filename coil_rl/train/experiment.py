@@ -121,6 +121,10 @@ class Experiment:
                 check_same(state["identity"], self.identity, f"{newest} belongs to a run", remedy)
                 self.load_state_dict(state)
         self.rows = self.metrics.truncate(self.updates + 1 if self.updates else 0)
+        lacking = [name for name in (self.curve.names if self.curve else []) if self.rows and name not in self.rows[0]]
+        if lacking:
+            remedy = "put the whole file back, or train again in another folder"
+            raise UserError(f"{self.metrics.path} has no column {lacking[0]}; {remedy}")
         where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
         print(f"{self.folder} continues {where}", file=sys.stderr)
 

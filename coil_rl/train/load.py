@@ -6,6 +6,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError
@@ -39,6 +40,11 @@ def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "la
     if not all(parameter.isfinite().all() for parameter in policy.parameters()):
         raise UserError(f"{path} holds weights that are NaN or infinite; train again or use another")
     return policy
+
+
+def memory_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
+    """Return the entries that a policy writes for its next step, `("next", ...)`; none without a memory."""
+    return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
 
 
 def weights_file(folder: Path, which: str = "last") -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -14,14 +15,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.errors import UserError
-from coil_rl.transforms.guide_transform import GuideTransform
+from coil_rl.transforms.guide_transform import set_progress
 
 
 class Rollout:
     """Batches of consecutive steps of all rows of an env. A row that is done is reset.
 
     Args:
-        env: batched env; its transforms are set to training mode.
+        env: its transforms are set to training mode.
         policy: writes the action; actions are sampled.
         steps: T, length of a batch.
         keys: entries to keep, those after a step as `("next", ...)`; all by default.
@@ -37,7 +38,6 @@ class Rollout:
         self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
     ) -> None:
         self.env, self.policy, self.steps = env.train(), policy, steps
-        self.guided = [module for module in env.modules() if isinstance(module, GuideTransform)]
         self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
@@ -57,20 +57,20 @@ class Rollout:
         Raises:
             UserError: if a number is NaN or infinite, with its entry, step and row.
         """
-        for transform in self.guided:
-            transform.progress = progress
-        carrier = self.env.reset() if self.carrier is None else self.carrier
+        set_progress(self.env, progress)
+        carrier = acting = self.env.reset() if self.carrier is None else self.carrier
         columns: dict[NestedKey, list[Tensor]] = {}
         try:
             with set_exploration_type(ExplorationType.RANDOM):
                 for _ in range(self.steps):
-                    step, carrier = self.env.step_and_maybe_reset(self.policy(carrier))
+                    acting = self.policy(carrier)
+                    step, carrier = self.env.step_and_maybe_reset(acting)
                     for key in self.keys or step.keys(True, True):
                         columns.setdefault(key, []).append(step[key])
         except Exception:
             # NaN of an earlier step may be the cause.
             check_batch(self._stacked(columns), self.taken)
-            check_batch(carrier.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0))
+            check_batch(acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0))
             raise
         batch = self._stacked(columns)
         check_batch(batch, self.taken)
@@ -97,15 +97,20 @@ class Rollout:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
+        """Restore a state of `state_dict`; new episodes begin where the env or a guide cannot go on with its own."""
         env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         env.load_state_dict(state["env"])
         if env is not self.env:
             self.env.load_state_dict(state["transforms"])
         carrier = state["carrier"]
-        if carrier is not None:
-            carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
-        self.carrier, self.taken = carrier, state["taken"]
+        # A part that cannot go on has said so.
+        continues = all(getattr(module, "continues", True) for module in self.env.modules())
+        if carrier is not None and not env.state_dict() and not env.state_spec.keys():
+            continues = False
+            warnings.warn(f"{type(env).__name__} does not save its state, so new episodes begin", stacklevel=2)
+        if carrier is not None and continues:
+            self.carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
+        self.taken = state["taken"]
 
 
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
@@ -114,7 +119,7 @@ def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
     The check waits for the device once.
 
     Raises:
-        UserError: for the earliest such number, with its entry, step (from 1) and car (from 0).
+        UserError: for the earliest such number, with its entry, step (from 1) and row (from 0).
     """
     floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
     if not floats or torch.stack([value.isfinite().all() for value in floats.values()]).all():
@@ -124,11 +129,11 @@ def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
         if value.isfinite().all():
             continue
         rows = value.reshape(batch.shape[:-1].numel(), batch.shape[-1], -1)
-        t, car = (~rows.isfinite()).any(-1).T.nonzero()[0].tolist()
-        numbers = rows[car, t]
+        t, row = (~rows.isfinite()).any(-1).T.nonzero()[0].tolist()
+        numbers = rows[row, t]
         path = (key,) if isinstance(key, str) else key
         # Entries before a step precede those after it.
         place = (t, path[0] == "next", order)
-        errors.append((place, car, float(numbers[~numbers.isfinite()][0]), "/".join(path)))
-    (t, _, _), car, number, name = min(errors)
-    raise UserError(f"{name} is {number} at step {steps + t + 1} of car {car}")
+        errors.append((place, row, float(numbers[~numbers.isfinite()][0]), "/".join(path)))
+    (t, _, _), row, number, name = min(errors)
+    raise UserError(f"{name} is {number} at step {steps + t + 1} of row {row}")

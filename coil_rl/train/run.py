@@ -150,7 +150,7 @@ def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
 
 def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None) -> dict[str, float]:
     """Return the mean return of each guide in the cases of the evaluation."""
-    if EVALUATION not in config.evaluation.curve.cases:
+    if EVALUATION not in config.evaluation.curve.cases or not (guides or config.guide):
         return {}
     guides = guides or build_guides(config)
     env, policy = build_guided_env(config, cases_node(config, EVALUATION), guides)

@@ -1,7 +1,8 @@
 """The gate for received run folders: what a `config.yaml` that somebody else may have written can name.
 
-Instantiating a configuration calls whatever its `_target_` keys name. So each of them must be on a list of full names
-before anything is imported:
+Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a controller, the
+`controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So each of them must be on a list of full
+names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment: a part that has its
   YAML file is on the list;
@@ -92,7 +93,8 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
             raise UserError(f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part")
     container = OmegaConf.to_container(command) if command is not None else None
     _packages = frozenset(names)
-    _own = frozenset(value for _, _, key, value in _entries(container) if key == "_target_" and isinstance(value, str))
+    paths = (_import_path(name, key, value) for name, _, key, value in _entries(container))
+    _own = frozenset(path for path in paths if isinstance(path, str))
 
 
 def read_yaml(path: Path) -> DictConfig | ListConfig:
@@ -122,8 +124,9 @@ def check_config(config: DictConfig, path: Path) -> None:
         named = key if not name.startswith("defaults[") else ""  # Hydra's list names groups by paths
         if re.search(r"[/\\]", str(value if name == "label" else named)):
             raise UserError(f"{path}: {name:.100} must not contain / or \\, because files are named by it")
-        if key == "_target_":
-            _check_target(value, name, parent, path)
+        target = _import_path(name, key, value)
+        if key == "_target_" or target is not None:
+            _check_target(target, name, parent, path)
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
         if (key == "memory" or str(key).endswith("__memory")) and value is not None:
@@ -143,6 +146,15 @@ def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any]
         yield from _entries(value, full)
 
 
+def _import_path(name: str, key: Any, value: Any) -> Any:
+    """Return what an entry names to be imported, written with points only, else None."""
+    if key == "_target_":
+        return value
+    # The text under `controllers` may be at any depth, because keys may contain points.
+    names_code = key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
+    return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
+
+
 def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
     refusal = f"{path}: {name:.100} names {target!r:.100}"
     package = target.partition(".")[0] if isinstance(target, str) else ""
@@ -152,6 +164,8 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
     if target in allowed and not target.startswith(LOGGERS):
         return
     if package not in NEVER_TRUSTED and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names:
+        if name.endswith(".id") and "controllers" not in name:  # a Gymnasium env, which its module registers
+            return
         try:
             origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(".")[0]
         except Exception as error:
@@ -178,6 +192,7 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
 @cache
 def _shipped_targets() -> frozenset[str]:
     conf = resources.files("coil_rl.conf")
-    groups = [group for field in fields(TrainConfig) if (group := conf / field.name).is_dir()]
+    names = [*(field.name for field in fields(TrainConfig)), "cases", "network", "noise"]
+    groups = [group for name in names if (group := conf / name).is_dir()]
     texts = [file.read_text(encoding="utf-8") for group in groups for file in group.iterdir() if ".yaml" in file.name]
     return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,8 @@ from coil_rl.report import markdown_table, style
 from coil_rl.report.style import lighten, picture
 from coil_rl.train import load
 from coil_rl.train.build import build, build_env
-from coil_rl.train.evaluate_run import drive_guides
-from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.evaluate_run import build_evaluation, drive_guides
+from coil_rl.train.evaluation import EvaluationResult
 from coil_rl.train.run_folder import read_config
 
 INSIDE_COLOUR = "#eceff2"
@@ -77,13 +78,19 @@ def drive(runs: Sequence[Path], count: int, policy: str) -> tuple[list[Track], d
     """Return the first test tracks of the first run, and the drives of its guide and of every agent there."""
     configs = [read_config(run, "run", {"device": "cpu"}) for run in runs]
     tracks: list[Track] = build(configs[0].track.test, "track.test")[:count]
-    names = [track.name for track in tracks]
-    drives = drive_guides(configs[0], configs[0].evaluation.env, names)
+    record = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
+    evaluation = replace(build_evaluation(configs[0]), cases=[track.name for track in tracks], record=record)
+    drives = drive_guides(configs[0], configs[0].evaluation.env, evaluation)
     for run, config in zip(runs, configs, strict=True):
-        env = build_env(config, {**config.evaluation.env, "num_cars": len(names)})
+        env = build_env(config, {**config.evaluation.env, "num_envs": len(tracks)})
         name = config.label if config.label not in drives else f"{config.label}, seed {config.seed}"
-        drives[name] = evaluate_policy(env, load.load_policy(run, config, env, policy), names=names)
+        drives[name] = evaluation.drive(env, load.load_policy(run, config, env, policy))
     return tracks, drives
+
+
+def line_of(result: EvaluationResult, index: int) -> Array:
+    """Return the driven line of an episode, [steps, 2] m."""
+    return result.histories["pose"][index][:, :2]
 
 
 def draw_map(axes: Axes, straight: StraightTrack) -> None:
@@ -127,12 +134,13 @@ def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, Evalu
             below = figure.add_subplot(grid[2 * index + 1, 1], sharex=above)
             draw_straight(above, straight)
             for name, result in drives.items():
-                line = {"color": strokes[name].colour, "ls": strokes[name].linestyle}
-                along, left, rough = straight.last_lap(result.lines[index], result.smoothness[index])
-                above.plot(along, left, lw=1.2, zorder=4, **line)
-                below.plot(along, rough, lw=1.0, **line)
+                stroke = {"color": strokes[name].colour, "ls": strokes[name].linestyle}
+                line, rough = line_of(result, index), result.histories["smoothness"][index]
+                along, left, rough = straight.last_lap(line, rough)
+                above.plot(along, left, lw=1.2, zorder=4, **stroke)
+                below.plot(along, rough, lw=1.0, **stroke)
                 if result.episodes[index]["crashed"]:
-                    above.plot(along[-1], left[-1], "X", ms=7, mfc=line["color"], mec=style.BACKGROUND, zorder=5)
+                    above.plot(along[-1], left[-1], "X", ms=7, mfc=stroke["color"], mec=style.BACKGROUND, zorder=5)
             for axes in (above, below):
                 lighten(axes)
                 axes.tick_params(length=0, labelsize=7, labelbottom=axes is below)
@@ -154,12 +162,12 @@ def main() -> None:
     straight = [StraightTrack(track) for track in tracks]
     draw(options.output / "lines.png", straight, drives)
     rows = [
-        {"driver": name, **episode, "path": of_track.path_ratio(line) if episode["laps"] else None}
+        {"driver": name, **episode, "path": of_track.path_ratio(line_of(result, index)) if episode["laps"] else None}
         for name, result in drives.items()
-        for episode, line, of_track in zip(result.episodes, result.lines, straight, strict=True)
+        for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True))
     ]
     columns = {
-        "driver": ("driver", ""), "track": ("track", ""), "reward": ("reward", ".1f"), "lap_time": ("lap (s)", ".2f"),
+        "driver": ("driver", ""), "case": ("track", ""), "reward": ("reward", ".1f"), "lap_time": ("lap (s)", ".2f"),
         "smoothness": ("smoothness", ".3f"), "path": ("path / centre line", ".3f"), "crashed": ("crashed", ""),
     }  # fmt: skip
     print(f"{markdown_table(rows, columns)}\n{options.output / 'lines.png'}")

@@ -38,7 +38,7 @@ EDGE = {"mec": style.INK, "mew": 0.5}
 def draw_moments(panels: list[Axes]) -> None:
     """Let the guide drive, and draw a panel at each moment."""
     track = shipped_track(TRACK)
-    env, guide = ConeTrackEnv([track], num_cars=1), SplineGuide()
+    env, guide = ConeTrackEnv([track], num_envs=1), SplineGuide()
     moments = {round(seconds * env.rate): name for name, seconds in MOMENTS.items()}
     state = env.reset()
     for step in range(max(moments) + 1):

@@ -43,17 +43,14 @@ class RecordingError(ValueError):
 
 
 class Channel(NamedTuple):
-    """A topic with its message type and the type's definition; the type is empty if the file has none.
-
-    The metadata are pairs of key and value, such as the quality of service that ROS 2 offers.
-    """
+    """A topic with its message type and the type's definition."""
 
     topic: str
-    message_type: str
+    message_type: str  # empty if the file has none
     encoding: str = "cdr"
     language: str = "ros2msg"
     definition: bytes = b""
-    metadata: tuple[tuple[str, str], ...] = ()
+    metadata: tuple[tuple[str, str], ...] = ()  # keys and values, such as the quality of service that ROS 2 offers
 
 
 class RawMessage(NamedTuple):
@@ -67,23 +64,15 @@ class RawMessage(NamedTuple):
 
 @dataclass
 class Contents:
-    """Contents of a recording.
+    """Contents of a recording."""
 
-    Attributes:
-        messages: by topic, in order of log time.
-        channels: of all topics.
-        notes, attachments: metadata records and attachments by name.
-        cut_off: whether a file ends early.
-        damage: the damaged places that were skipped.
-        lost: number of messages that damage made unreadable, by topic; a topic is missing if the number is unknown.
-    """
-
-    messages: dict[str, list[RawMessage]]
-    channels: list[Channel] = field(default_factory=list)
-    notes: dict[str, dict[str, str]] = field(default_factory=dict)
-    attachments: dict[str, records.Attachment] = field(default_factory=dict)
-    cut_off: bool = False
-    damage: list[str] = field(default_factory=list)
+    messages: dict[str, list[RawMessage]]  # by topic, in order of log time
+    channels: list[Channel] = field(default_factory=list)  # of all topics
+    notes: dict[str, dict[str, str]] = field(default_factory=dict)  # metadata records by name
+    attachments: dict[str, records.Attachment] = field(default_factory=dict)  # by name
+    cut_off: bool = False  # whether a file ends early
+    damage: list[str] = field(default_factory=list)  # the damaged places that were skipped
+    # Number of messages that damage made unreadable, by topic; a topic is missing if the number is unknown.
     lost: dict[str, int] = field(default_factory=dict)
 
 

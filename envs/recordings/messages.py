@@ -24,11 +24,7 @@ def ros_types() -> Typestore:
 
 @cache
 def definition(message_type: str) -> bytes:
-    """Return the definition of a type and its parts, as a recording stores it.
-
-    Raises:
-        ValueError: for an unknown type.
-    """
+    """Return the definition of a type and its parts as in a recording; raises a `ValueError` for an unknown type."""
     _fields_of(message_type)
     return ros_types().generate_msgdef(message_type, ros_version=2)[0].encode()
 

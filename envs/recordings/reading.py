@@ -27,6 +27,7 @@ from coil_rl.envs.recordings.messages import (
 )
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
+LARGEST = 1e7  # of poses, commands and angles
 REMEDY = "record it again, or correct the program that sent it"
 
 Floats = NDArray[np.float64]
@@ -36,36 +37,22 @@ Scanner = tuple[str, float, float, str]  # frame, smallest and greatest range, n
 
 @dataclass(frozen=True)
 class Recording:
-    """N scans of a LiDAR, with the odometry and the commands of the drive.
+    """N scans of a LiDAR, with the odometry and the commands of the drive."""
 
-    Attributes:
-        path: of the file or folder.
-        log_time: [N] ns, ascending.
-        stamp: [N] ns, start of each scan by the scanner's clock.
-        ranges: [N, P] m, float32; inf for values that are not finite or outside the scanner's range, and for padding.
-        points: [N] number of ranges of each scan.
-        angle_min, angle_increment: [N] radians, bearing of the first range, and step, negative for clockwise rotation.
-        odometry: poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
-        commands: [M, 2] m/s, radians/s, with their log times [M] ns; None without commands.
-        frame: of the scanner.
-        stamped_commands: whether the commands are TwistStamped messages.
-        notes: metadata records by name.
-        remarks: what the file has, or had, and the arrays lack: "is cut off: 160 scans can be read".
-    """
-
-    path: Path
-    log_time: Times
-    stamp: Times
-    ranges: NDArray[np.float32]
-    points: NDArray[np.int64]
-    angle_min: Floats
-    angle_increment: Floats
+    path: Path  # of the file or folder
+    log_time: Times  # [N] ns, ascending
+    stamp: Times  # [N] ns, start of each scan by the scanner's clock
+    ranges: NDArray[np.float32]  # [N, P] m; inf if not finite or outside the scanner's range, and for padding
+    points: NDArray[np.int64]  # [N] number of ranges of each scan
+    angle_min: Floats  # [N] radians, bearing of the first range
+    angle_increment: Floats  # [N] radians, step of the bearing, negative for clockwise rotation
+    # Poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
     odometry: tuple[Floats, Times, Times] | None = None
-    commands: tuple[Floats, Times] | None = None
-    frame: str = "laser"
-    stamped_commands: bool = False
-    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    remarks: Sequence[str] = ()
+    commands: tuple[Floats, Times] | None = None  # [M, 2] m/s, radians/s, with their log times [M] ns; None without
+    frame: str = "laser"  # of the scanner
+    stamped_commands: bool = False  # whether the commands are TwistStamped messages
+    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # metadata records by name
+    remarks: Sequence[str] = ()  # what the file has and the arrays lack: "is cut off: 160 scans can be read"
 
     @property
     def simulated(self) -> bool:
@@ -325,11 +312,11 @@ def _topics(contents: Contents, types: Sequence[str]) -> str:
 
 
 def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str) -> None:
-    """Raise if a row of values [M, n] is not finite."""
-    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    """Raise if a row of values [M, n] is not finite, or beyond what any robot does, in m, rad and s."""
+    wrong = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
     if len(wrong):
         index = int(wrong[0])
-        raise _message_error(path, topic, index, time[index], f"{name} is not a finite number")
+        raise _message_error(path, topic, index, time[index], f"{name} is not a number below {LARGEST:g}")
 
 
 def _message_error(path: Path, topic: str, index: int, time: int, problem: str) -> RecordingError:

@@ -23,33 +23,27 @@ FEATURES = ("width", "depth", "girth")
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """M points of several scans, ordered by scan and bearing.
-
-    `scan` is the index of a point's scan, `beam` its index in the scan; `bearing` is in 0 to 2 pi, `distance`, `x`
-    (along bearing 0) and `y` are in m.
-    """
+    """M points of several scans, ordered by scan and bearing."""
 
     scans: int
-    scan: Integers
-    beam: Integers
-    bearing: Array
-    distance: Array
-    x: Array
-    y: Array
+    scan: Integers  # index of the scan, [M] as the following
+    beam: Integers  # index in the scan
+    bearing: Array  # 0 to 2 pi
+    distance: Array  # m
+    x: Array  # m, along bearing 0
+    y: Array  # m
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """C clusters: label of the points, index of the scan, number of points, and mean point [C, 2] m.
+    """C clusters of points."""
 
-    The features [C, 3] m, with the points in order of bearing, are the width (distance from the first to the last
-    point), the depth (greatest minus least range) and the girth (sum of the distances between neighbours).
-    """
-
-    label: Integers
-    scan: Integers
-    size: Integers
-    centroid: Array
+    label: Integers  # of the points
+    scan: Integers  # index of the scan
+    size: Integers  # number of points
+    centroid: Array  # [C, 2] m, mean point
+    # [C, 3] m: width (distance from the first to the last point by bearing), depth (greatest minus least range) and
+    # girth (sum of the distances between neighbours by bearing).
     features: Array
 
 

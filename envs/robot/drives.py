@@ -41,30 +41,19 @@ MAX_RANGE_ERROR = 0.03  # m, a range with a greater error is an outlier
 
 @dataclass(frozen=True, eq=False)
 class SimulatedDrive:
-    """T scans of a drive with their ground truth.
-
-    Attributes:
-        sides: of the track with cones.
-        seconds: [T] start of each scan.
-        angles: [P] radians, bearings of the beams, or [T, P] if each scan has its own.
-        ranges: [T, P] m, infinite without a return.
-        hit: [T, P] index of the cone of each range, -1 for none.
-        poses: [3, T, P] sensor pose at the time of each beam (m, m, radians), NaN for padding.
-        cones, radius: [2, M] m, centres, and [M] m.
-        visibility: [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams.
-    """
+    """T scans of a drive with their ground truth."""
 
     name: str
     track: Track
-    sides: Sides
-    seconds: Tensor
-    angles: Tensor
-    ranges: Tensor
-    hit: Tensor
-    poses: Tensor
-    cones: Tensor
-    radius: Tensor
-    visibility: Tensor
+    sides: Sides  # of the track with cones
+    seconds: Tensor  # [T] start of each scan
+    angles: Tensor  # [P] radians, bearings of the beams, or [T, P] if each scan has its own
+    ranges: Tensor  # [T, P] m, infinite without a return
+    hit: Tensor  # [T, P] index of the cone of each range, -1 for none
+    poses: Tensor  # [3, T, P] sensor pose at the time of each beam (m, m, radians), NaN for padding
+    cones: Tensor  # [2, M] m, centres
+    radius: Tensor  # [M] m, of the cones
+    visibility: Tensor  # [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams
 
     @property
     def thick(self) -> Tensor:
@@ -72,22 +61,15 @@ class SimulatedDrive:
         return self.radius > (THIN + THICK) / 2
 
 
-def simulated_drive(
-    sides: Sides,
-    seed: int,
-    *,
-    track: Track | None = None,
-    lidar: SimulatedLidar | None = None,
-    laps: int = 1,
-) -> SimulatedDrive:
-    """Simulate a drive along the centre line of a track with cones on one side or both.
+def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None) -> SimulatedDrive:
+    """Simulate a lap along the centre line of `robot_track()` with cones on one side or both.
 
-    The seed is that of the noise and the sway. By default the track is `robot_track()`, the LiDAR an RPLIDAR A1M8.
+    The seed is that of the noise and the sway. By default the LiDAR is an RPLIDAR A1M8.
     """
     check_choice(("left", "right", "both"), sides=sides)
-    track, lidar = track or robot_track(), lidar or SimulatedLidar()
+    track, lidar = robot_track(), lidar or SimulatedLidar()
     generator = torch.Generator().manual_seed(seed)
-    line = torch.from_numpy(np.tile(middle_line(track, SPEED / lidar.rate), (laps, 1)))
+    line = torch.from_numpy(middle_line(track, SPEED / lidar.rate))
     waves, phase = torch.rand(2, generator=generator, dtype=torch.float64)
     path = _swaying(line, waves=3 + 5 * float(waves), phase=float(phase))
     poses = _poses(path, lidar.phase)
@@ -134,11 +116,7 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
 
 
 def track_of(recording: Recording) -> Track:
-    """Return the track in a recording's metadata.
-
-    Raises:
-        RecordingError: if there is none, or it is not valid.
-    """
+    """Return the track in a recording's metadata; raises a `RecordingError` if there is none, or it is not valid."""
     try:
         return noted_track(recording.notes.get("track", {}))
     except TrackError as error:

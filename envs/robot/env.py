@@ -49,7 +49,7 @@ class SimulatedRobotEnv(SeededEnv):
 
     Args:
         tracks: in the robot's own metres; None for `robot_track()`.
-        num_cars: B.
+        num_envs: B.
         starts, assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
         perception: None for `Perception` with the shipped classifier.
         lidar: None for an RPLIDAR A1M8; one control step per scan.
@@ -62,7 +62,7 @@ class SimulatedRobotEnv(SeededEnv):
 
     Example:
         >>> from coil_rl.envs import SimulatedRobotEnv
-        >>> env = SimulatedRobotEnv(num_cars=2)
+        >>> env = SimulatedRobotEnv(num_envs=2)
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([2, 3, 20])
     """
@@ -70,7 +70,7 @@ class SimulatedRobotEnv(SeededEnv):
     def __init__(
         self,
         tracks: Sequence[Track] | None = None,
-        num_cars: int = 1,
+        num_envs: int = 1,
         *,
         starts: int | None = None,
         assignment: Literal["random", "cyclic"] = "random",
@@ -86,7 +86,7 @@ class SimulatedRobotEnv(SeededEnv):
         max_steering: float = 80.0,
         seed: int = 0,
     ) -> None:
-        check_range(0, above=True, num_cars=num_cars, speed=speed, car_length=car_length)
+        check_range(0, above=True, num_envs=num_envs, speed=speed, car_length=car_length)
         check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
@@ -94,7 +94,7 @@ class SimulatedRobotEnv(SeededEnv):
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
         check_weights("reward", reward or {}, RewardWeights._fields)
-        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_cars]))
+        super().__init__(device=torch.device("cpu"), batch_size=torch.Size([num_envs]))
         self.tracks = [robot_track()] if tracks is None else list(tracks)
         self.assignment = assignment
         self.perception = perception or Perception(simulated_cone_classifier())
@@ -105,22 +105,22 @@ class SimulatedRobotEnv(SeededEnv):
         self.max_steering = math.radians(max_steering)
         self.weights = {key: torch.tensor(float(x)) for key, x in RewardWeights(**(reward or {}))._asdict().items()}
         sight = self.perception.range_max * self.perception.scale
-        self.memory = BoundaryMemory(num_cars, spline, smoothing, sight=sight)
+        self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
         index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
         self.start_track, self.start_pose, self.staggered = index, poses.T.float(), starts is not None
         self.start_lap = torch.where(driven.isnan(), NEVER, -driven / self.step_length).round().long()
         self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
-        self.place: Tensor = nn.Buffer(torch.arange(num_cars) % len(index))
+        self.place: Tensor = nn.Buffer(torch.arange(num_envs) % len(index))
         self.track: Tensor = nn.Buffer(self.start_track[self.place])
-        self.pose: Tensor = nn.Buffer(torch.zeros(3, num_cars))
-        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_cars))
-        self.steps: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
-        self.lap: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.int64))
-        self.lap_start: Tensor = nn.Buffer(torch.full((num_cars,), NEVER))
-        self.in_finish: Tensor = nn.Buffer(torch.zeros(num_cars, dtype=torch.bool))
-        self.scan: Tensor = nn.Buffer(torch.full((num_cars, self.lidar.beams), torch.inf))
+        self.pose: Tensor = nn.Buffer(torch.zeros(3, num_envs))
+        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_envs))
+        self.steps: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.int64))
+        self.lap: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.int64))
+        self.lap_start: Tensor = nn.Buffer(torch.full((num_envs,), NEVER))
+        self.in_finish: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.bool))
+        self.scan: Tensor = nn.Buffer(torch.full((num_envs, self.lidar.beams), torch.inf))
         declare_specs(self, self._reset())
         self.set_seed(seed)
 
@@ -150,7 +150,8 @@ class SimulatedRobotEnv(SeededEnv):
         view = self._perceive()
         zero = torch.zeros(self.batch_size)
         terms = dict.fromkeys(REWARD_TERMS, zero)
-        return self._tensordict(view, terms, lap_time=zero, crashed=zero.bool(), clearance=zero, smoothness=zero)
+        flags = {"crashed": zero.bool(), "completed": zero.bool()}
+        return self._tensordict(view, terms, lap_time=zero, **flags, clearance=zero, smoothness=zero)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
@@ -166,10 +167,11 @@ class SimulatedRobotEnv(SeededEnv):
         no_cone, alive = torch.zeros_like(action), (~crashed).float()
         outcome = Outcome(action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive)
         terms = weighted_terms(outcome, self.weights)
-        terminated = crashed | (self.lap >= self.laps)
+        completed = (self.lap >= self.laps) & ~crashed
+        terminated = crashed | completed
         truncated = (self.steps >= self.max_steps) & ~terminated
-        info = {"lap_time": lap_time, "crashed": crashed, "clearance": clearance, "smoothness": roughness}
-        out = self._tensordict(view, terms, **info)
+        flags = {"crashed": crashed, "completed": completed}
+        out = self._tensordict(view, terms, lap_time=lap_time, **flags, clearance=clearance, smoothness=roughness)
         out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)

@@ -7,6 +7,7 @@ the beams. A nearer cone hides a farther one, and the robot moves during a scan.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,38 +18,24 @@ RANGE_MIN = 0.15  # m, minimum range of the sensor
 RANGE_MAX = 12.0  # m, maximum range
 
 
+@dataclass(eq=False)
 class SimulatedLidar:
-    """Range measurements with the noise of an RPLIDAR A1M8.
+    """Range measurements with the noise of an RPLIDAR A1M8; raises a `ValueError` for a value outside its range."""
 
-    Args:
-        beams: P, points per scan.
-        rate: scans per second.
-        noise: m, standard deviation of a range at distance 0.
-        noise_growth: 1/m, increase of the standard deviation per square metre of distance.
-        quantum: m, resolution of the ranges.
-        no_return: share of beams without a return.
-        outliers: share of beams with a random range.
+    beams: int = 360  # P, points per scan
+    rate: float = 5.5  # scans per second
+    noise: float = 0.0007  # m, standard deviation of a range at distance 0
+    noise_growth: float = 0.001  # 1/m, increase of the standard deviation per square metre of distance
+    quantum: float = 0.00025  # m, resolution of the ranges
+    no_return: float = 0.02  # share of beams without a return
+    outliers: float = 0.005  # share of beams with a random range
 
-    Raises:
-        ValueError: for a value outside its range.
-    """
-
-    def __init__(
-        self,
-        beams: int = 360,
-        rate: float = 5.5,
-        noise: float = 0.0007,
-        noise_growth: float = 0.001,
-        quantum: float = 0.00025,
-        no_return: float = 0.02,
-        outliers: float = 0.005,
-    ) -> None:
-        check_range(0, above=True, beams=beams, rate=rate, quantum=quantum)
-        check_range(0, noise=noise, noise_growth=noise_growth)
-        if min(no_return, outliers) < 0 or no_return + outliers > 1:
-            raise ValueError(f"no_return={no_return} and outliers={outliers} must be shares of all beams")
-        self.beams, self.rate, self.quantum = beams, rate, quantum
-        self.noise, self.noise_growth, self.no_return, self.outliers = noise, noise_growth, no_return, outliers
+    def __post_init__(self) -> None:
+        check_range(0, above=True, beams=self.beams, rate=self.rate, quantum=self.quantum)
+        check_range(0, noise=self.noise, noise_growth=self.noise_growth)
+        if min(self.no_return, self.outliers) < 0 or self.no_return + self.outliers > 1:
+            raise ValueError(f"no_return={self.no_return} and outliers={self.outliers} must be shares of all beams")
+        beams = self.beams
         # As in rplidar_ros, a scan starts and ends behind the robot. The sensor turns clockwise but bearings ascend, so
         # the last beam is measured first.
         self.angles = (torch.arange(1, beams + 1, dtype=torch.float64) * (2 * math.pi / beams) - math.pi).float()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, fields
+from dataclasses import KW_ONLY, dataclass, fields
 from functools import cached_property, partial
 from importlib import resources
 from typing import Literal
@@ -92,23 +92,13 @@ def simulated_cone_classifier() -> ConeClassifier:
     return ConeClassifier(**json.loads(text))
 
 
+@dataclass(eq=False)
 class Perception:
     """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep the cones in range.
 
     Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points.
 
-    Args:
-        classifier: tells thin cones, thick cones and other clusters apart.
-        range_min, range_max: m, smaller ranges are no return, and range of view.
-        bearing_max: degrees to either side of the heading.
-        scale: factor from the robot's metres to those of the cone world.
-        laser_yaw: degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
-        margin: m, points this far beyond `range_max` are clustered too, so that cones there are complete.
-        gap: m, points closer than this are linked.
-        kept_cones: K, the nearest cones kept per side.
-
-    Raises:
-        ValueError: for a value outside its range.
+    Raises a `ValueError` for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
@@ -119,29 +109,24 @@ class Perception:
         ((1, 2, 16, 2), array([[1, 0]]))
     """
 
-    def __init__(
-        self,
-        classifier: ConeClassifier,
-        *,
-        range_min: float = 0.15,
-        range_max: float = 1.0,
-        bearing_max: float = 60.0,
-        scale: float = 7.0,
-        laser_yaw: float = 0.0,
-        margin: float = 0.15,
-        gap: float = GAP,
-        kept_cones: int = 16,
-    ) -> None:
-        check_range(0, above=True, range_max=range_max, scale=scale, gap=gap, kept_cones=kept_cones)
-        if not 0 < range_min < range_max:
-            raise ValueError(f"range_min={range_min} must be above 0, the code for no return, and below range_max")
-        check_range(0, margin=margin)
-        check_range(0, 180, above=True, bearing_max=bearing_max)
-        check_range(-360, 360, laser_yaw=laser_yaw)
-        self.classifier = classifier
-        self.range_min, self.range_max, self.margin, self.gap = range_min, range_max, margin, gap
-        self.bearing_max, self.laser_yaw = math.radians(bearing_max), math.radians(laser_yaw)
-        self.scale, self.kept_cones = scale, kept_cones
+    classifier: ConeClassifier  # tells thin cones, thick cones and other clusters apart
+    _: KW_ONLY
+    range_min: float = 0.15  # m, smaller ranges are no return
+    range_max: float = 1.0  # m, range of view
+    bearing_max: float = 60.0  # degrees to either side of the heading
+    scale: float = 7.0  # factor from the robot's metres to those of the cone world
+    laser_yaw: float = 0.0  # degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise
+    margin: float = 0.15  # m, points this far beyond `range_max` are clustered too, so that cones there are complete
+    gap: float = GAP  # m, points closer than this are linked
+    kept_cones: int = 16  # K, the nearest cones kept per side
+
+    def __post_init__(self) -> None:
+        check_range(0, above=True, range_max=self.range_max, scale=self.scale, gap=self.gap, kept_cones=self.kept_cones)
+        if not 0 < self.range_min < self.range_max:
+            raise ValueError(f"range_min={self.range_min} must be above 0, the code for no return, and below range_max")
+        check_range(0, margin=self.margin)
+        check_range(0, 180, above=True, bearing_max=self.bearing_max)
+        check_range(-360, 360, laser_yaw=self.laser_yaw)
 
     def __call__(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
         """Return the cones in view of scans [N, P] m, whose beams have the bearings [P] radians in the LiDAR's frame.
@@ -162,13 +147,13 @@ class Perception:
 
     def points(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Points:
         """Return all points up to `range_max + margin`, in the car's frame, unscaled."""
-        bearings = np.asarray(angles, dtype=np.float64) + self.laser_yaw
+        bearings = np.asarray(angles, dtype=np.float64) + math.radians(self.laser_yaw)
         return points_of(ranges, bearings, self.range_min, self.range_max + self.margin)
 
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
         """Return whether the centroid of each cluster is in range and bearing, [C]."""
         x, y = clusters.centroid.T
-        return (np.hypot(x, y) <= self.range_max) & (np.abs(np.arctan2(y, x)) <= self.bearing_max)
+        return (np.hypot(x, y) <= self.range_max) & (np.abs(np.arctan2(y, x)) <= math.radians(self.bearing_max))
 
     def rejected(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> float:
         """Return the share of the clusters in sight that are no cones, 0 without any; arguments as in `points_of`."""
@@ -220,11 +205,7 @@ class BoundaryMemory(nn.Module):
         self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
 
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Update the memory with the cones in view.
-
-        Args:
-            cones: [B, 2, K, 2] m in the car's frame and the scale of the cone world, nearest first, left side first.
-            count: [B, 2] number of cones.
+        """Update the memory with the cones in view and their number, as `Perception` returns them.
 
         Returns:
             The observation [B, 20], zeros for a side that was never valid; and which sides are valid now [B, 2].

@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import REWARD_TERMS
@@ -221,7 +222,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
         ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, cyclic"),
         *(
             ({name: value}, f"{name}={value} must be more than 0")
-            for name in ("num_cars", "rate", "laps", "time_limit", "kept_cones", "speed", "car_length", "max_steering")
+            for name in ("num_envs", "rate", "laps", "time_limit", "kept_cones", "speed", "car_length", "max_steering")
             for value in (0, -1)
         ),
         ({"rate": math.nan}, "rate=nan must be more than 0"),
@@ -237,7 +238,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
 )
 def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        ConeTrackEnv(**({"tracks": rings, "num_cars": 2} | wrong))
+        ConeTrackEnv(**({"tracks": rings, "num_envs": 2} | wrong))
 
 
 def test_actions_are_clamped(rings: list[Track]) -> None:
@@ -286,8 +287,9 @@ def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
 
 def test_lap_that_begins_anywhere_counts_as_driven_from_the_finish(rings):
     world = {"assignment": "cyclic", "laps": 1, "rate": 12}
-    whole = evaluate_policy(ConeTrackEnv(rings, 3, **world), SplineGuide()).episodes
-    for car, part in enumerate(evaluate_policy(ConeTrackEnv(rings, 12, starts=12, **world), SplineGuide()).episodes):
+    envs = ConeTrackEnv(rings, 3, **world), ConeTrackEnv(rings, 12, starts=12, **world)
+    whole, parts = (evaluate_policy(env, SplineGuide(), measures=driving_measures()).episodes for env in envs)
+    for car, part in enumerate(parts):
         assert part["completed"]
         assert part["steps"] < whole[car % 3]["steps"]
         assert part["lap_time"] == pytest.approx(whole[car % 3]["lap_time"], rel=0.04)

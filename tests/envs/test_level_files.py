@@ -201,7 +201,7 @@ def assert_read_or_rejected(data, lines, path, drive):
         return
     assert 0 < track.length < 10_000
     if drive:
-        steps = ConeTrackEnv([track], num_cars=4).rollout(5, break_when_any_done=False)
+        steps = ConeTrackEnv([track], num_envs=4).rollout(5, break_when_any_done=False)
         assert all(torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones"))
 
 

@@ -14,7 +14,7 @@ from coil_rl.train.build import build_env, build_guides
 from coil_rl.train.evaluation import evaluate_policy
 
 TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
+        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.num_envs=4", "budget.steps=16",
         "budget.frames=128"]  # fmt: skip
 
 
@@ -30,7 +30,7 @@ def run(request, tmp_path_factory):
 
 def test_guide_drives_as_the_policy_in_its_own_env(run):
     config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
-    overrides = {"num_cars": 3, "assignment": "cyclic"}
+    overrides = {"num_envs": 3, "assignment": "cyclic"}
     policy = evaluate_policy(build_env(config, overrides), agent)
     guided = composed(*TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
     learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
@@ -51,6 +51,14 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
 def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
     with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):
+        LearnedGuide(str(run))
+
+
+def test_run_whose_advice_needs_earlier_steps_is_refused(tmp_path):
+    (tmp_path / "actions.csv").write_text("0.1\n0.2\n")
+    options = ["method=coil", "guide=recorded", f"guide.recorded.file={tmp_path / 'actions.csv'}"]
+    run = make_untrained_run(tmp_path / "run", *TINY, *options)
+    with pytest.raises(ValueError, match="run has GuideActions, which needs earlier steps; its policy is no guide"):
         LearnedGuide(str(run))
 
 

@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
 from coil_rl.guides import RacingLineGuide, SplineGuide
@@ -41,7 +42,8 @@ def arc(x, y, turn=1.4):
 
 
 def lap(track, guide, rate=24.0):
-    return evaluate_policy(ConeTrackEnv([track], 1, rate=rate, laps=1), guide).episodes[0]
+    env = ConeTrackEnv([track], 1, rate=rate, laps=1)
+    return evaluate_policy(env, guide, measures=driving_measures()).episodes[0]
 
 
 @pytest.mark.parametrize(

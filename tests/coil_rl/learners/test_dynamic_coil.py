@@ -8,6 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule, networks
+from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.train.rollout import Rollout
 
 AGENT = (True, ())
@@ -66,7 +67,7 @@ def cars():
 
 
 def guide(env):
-    network = networks.ObservationNetwork(env, ["observation"], [8], 1, 1.0)
+    network = ObservationNetwork(env, ["observation"], Mlp([8]), 1, 1.0)
     return networks.FastTensorDictModule(network, ["observation"], ["action"])
 
 

@@ -1,7 +1,10 @@
 import pytest
 import torch
 import worlds
+from any_env import AnyEnv
 from torch.distributions import AffineTransform, Normal, TanhTransform, TransformedDistribution
+from torch.nn import functional as F
+from torchrl.data import MultiCategorical
 
 from coil_rl.learners import PPO, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
@@ -67,3 +70,14 @@ def test_coefficient_of_zero_changes_nothing():
         return torch.cat([p.detach().flatten() for p in ppo.parameters])
 
     torch.testing.assert_close(trained(), trained(KickstartLoss(Linear(1.0, 0.0))))
+
+
+def test_loss_of_several_choices_is_their_cross_entropy():
+    torch.manual_seed(0)
+    env = AnyEnv(8, MultiCategorical([2, 4]))
+    policy = PPO(env, action_gain=2.0).policy
+    data = env.reset()
+    advised = torch.stack([torch.randint(n, (8,)) for n in (2, 4)], -1)
+    one_hot = torch.cat([F.one_hot(advised[:, index], n) for index, n in enumerate((2, 4))], -1).float()
+    loss = KickstartLoss()(policy, data.set("guide_action", one_hot.unsqueeze(1)))
+    torch.testing.assert_close(loss, -policy.get_dist(data).log_prob(advised).mean())

@@ -6,7 +6,10 @@ from functools import partial
 import pytest
 import torch
 import worlds
+from any_env import AnyEnv
 from cart_poles import CartPoles
+from torchrl.data import MultiCategorical
+from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from coil_rl.envs import ConeTrackEnv
@@ -122,6 +125,32 @@ def test_minibatch_of_one_frame_is_refused(kind):
     trained(kind, CartPoles(2), steps=4, minibatches=4)
     with pytest.raises(ValueError, match="minibatches=5 leaves less than 2 of 8 frames to each"):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
+
+
+@pytest.mark.parametrize("make", [worlds.cones, partial(CartPoles, 6), partial(AnyEnv, 6, MultiCategorical([2, 3]))])
+@pytest.mark.parametrize("entropy", [0.0, 0.01])
+def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
+    torch.manual_seed(0)
+    env = make()
+    ppo = PPO(env, epochs=3, minibatches=2, learning_rate=5e-2, entropy=entropy)
+    options = {"entropy_bonus": entropy > 0, "entropy_coeff": entropy, "critic_coeff": 0.5, "loss_critic_type": "l2"}
+    reference = ClipPPOLoss(
+        ppo.policy, ppo.critic, clip_epsilon=0.2, normalize_advantage=True, functional=False, **options
+    )
+    batch = Rollout(env, ppo.policy, 8, ppo.keys).collect()
+    ppo.update(batch.clone())  # the ratios are no longer 1
+    rows, found = ppo.prepare(batch, 0.0), []
+    for loss in (reference, ppo.loss):
+        torch.manual_seed(1)
+        ppo.optimiser.zero_grad()
+        losses = loss(rows)
+        sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
+        found.append((losses.detach(), [parameter.grad.clone() for parameter in ppo.parameters]))
+    (losses, gradients), (our_losses, our_gradients) = found
+    assert losses["clip_fraction"] > 0
+    assert list(our_losses.keys()) == list(losses.keys())  # the columns of the log
+    assert all(torch.equal(value, our_losses[name]) for name, value in losses.items())
+    assert all(map(torch.equal, gradients, our_gradients))
 
 
 def test_advantages_equal_those_of_torchrl_with_two_evaluations_per_state(ring):

@@ -10,7 +10,8 @@ from torchrl.envs import PendulumEnv
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, KickstartLoss, Reinforce
 from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, PhaseSchedule
-from coil_rl.learners.networks import FastTensorDictModule, ObservationNetwork, actor
+from coil_rl.learners.encoders import Mlp, ObservationNetwork
+from coil_rl.learners.networks import FastTensorDictModule, actor
 from coil_rl.schedules import Linear
 from coil_rl.transforms import DiscreteActions, MixedAction, ResidualAction, RewardCoupling, Takeover
 
@@ -87,7 +88,7 @@ def test_replay_refuses_an_effect_of_actions_that_changes_over_the_run(transform
 def test_dynamic_coil_refuses_unusable_guides_and_values_out_of_range():
     env = worlds.cones()
     constant = TensorDictModule(lambda observation: observation[..., :1] * 0, ["observation"], ["action"])
-    network = ObservationNetwork(env, ["observation"], [8], 1, 1.0)
+    network = ObservationNetwork(env, ["observation"], Mlp([8]), 1, 1.0)
     one = FastTensorDictModule(network, ["observation"], ["action"])
     for guides, message in (
         ({"constant": constant}, "guide 'constant' has no parameters"),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from ovals import circle, oval_line
+from tensordict import TensorDict
 
 from coil_rl.envs import Track, shipped_tracks
 from coil_rl.listening.sections import SECTIONS, TrackSections, classify, curvature, smooth_line
@@ -55,12 +56,31 @@ def test_shipped_tracks_turn_once_and_have_all_kinds_of_turns():
         assert names(line) >= {"left", "right", "entry", "exit"}
 
 
+def state(track, positions):
+    """Return a state of cars at positions [N, 2] of a track."""
+    poses = torch.as_tensor(np.pad(positions, ((0, 0), (0, 1))), dtype=torch.float32)
+    return TensorDict({"info": {"track": torch.full((len(poses), 1), track), "pose": poses}}, [len(poses)])
+
+
 def test_cars_are_located_on_their_own_track():
     sections = TrackSections(shipped_tracks("test"))
     for index, line in enumerate(sections.lines):
         noise = np.random.default_rng(0).uniform(-0.05, 0.05, line.shape)
-        track = torch.full((len(line),), index)
-        nearest = sections.nearest(track, torch.as_tensor(line + noise, dtype=torch.float32))
-        assert (nearest - torch.arange(len(line))).abs().max() <= 1
-        exact = torch.as_tensor(line, dtype=torch.float32)
-        assert sections.section(track, exact).tolist() == sections.sections[index].tolist()
+        place = sections.locate(state(index, line + noise))
+        assert (place["track"] == index).all()
+        assert (place["point"] - torch.arange(len(line))).abs().max() <= 1
+        exact = sections.locate(state(index, line))
+        assert sections.section(exact).tolist() == sections.sections[index].tolist()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"turn_radius": 0.1}, "turn_radius=0.1 must be at least 0.5"),
+        ({"approach": 0.0}, "approach=0.0 must be at least 0.1"),
+        ({"bin": -1.0}, "bin=-1.0 must be at least 0.1"),
+    ],
+)
+def test_lengths_out_of_range_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        TrackSections(shipped_tracks("test"), **options)

@@ -1,25 +1,22 @@
+import numpy as np
 import pytest
 import torch
 from ovals import oval_track
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import TransformedEnv
+from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.listening.sections import SECTIONS, TrackSections
-from coil_rl.listening.survey import (
-    Ablation,
-    ablations,
-    drive_ablated,
-    measure_on_lines,
-    survey,
-    table_along_track,
-    table_by_section,
-)
+from coil_rl.listening.survey import Ablation, ablations, drive_ablated, survey, table_by_section
+from coil_rl.train.evaluate_run import Evaluation
 from coil_rl.transforms import GuideActions
 
 TRACKS = [oval_track("to the left"), oval_track("to the right", clockwise=True)]
 TRACK_SECTIONS = TrackSections(TRACKS)
+EVALUATION = Evaluation([track.name for track in TRACKS], driving_measures(), {"pose": ("info", "pose")})
 FOLLOW = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
 
 
@@ -30,29 +27,33 @@ def make_env(cars, seconds=60):
 
 @pytest.fixture(scope="module")
 def found():
-    return survey(make_env(4), FOLLOW, TRACK_SECTIONS, donors=4)
+    return survey(make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, donors=4)
 
 
 @pytest.fixture(scope="module")
 def rows(found):
-    removed = ablations(2)
+    removed = ablations(2, len(SECTIONS))
     env = make_env(2 * len(removed))
-    episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, removed, found.advice.mean(0))
-    return table_by_section(found, dict(zip(removed, episodes, strict=True)))
+    episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, EVALUATION, removed, found.advice.mean(0))
+    return table_by_section(found, TRACK_SECTIONS, EVALUATION, dict(zip(removed, episodes, strict=True)))
 
 
 def test_every_state_of_every_episode_is_measured(found):
     assert found.guides == ["spline", "random"]
     assert all(episode["completed"] for episode in found.result.episodes)
-    count = sum(episode["steps"] for episode in found.result.episodes)
+    assert [episode["case"] for episode in found.result.episodes] == [track.name for track in TRACKS] * 2
+    steps = np.array([episode["steps"] for episode in found.result.episodes])
+    assert np.bincount(found.step).tolist() == [(steps > step).sum() for step in range(max(steps))]
+    count = steps.sum()
     assert found.advice.shape == (count, 2, 1)
     assert all(values.shape == (count, 2) for values in found.measures.values())
     assert found.measures["agreement"].mean(0)[0] == 0
     assert found.measures["intervention"].mean(0)[1] == 0
     for index, line in enumerate(TRACK_SECTIONS.lines):
-        on_track = found.track == index
-        assert len(set(found.point[on_track])) > 0.7 * len(line)
-        assert (found.section[on_track] == TRACK_SECTIONS.sections[index][found.point[on_track]]).all()
+        on_track = found.place["track"] == index
+        points = found.place["point"][on_track]
+        assert len(set(points)) > 0.7 * len(line)
+        assert (found.section[on_track] == TRACK_SECTIONS.sections[index][points]).all()
 
 
 def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(rows):
@@ -68,7 +69,8 @@ def test_advice_is_replaced_in_its_section_only():
     history = []
 
     def act(advice, pose, track):
-        history.append((TRACK_SECTIONS.section(track.squeeze(-1), pose[:, :2]), advice[:, 0, 0]))
+        place = TRACK_SECTIONS.locate(TensorDict({"info": {"track": track, "pose": pose}}, pose.shape[:1]))
+        history.append((TRACK_SECTIONS.section(place), advice[:, 0, 0]))
         return advice[:, 1]
 
     keys = ["guide_action", ("info", "pose"), ("info", "track")]
@@ -76,7 +78,7 @@ def test_advice_is_replaced_in_its_section_only():
     env = ConeTrackEnv(TRACKS, 4, rate=6, laps=1, time_limit=15, assignment="cyclic")
     env = TransformedEnv(env, GuideActions({"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()}))
     left, replacement = SECTIONS.index("left"), torch.tensor([[0.25], [0.0]])
-    drive_ablated(env, agent, TRACK_SECTIONS, [Ablation(0, left), Ablation(0)], replacement)
+    drive_ablated(env, agent, TRACK_SECTIONS, EVALUATION, [Ablation(0, left), Ablation(0)], replacement)
     section, advice = (torch.stack(column) for column in zip(*history, strict=True))
     assert ((advice[:, :2] == 0.25) == (section[:, :2] == left)).all()
     assert (section[:, :2] == left).any()
@@ -93,20 +95,21 @@ def test_rows_by_section_add_up_to_the_first_one(found, rows):
 
 
 def test_rows_along_the_track_contain_every_state_once(found):
-    rows = table_along_track(found, TRACK_SECTIONS, bin_length=2.0)
+    sections = TrackSections(TRACKS, bin=2.0)
+    rows = sections.table(found)
     for slot, guide in enumerate(found.guides):
         of_guide = [row for row in rows if row["guide"] == guide]
-        assert sum(row["states"] for row in of_guide) == len(found.track)
+        assert sum(row["states"] for row in of_guide) == len(found.section)
         for measure in found.measures:
             total = sum(row["states"] * row[measure] for row in of_guide)
             assert total == pytest.approx(float(found.measures[measure][:, slot].sum()), rel=1e-4)
-    lines, values = measure_on_lines(found, TRACK_SECTIONS, "agreement", bin_length=2.0)
+    lines, values = sections.measure_on_lines(found, rows, "agreement")
     assert [len(line) for line in lines] == [len(row) for row in values["random"]]
     assert set(values["random"][0].tolist()) <= {row["agreement"] for row in rows if row["guide"] == "random"}
 
 
-def test_cars_must_be_a_multiple_of_the_ablations_and_have_advice():
-    with pytest.raises(ValueError, match="4 cars cannot be divided among 3 ablations"):
-        drive_ablated(make_env(4), FOLLOW, TRACK_SECTIONS, ablations(2)[:3], torch.zeros(2, 1))
+def test_rows_must_be_a_multiple_of_the_ablations_and_have_advice():
+    with pytest.raises(ValueError, match="4 rows cannot be divided among 3 ablations"):
+        drive_ablated(make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, ablations(2, 5)[:3], torch.zeros(2, 1))
     with pytest.raises(ValueError, match="nothing writes guide_action"):
-        survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS)
+        survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS, EVALUATION)

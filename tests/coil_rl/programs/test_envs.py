@@ -1,5 +1,6 @@
 """Every env of the configuration trains, is killed, resumes and is evaluated, by its guide and each kind of learner."""
 
+import csv
 import signal
 import time
 from pathlib import Path
@@ -8,14 +9,23 @@ import kill_and_resume
 import pytest
 from programs import called
 
-ENVS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
+FILES = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
 REPLAYS = ["mcap_replay"]  # for coil-replay alone
-DRIVEN = [env for env in ENVS if env not in REPLAYS]
-TINY = ["env.laps=1", "env.time_limit=1", "evaluation.repeats=1", "logger=none", "checkpoint_every=1",
-        "budget.frames=256", "budget.cars=4", "budget.steps=16"]  # fmt: skip
+# Envs of other libraries, without tracks and guides.
+OTHERS = {
+    "gym": ["env.id=Pendulum-v1", "env.max_steps=12"],
+    "torchrl": ["env.of._target_=torchrl.envs.PendulumEnv", "env.max_steps=12", "observes=[th,thdot]"],
+}
+SMALL_CASES = ["evaluation.cases=3", "evaluation.curve.num_envs=2", "evaluation.gif=false"]
+TRACKED = ["cone_track", "driving_tasks", "simulated_robot"]
+TINY = ["evaluation.repeats=1", "logger=none", "checkpoint_every=1", "budget.frames=256", "budget.num_envs=4",
+        "budget.steps=16"]  # fmt: skip
+OWN = {env: ["env.laps=1", "env.time_limit=1"] for env in TRACKED}
+OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
 REPLAY = ["learner.capacity=1000", "learner.starts=64", "learner.batch_size=32", "learner.ratio=1"]
-PROXY = ["proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16", "proxy.learner.regressor.epochs=1"]
+PROXY = ["proxy.budget.frames=64", "proxy.budget.num_envs=2", "proxy.budget.steps=16",
+         "proxy.learner.regressor.epochs=1"]  # fmt: skip
 LEARNERS = {
     "ppo": ["method=ppo", *PPO],
     "guide": ["method=guide"],
@@ -24,6 +34,7 @@ LEARNERS = {
     "dynamic_coil": ["method=dynamic_coil_sequential", "guide=[spline,constant]", *PPO, *PROXY],
     "dqn": ["method=coil", "learner=dqn", *REPLAY],
     "sac": ["method=coil", "learner=sac", *REPLAY],
+    "sac_alone": ["method=ppo", "learner=sac", *REPLAY],
 }
 
 
@@ -41,23 +52,35 @@ def kill(folder, overrides, mark):
 
 def trained(env, learner, folder):
     """Train to the end, evaluate the run again, and return the arguments of the training."""
-    overrides = [f"env={env}", *LEARNERS[learner], *TINY]
+    overrides = [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
     called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
-    assert (folder / "lines.gif").exists()
-    called("evaluate", f"run={folder}", "evaluation.repeats=1", "hydra.run.dir=again", cwd=folder.parent)
-    again = folder.parent / "again" / "evaluation.csv"
-    assert again.read_bytes() == (folder / "evaluation.csv").read_bytes()
+    assert (folder / ("lines.gif" if env in TRACKED else "returns.png")).exists()
+    again = ["evaluation.repeats=1", "trust=[torchrl]", "hydra.run.dir=again"]
+    called("evaluate", f"run={folder}", *again, cwd=folder.parent)
+    evaluation = (folder.parent / "again" / "evaluation.csv").read_bytes()
+    assert evaluation == (folder / "evaluation.csv").read_bytes()
     return overrides
 
 
-@pytest.mark.parametrize("env", DRIVEN)
-def test_env_trains_and_is_evaluated_on_its_own_tracks(env, tmp_path):
+@pytest.mark.parametrize("env", [*TRACKED, *OTHERS])
+def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
     trained(env, "ppo", tmp_path / "run")
+    with (tmp_path / "run" / "evaluation.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    cases = {row["case"] for row in rows} - {"mean"}
+    assert (cases == {"0", "1", "2"}) == (env in OTHERS)
+    assert ("completed" in rows[0]) == ("guide" in {row["driver"] for row in rows}) == (env in TRACKED)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("env", OTHERS)
+def test_env_without_a_guide_trains_with_replay(env, tmp_path):
+    trained(env, "sac_alone", tmp_path / "run")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("learner", LEARNERS)
-@pytest.mark.parametrize("env", DRIVEN)
+@pytest.mark.parametrize("env", TRACKED)
 def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_path, monkeypatch):
     monkeypatch.setattr(kill_and_resume, "SMALL", [])
     whole, resumed = tmp_path / "whole", tmp_path / "resumed"
@@ -72,9 +95,9 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("env", REPLAYS)
-def test_env_without_tracks_is_refused_before_the_training(env, learner, tmp_path):
+def test_env_without_rows_is_refused_before_the_training(env, learner, tmp_path):
     done = called("train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2)
-    assert "McapReplayEnv has no key tracks, so nothing can drive in it; choose another env" in done.stderr
+    assert "McapReplayEnv has no key num_envs, so no policy can act in it; choose another env" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not any(tmp_path.iterdir())
 
@@ -84,11 +107,16 @@ def test_env_without_tracks_is_refused_before_the_training(env, learner, tmp_pat
     [
         (
             ["+env.info=false", "~watch.episode", "~watch.step"],
-            "ConeTrackEnv lacks the entries info.track, info.lap_time",
+            "evaluation.measures.lap_time=info.lap_time is no entry of the env; it has cone_count, cones",
         ),
         (
-            ["env._target_=worlds.without_rate"],
-            "without_rate lacks the attribute rate (steps per second) for evaluation.gif",
+            [
+                "env=gym",
+                *OTHERS["gym"],
+                "method=ppo",
+                "+evaluation.pictures.lines={_target_: coil_rl.report.DrivenLines, tracks: []}",
+            ],
+            "evaluation.pictures=info.pose is no entry of the env; it has done, episode_reward",
         ),
         (["env=simulated_robot", "method=oil"], "track.train gives one track, which cannot be left out to validate"),
     ],

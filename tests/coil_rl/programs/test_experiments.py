@@ -13,8 +13,8 @@ CONF = Path(__file__).parents[3] / "conf"
 EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 NEEDS_RUNS = ["driving_tasks"]
 TINY = ["track=generated", "track.train.count=2", "track.test.count=2", "env.laps=1", "env.time_limit=1", "env.rate=12",
-        "evaluation.repeats=1", "logger=none", "budget.cars=4", "budget.steps=16", "budget.frames=128",
-        "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16"]  # fmt: skip
+        "evaluation.repeats=1", "logger=none", "budget.num_envs=4", "budget.steps=16", "budget.frames=128",
+        "proxy.budget.frames=64", "proxy.budget.num_envs=2", "proxy.budget.steps=16"]  # fmt: skip
 
 
 def first(experiment, run_dir):

@@ -13,7 +13,7 @@ from coil_rl.train.rollout import Rollout
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
 DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]
 IMITATION = ["dagger", "oil"]
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.cars=4", "budget.steps=8"]
+TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.num_envs=4", "budget.steps=8"]
 OFF_POLICY = ["learner.starts=16", "learner.batch_size=8", "learner.ratio=1", "learner.hidden=[8]"]
 GIVEN = {"dqn": OFF_POLICY, "sac": OFF_POLICY, "ppo": ["learner.epochs=1", "learner.minibatches=2", "action=choices"]}
 
@@ -92,5 +92,5 @@ def test_off_policy_learners_set_their_action_and_batch(tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
     assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
-    assert [config.budget.cars * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 16_384]
+    assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 16_384]
     assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1

@@ -73,7 +73,7 @@ def test_numbers_are_reproducible(runs, tmp_path):
         ("", "run must be given: write run=VALUE"),
         ("run={runs}/ppo", "does not use advice: the policy does not read guide_action; it reads observation"),
         ("run={runs}/guide", "has no agent, only a guide"),
-        ("run={runs}/coil bin=0", "bin=0.0 must be greater than or equal to 0.1"),
+        ("run={runs}/coil evaluation.sections.bin=0", "evaluation.sections: bin=0 must be at least 0.1"),
     ],
 )
 def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(arguments, message, runs, tmp_path):

@@ -21,10 +21,10 @@ SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc"]
 SLOW += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint", "dynamic_coil_stochastic"]
 TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
 TINY = [*TRACKS, "env.laps=1", "env.time_limit=1", "env.rate=12", "evaluation.repeats=1", "evaluation.gif=false",
-        "logger=none", "checkpoint_every=1", "budget.cars=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
+        "logger=none", "checkpoint_every=1", "budget.num_envs=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
-SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.cars=2", "proxy.budget.steps=16",
-               "proxy.learner.regressor.epochs=1"]  # fmt: skip
+SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.num_envs=2",
+               "proxy.budget.steps=16", "proxy.learner.regressor.epochs=1"]  # fmt: skip
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
 SKLEARN = list(SMALL)  # archives of skops contain the time
 SMALL |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}

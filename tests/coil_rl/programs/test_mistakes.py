@@ -21,7 +21,7 @@ from coil_rl.train import checkpoint, evaluate_run
 from coil_rl.train.build import build_env, build_learner
 from coil_rl.train.check import check
 
-TINY = ["budget.cars=8", "budget.steps=32", "track=generated", "track.train.count=1", "track.test.count=1"]
+TINY = ["budget.num_envs=8", "budget.steps=32", "track=generated", "track.train.count=1", "track.test.count=1"]
 
 
 @pytest.fixture
@@ -56,11 +56,11 @@ def refusal(name, *arguments):
         # keys
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("sed=1", "resume; did you mean seed?"),
-        ("budget.car=1", "no key budget.car; budget has frames, cars, steps; did you mean cars?"),
+        ("budget.step=1", "no key budget.step; budget has frames, num_envs, steps; did you mean steps?"),
         ("learner.learning_rat=1", "+learner.learning_rat=VALUE adds it; did you mean learning_rate?"),
-        ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_cars"),
+        ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
-        ("+budget.frame=1", "there is no key frame; budget has frames, cars, steps; did you mean frames?"),
+        ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps; did you mean frames?"),
         ("+watch.epsode.a=[reward]", "no key watch.epsode; watch has episode, step; did you mean episode?"),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
@@ -73,7 +73,7 @@ def refusal(name, *arguments):
         ("proxy.method=x", "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig"),
         # values
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
-        ("budget.cars=100000 budget.steps=10000", "budget.cars x budget.steps=1000000000 must be at most"),
+        ("budget.num_envs=100000 budget.steps=10000", "budget.num_envs x budget.steps=1000000000 must be at most"),
         ("device=tpu", "device=tpu must be cpu, cuda, or one GPU such as cuda:0"),
         ("preset.rate=1e23", "env: rate=1e+23 must be more than 0 and at most 1000"),
         ("env.time_limit=1e300", "env: time_limit=1e+300 must be more than 0 and at most 1000000"),
@@ -82,18 +82,25 @@ def refusal(name, *arguments):
         (f"learner.hidden={[8] * 17}".replace(" ", ""), "learner: hidden_layers=17 must be at least 0 and at most 16"),
         ("proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
         ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
-        ("track.train.count=0", "track.train: count=0 of random_tracks must be from 1 to 10000"),
+        ("track.train.count=0", "count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
+        ("evaluation.measures.crashed.entry=[info,crash]", "evaluation.measures.crashed=info.crash is no entry of the"),
+        ("evaluation.measures.laps.where=[info,flag]", "evaluation.measures.laps=info.flag is no entry of the env"),
+        ("evaluation.measures.laps.reduction=median", "evaluation.measures.laps.reduction='median' must be 'mean'"),
+        ("+evaluation.measures.laps.unit=s", "there is no key unit; evaluation.measures.laps has entry, red"),
+        ("evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2", "at_least and at_most cannot both"),
+        ("evaluation.pictures.lines._target_=coil_rl.report.Nope", "evaluation.pictures.lines: there is no 'coil_rl"),
+        ("~evaluation.curve.cases.selection", "evaluation.curve.cases has evaluation; give evaluation and selection"),
         ("label=guide", "label=guide cannot be used"),
-        ("guide=constant guide.constant.value=[1,2]", "guide.constant: its action has the shape [1, 2], but the env"),
+        ("guide=constant guide.constant.value=[1,2]", "has the shape [1, 2], but must have [1, 1]"),
         # targets
         ("guide.spline._target_=coil_rl.guides.Nope", "guide.spline: there is no 'coil_rl.guides.Nope'; check"),
         ("guide.spline._target_=coil_rl.guides.spline.FAR", "is 1000.0, which cannot be called"),
         ("guide=zero guide.zero._target_=builtins.dict", "makes dict, not TensorDictModuleBase"),
         ("guide=zero guide.zero._target_=subprocess.run", "guide.zero: Target 'subprocess.run' is blocklisted"),
         # groups
-        ("guide=splin", "no guide=splin; guide can be centre_fast, constant, learned, random, spline, undertuned"),
+        ("guide=splin", "no guide=splin; guide can be bot, centre_fast, constant, controller"),
         ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
         ("+experiment=nope", "no experiment=nope; experiment can be coil_vs_ppo"),
         ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
@@ -102,11 +109,13 @@ def refusal(name, *arguments):
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
         ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
-        ("method=coil degrade=[shuffled] track.train.count=2", "track.test has 1 tracks, with one car each: degrade: "),
-        ("method=coil +degrade@evaluation.advice.other=shuffled", "one car each: method.transforms: ShuffledAdvice"),
+        ("method=coil degrade=[shuffled] track.train.count=2", "each case of the evaluation has one row, 1 in all: "),
+        ("method=coil +degrade@evaluation.advice.other=shuffled", "1 in all: method.transforms: ShuffledAdvice"),
         ("method=oil", "track.train gives one track, which cannot be left out to validate; set learner.group_key=null"),
         ("method=dynamic_coil_joint proxy.learner.regressor.epochs=-1", "guide.spline: learner: epochs=-1 must"),
-        ("method=dynamic_coil_joint proxy.method.observes=[]", "proxy.method.observes: a proxy needs observations"),
+        ("method=dynamic_coil_joint proxy.method.observes=null", "proxy.method.observes: a proxy needs observations"),
+        ("observes=[] method=ppo", "observes=[]: the agent has no observations; give the entries of the env"),
+        ("guide=none", "guide: there is none, but method=coil needs one; give guide=NAME, or method=ppo"),
         ("method=dynamic_coil_joint ~proxy.method.transforms.advice", "guide.spline: method.transforms.advice="),
         ("guide=learned guide.learned.run=nowhere", "guide.learned: run=nowhere is not the folder of a run"),
         ("method=rfc +method.transforms.coupling.guide=1", "method.transforms: RewardCoupling reads row 1 of"),
@@ -131,7 +140,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
-        ("guide=splin", "no guide=splin; guide can be centre_fast, constant, learned, random, spline, undertuned"),
+        ("guide=splin", "no guide=splin; guide can be bot, centre_fast, constant, controller"),
         # command line
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
         ("=3", "'=3' has no key, write KEY=VALUE"),
@@ -194,7 +203,7 @@ def run(tmp_path_factory):
         ({"seed": "abc"}, "Value 'abc' of type 'str' could not be converted to Integer"),
         ({"learner.gama": 1}, "learner: PPO takes no gama"),
         ({"learner.hidden": [8]}, "policy_last.pt does not fit the networks in"),
-        ({"budget.cars": -5}, "budget.cars=-5 must be greater than or equal to 1"),
+        ({"budget.num_envs": -5}, "budget.num_envs=-5 must be greater than or equal to 1"),
     ],
 )
 def test_changed_run_folder_is_refused(started, run, tmp_path, change, message):

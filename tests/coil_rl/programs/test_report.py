@@ -5,7 +5,7 @@ import pytest
 from programs import TINY, called, program
 from run_folders import driven, make_run, make_sweep
 
-FILES = {"report.md", "report.csv", "report_tracks.csv", "report.png", "report_curves.png"}
+FILES = {"report.md", "report.csv", "report_cases.csv", "report.png", "report_curves.png"}
 
 
 @pytest.fixture
@@ -49,8 +49,8 @@ def test_files_have_full_precision(sweep):
     assert float(coil["reward"]) == pytest.approx(571)
     assert float(coil["low"]) < 571 / 550 + 1e-3 < float(coil["high"])
     assert (coil["better"], coil["needs_guide"], coil["guide"], coil["seeds"]) == ("0.0", "True", "guide", "3")
-    tracks = {tuple(row.values())[:5]: row["reward"] for row in read_csv(sweep / "report_tracks.csv")}
-    assert tracks["sampled", "ppo", "", "3", "b"] == "615.0"
+    cases = {tuple(row.values())[:5]: row["reward"] for row in read_csv(sweep / "report_cases.csv")}
+    assert cases["sampled", "ppo", "", "3", "b"] == "615.0"
     text = (sweep / "report.md").read_text()
     assert text.index("## Deterministic actions") < text.index("## Sampled actions")
 
@@ -90,7 +90,7 @@ def test_several_folders_make_one_report_in_the_first(sweep):
 def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(arguments, message, sweep):
     Path("empty").mkdir()
     damaged = make_run(Path("damaged"), "coil", 0, None)
-    (damaged / "evaluation.csv").write_text("driver,advice,actions,track,reward\ncoil,,sampled,a,")
+    (damaged / "evaluation.csv").write_text("driver,advice,actions,case,reward\ncoil,,sampled,a,")
     before = all_files()
     code, _, error = report(*arguments.split())
     (sentence,) = error.splitlines()
@@ -110,7 +110,7 @@ def test_report_reads_the_runs_of_coil_train(tmp_path):
     assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
     reward = {row["driver"]: float(row["reward"]) for row in read_csv(tmp_path / "sweep" / "report.csv")[:3]}
     for run in (tmp_path / "sweep").glob("*_seed0"):
-        means = [row for row in read_csv(run / "evaluation.csv") if row["track"] == "mean" and not row["advice"]]
+        means = [row for row in read_csv(run / "evaluation.csv") if row["case"] == "mean" and not row["advice"]]
         guide, agent = means[0], means[1]
         assert reward["guide"] == pytest.approx(float(guide["reward"]))
         assert reward[agent["driver"]] == pytest.approx(float(agent["reward"]))

@@ -152,7 +152,7 @@ def test_every_budget_fits_every_experiment(budget):
 @pytest.mark.slow
 def test_a_figure_trains_its_runs_and_a_lost_run_again():
     choices = ["experiments=[paper]", "labels=[coil,ppo]"]
-    tiny = [*TRACK, "budget.frames=512", "budget.cars=8"]
+    tiny = [*TRACK, "budget.frames=512", "budget.num_envs=8"]
     arguments = ["figure=22", "budget=smoke", *(f"results.figure_22.{choice}" for choice in choices), f"train={tiny}"]
     program("reproduce", *arguments, cwd=Path())
     pages = [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")]

@@ -22,7 +22,7 @@ def runs(tmp_path_factory):
         ("coil", "method=coil", "seed=3"),
         ("residual", "method=residual", "learner.action_gain=1.0"),
         ("guide", "method=guide"),
-        ("tasks", "method=ppo", "env=driving_tasks", "also_observes=[task]"),
+        ("tasks", "method=ppo", "env=driving_tasks", "observes=[observation,task]"),
     ):
         make_untrained_run(folder / name, "track=robot", "track.train.scale=7", *overrides)
     return folder

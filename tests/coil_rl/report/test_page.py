@@ -17,21 +17,21 @@ def cells(table):
     return [lines[0], *lines[2:]]
 
 
-def test_section_has_a_table_of_drivers_and_one_of_tracks(tmp_path):
-    heading, drivers, tracks = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
+def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
+    heading, drivers, rewards = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
     assert heading == "## Results"
     titles, guide, ppo, coil, zeroed = cells(drivers)
     assert titles[:6] == [
         "driver", "advice", "seeds", "completed", "seeds with a crash (95 %)", "reward / guide's (95 %)",
     ]  # fmt: skip
-    assert guide[:6] == ["guide", "", "-", "100%", "0 of 2 tracks", "1.000"]
+    assert guide[:6] == ["guide", "", "-", "100%", "0 of 2 cases", "1.000"]
     assert coil == [
         "coil", "", "3", "100%", "0 of 3 (0% to 71%)", "1.038 (1.034 to 1.043)", "-0.037 (-0.037 to -0.037)", "0.000",
         "0%", "571.0", "50.00", "0.200", "0.30", "yes",
     ]  # fmt: skip
     assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (["-", "-", "-"], "no", ["coil", "zeroed"], "-")
-    assert cells(tracks)[0] == ["mean reward", "a", "b"]
-    assert cells(tracks)[-1] == ["coil, zeroed", "-100.0", "-201.0"]
+    assert cells(rewards)[0] == ["mean reward", "a", "b"]
+    assert cells(rewards)[-1] == ["coil, zeroed", "-100.0", "-201.0"]
 
 
 def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
@@ -79,11 +79,11 @@ def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
     assert cells(table)[2][5:7] == ["2,400 (1 of 2 seeds)", "2,500 (1 of 2 seeds)"]
 
 
-def test_empty_columns_and_many_tracks_are_omitted(tmp_path):
-    tracks = {f"track_{k}": 1.0 * k for k in range(9)}
-    make_run(tmp_path / "run", "coil", 0, driven("guide", tracks) + driven("coil", tracks))
+def test_empty_columns_and_many_cases_are_omitted(tmp_path):
+    cases = {f"case_{k}": 1.0 * k for k in range(9)}
+    make_run(tmp_path / "run", "coil", 0, driven("guide", cases) + driven("coil", cases))
     text = section(tmp_path)
     assert not [word for word in ("advice", "better than") if word in text]
-    assert text.endswith("The rewards on each of the 9 tracks are in report_tracks.csv.")
+    assert text.endswith("The rewards in each of the 9 cases are in report_cases.csv.")
     assert "Difference" not in page.notes(None, True, False)
     assert "Difference to its guide: of the same seed" in page.notes("guide", False, True)

@@ -22,7 +22,7 @@ def test_every_run_of_a_folder_is_read(sweep):
         ("coil", "zeroed", "deterministic"),
     ]  # fmt: skip
     agent = drives.get_group(("coil", "", "deterministic"))
-    assert agent[["track", "reward", "smoothness"]].to_numpy().tolist() == [["a", 521, 0.2], ["b", 621, 0.2]]
+    assert agent[["case", "reward", "smoothness"]].to_numpy().tolist() == [["a", 521, 0.2], ["b", 621, 0.2]]
     assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == ({"guide": 300}, 1000, 20)
 
 
@@ -48,7 +48,7 @@ def test_guide_without_agent_has_no_curve(tmp_path):
     assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
-ROW = "driver,advice,actions,track,reward,lap_time,smoothness,completed,crashed,clearance\nguide,,sampled,a,"
+ROW = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\nguide,,sampled,a,"
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import torch
 from drives import drive as circle
 from reproduced_runs import read_csv, row
 from run_folders import make_untrained_run
+from worlds import driving_measures
 
 from coil_rl.envs import RecordingError, SimulatedRobotEnv, read_recording, record_drives
 from coil_rl.errors import UserError
@@ -21,7 +22,7 @@ def recordings(tmp_path_factory):
     """A crash of a robot with constant steering, and two drives of the guide."""
     folder = tmp_path_factory.mktemp("drives")
     record_drives(SimulatedRobotEnv(seed=4), ConstantGuide(1.0), [folder / "crash.mcap"], {"policy": "constant"})
-    env = SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4)
+    env = SimulatedRobotEnv(num_envs=2, time_limit=20.0, seed=4)
     record_drives(env, SplineGuide(), [folder / "0.mcap", folder / "1.mcap"], {"policy": "guide"})
     return folder
 
@@ -29,14 +30,16 @@ def recordings(tmp_path_factory):
 def test_measures_of_recordings_equal_those_of_the_simulation(recordings, tmp_path):
     page = Table6(recordings=[str(recordings)]).make(tmp_path / "table_6")
     rows = {line["recording"]: line for line in read_csv(tmp_path / "table_6.csv")}
-    live = evaluate_policy(SimulatedRobotEnv(num_cars=2, time_limit=20.0, seed=4), SplineGuide()).episodes
+    measured = driving_measures("simulated_robot")
+    env = SimulatedRobotEnv(num_envs=2, time_limit=20.0, seed=4)
+    live = evaluate_policy(env, SplineGuide(), measures=measured).episodes
     for robot, episode in enumerate(live):
-        measured = rows[f"{robot}.mcap"]
-        assert float(measured["smoothness"]) == pytest.approx(episode["smoothness"], abs=1e-5)
-        assert float(measured["clearance"]) == pytest.approx(episode["clearance"], abs=1e-5)
-        assert measured["crashed"] == "False"
-        assert float(measured["off_centre"]) < 0.05
-    (crash,) = evaluate_policy(SimulatedRobotEnv(seed=4), ConstantGuide(1.0)).episodes
+        recorded = rows[f"{robot}.mcap"]
+        assert float(recorded["smoothness"]) == pytest.approx(episode["smoothness"], abs=1e-5)
+        assert float(recorded["clearance"]) == pytest.approx(episode["clearance"], abs=1e-5)
+        assert recorded["crashed"] == "False"
+        assert float(recorded["off_centre"]) < 0.05
+    (crash,) = evaluate_policy(SimulatedRobotEnv(seed=4), ConstantGuide(1.0), measures=measured).episodes
     assert rows["crash.mcap"]["crashed"] == "True"
     assert float(rows["crash.mcap"]["clearance"]) == pytest.approx(crash["clearance"], abs=1e-5)
     assert row(page, "guide ")[:5] == ["guide", "-", "2", "0", "0"]

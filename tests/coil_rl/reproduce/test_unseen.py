@@ -69,7 +69,7 @@ def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made)
     assert claims["COIL's laps take less time than PPO's"][:2] == ["-0.10", expected]
     assert claims["COIL earns more with its guide's advice than with another car's"][0] == "-"
     none = "0 of 3 (0% to 71%)"
-    crashes = f"**did not hold up**: guide 0 of 2 tracks, ppo {none}, coil {none}, oil 3 of 3 (29% to 100%)"
+    crashes = f"**did not hold up**: guide 0 of 2 cases, ppo {none}, coil {none}, oil 3 of 3 (29% to 100%)"
     assert claims["Nobody crashes"][:2] == ["0%", crashes]
     assert len(claims) == 7 + 3 + 1
 
@@ -78,13 +78,13 @@ def test_the_csv_has_every_drive(made):
     _, numbers = made
     assert len(numbers) == 2 * (3 * 3 * 3 + 3 * 2 + 2 * 3 * 3)
     drive = next(row for row in numbers if (row["label"], row["actions"], row["seed"]) == ("coil", "sampled", "2"))
-    assert (drive["track"], float(drive["reward"]), float(drive["lap_time"])) == ("a", 482, 50)
+    assert (drive["case"], float(drive["reward"]), float(drive["lap_time"])) == ("a", 482, 50)
 
 
 def test_many_tracks_are_in_the_csv_only(tmp_path):
     runs = make_runs(tmp_path / "main", {"coil": 30.0, "ppo": 60.0}, seeds=2)
     for run in runs:
-        first = run.evaluation[run.evaluation["track"] == "a"]
-        object.__setattr__(run, "evaluation", pd.concat([first.assign(track=name) for name in "abcdefghi"]))
+        first = run.evaluation[run.evaluation["case"] == "a"]
+        object.__setattr__(run, "evaluation", pd.concat([first.assign(case=name) for name in "abcdefghi"]))
     page = Table5(["main"]).make(tmp_path / "t", {"main": runs})
     assert page.count("The numbers of each of the 9 tracks are in t.csv.") == 2

@@ -14,7 +14,7 @@ from coil_rl.train.run_folder import read_config
 
 
 def robots():
-    return SimulatedRobotEnv(num_cars=2, time_limit=1.0)
+    return SimulatedRobotEnv(num_envs=2, time_limit=1.0)
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.errors import UserError
@@ -55,7 +56,7 @@ def test_numbers_are_those_of_each_policy_driven_alone(tmp_path, rings):
     for frames in (0, 100):
         policy.load_state_dict(perturbed(policy, seed=frames))
         line.keep(frames)
-        expected.append(evaluate_policy(world(rings), policy).episodes)
+        expected.append(evaluate_policy(world(rings), policy, measures=driving_measures()).episodes)
     assert expected[0] != expected[1]
     for row, episodes in zip(line.drive([0, 100]), expected, strict=True):
         for name, key in {"return": "reward", "crashed": "crashed", "smoothness": "smoothness"}.items():

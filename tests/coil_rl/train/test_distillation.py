@@ -13,8 +13,8 @@ from coil_rl.train import distillation, load
 from coil_rl.train.check import check
 
 TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.cars=4", "budget.steps=16",
-        "budget.frames=128", "proxy.budget.frames=256", "proxy.budget.cars=4", "proxy.budget.steps=16",
+        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.num_envs=4", "budget.steps=16",
+        "budget.frames=128", "proxy.budget.frames=256", "proxy.budget.num_envs=4", "proxy.budget.steps=16",
         "proxy.learner.regressor.epochs=20"]  # fmt: skip
 
 

@@ -1,8 +1,10 @@
 import pytest
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 
+from coil_rl.errors import UserError
 from coil_rl.train.build import build_guides
-from coil_rl.train.evaluate_run import drive_guides
+from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -14,7 +16,7 @@ def composed():
 
 
 def drive(config, guides=None):
-    return drive_guides(config, config.evaluation.env, ["a", "b", "c"], guides)
+    return drive_guides(config, config.evaluation.env, build_evaluation(config), guides)
 
 
 def test_guides_of_a_sweep_are_driven_once(composed):
@@ -34,3 +36,34 @@ def test_given_guides_are_not_cached(composed):
     cached, given = drive(config), drive(config, build_guides(config))
     assert given["guide spline"] is not cached["guide spline"]
     assert given["guide spline"].mean_reward == cached["guide spline"].mean_reward
+
+
+def test_evaluation_has_the_cases_and_measures_of_the_env_and_the_entries_of_its_pictures(composed):
+    config = composed()
+    evaluation = build_evaluation(config, build_pictures(config))
+    assert evaluation.cases == ["test_1", "test_2", "test_3"]
+    assert list(evaluation.measures) == list(config.evaluation.measures)
+    assert evaluation.record == {"pose": ("info", "pose")}
+    (result,) = drive_guides(composed("guide=spline"), config.evaluation.env, evaluation).values()
+    assert [episode["case"] for episode in result.episodes] == evaluation.cases
+    assert len(result.histories["pose"]) == 3
+
+
+def with_cases(config, cases):
+    OmegaConf.update(config, "evaluation.cases", cases, merge=False)
+    return config
+
+
+@pytest.mark.parametrize(("cases", "names"), [(3, ["0", "1", "2"]), (["one", 2], ["one", "2"])])
+def test_cases_are_a_number_or_names(composed, cases, names):
+    assert build_evaluation(with_cases(composed(), cases)).cases == names
+
+
+@pytest.mark.parametrize("cases", [0, -1, [], "abc", 1.5, None])
+def test_evaluation_without_cases_is_refused(composed, cases):
+    with pytest.raises(UserError, match=r"evaluation\.cases=.* must be at least 1, or the names of the cases"):
+        build_evaluation(with_cases(composed(), cases))
+
+
+def test_guides_without_a_guide_are_not_driven(composed):
+    assert drive(composed("guide=none", "method=ppo")) == {}

@@ -193,7 +193,7 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
     good = experiment(tmp_path / "good", frames=16 * 8 * 2)
     good.run()
     run = experiment(tmp_path / "run", extra=[WriteNaN(key, step, 5)])
-    message = f"next/{key} is nan at step {step} of car 5; the last good checkpoint is kept"
+    message = f"next/{key} is nan at step {step} of row 5; the last good checkpoint is kept"
     with pytest.raises(UserError, match=f"{message}.*{re.escape(f'coil-train resume={tmp_path}/run')}"):
         run.run()
     ours, theirs = (checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("run", "good"))

@@ -62,7 +62,7 @@ def test_tracks_of_the_training_are_not_needed(replay, tmp_path):
     ("overrides", "words"),
     [
         (["method=guide"], "has no agent: its guide drives alone; give that guide instead"),
-        (["method=ppo", "env=driving_tasks", "also_observes=[task]"], "the env has no entry task to observe; it has"),
+        (["method=ppo", "env=driving_tasks", "observes=[observation,task]"], "the env has no entry task to observe"),
     ],
 )
 def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(replay, tmp_path, overrides, words):

@@ -61,12 +61,12 @@ def zeros():
 @pytest.mark.parametrize(
     ("places", "message"),
     [
-        ([("observation", 3, 2, 1)], "observation is nan at step 103 of car 3"),
-        ([(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)], "observation is nan at step 106 of car 2"),
-        ([(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)], "next/info/pose is nan at step 102 of car 0"),
+        ([("observation", 3, 2, 1)], "observation is nan at step 103 of row 3"),
+        ([(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)], "observation is nan at step 106 of row 2"),
+        ([(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)], "next/info/pose is nan at step 102 of row 0"),
     ],
 )
-def test_first_nan_is_reported_with_its_entry_step_and_car(places, message):
+def test_first_nan_is_reported_with_its_entry_step_and_row(places, message):
     batch = zeros()
     for key, car, t, number in places:
         batch[key][car, t, number] = torch.nan
@@ -78,5 +78,5 @@ def test_infinity_is_reported_also_without_a_batch_dimension():
     batch = zeros()[0]
     check_batch(batch)
     batch["next", "observation"][4, 0] = -torch.inf
-    with pytest.raises(UserError, match="next/observation is -inf at step 5 of car 0"):
+    with pytest.raises(UserError, match="next/observation is -inf at step 5 of row 0"):
         check_batch(batch)

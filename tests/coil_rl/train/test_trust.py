@@ -80,6 +80,49 @@ def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp
     assert set(sys.modules) == modules
 
 
+@pytest.mark.parametrize("path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"])
+@pytest.mark.parametrize(
+    "key", ["guide.theirs.of", "env.controllers.theirs", "env.of", "evaluation.env.controllers.x.y"]
+)
+def test_controller_outside_the_list_is_refused_before_any_import(key, path, saved, tmp_path, monkeypatch):
+    trust._shipped_targets()
+    monkeypatch.setattr(hydra.utils, "get_object", no_import)
+    monkeypatch.setattr(importlib, "import_module", no_import)
+    for value in (path, {"a.b": path} if "controllers" in key else path):
+        with pytest.raises(UserError, match=rf"{key}[a-b.]* names '.*', which is no part of a run and could run code"):
+            read(tmp_path, changed(saved, key, value))
+
+
+def test_gymnasium_env_of_a_module_is_refused_like_the_module(package, saved, tmp_path):
+    for env, message in (("os:x-v0", "no part of a run"), ("their_package:Env-v0", r"trust=\[their_package\]")):
+        with pytest.raises(UserError, match=message):
+            read(tmp_path, changed(saved, "env.id", env))
+    assert "their_package" not in sys.modules
+    trust.trust_packages(["their_package"])
+    assert read(tmp_path, changed(saved, "env.id", "their_package:Env-v0")).env.id == "their_package:Env-v0"
+    assert read(tmp_path, changed(saved, "env.id", "LunarLander-v3")).env.id == "LunarLander-v3"
+
+
+def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package, saved, tmp_path):
+    theirs = changed(
+        saved, "guide.theirs", {"_target_": "coil_rl.guides.ControllerGuide", "of": "their_package:TheirGuide"}
+    )
+    with pytest.raises(
+        UserError, match=r"guide\.theirs\.of names .*; if you know .* allow it with trust=\[their_package\]"
+    ):
+        read(tmp_path, theirs)
+    assert "their_package" not in sys.modules
+    trust.trust_packages([], OmegaConf.create({"guide": {"mine": {"of": "their_package:TheirGuide"}}}))
+    assert read(tmp_path, theirs).guide.theirs
+    trust.trust_packages(["their_package"])
+    assert read(tmp_path, theirs).guide.theirs
+    with pytest.raises(UserError, match="which is defined elsewhere"):
+        read(tmp_path, changed(theirs, "guide.theirs.of", "their_package:os.system"))
+    for name in ("mine", "id"):
+        with pytest.raises(UserError, match="which is defined elsewhere"):
+            read(tmp_path, changed(saved, "env.controllers", {name: "their_package:os.system"}))
+
+
 @pytest.mark.parametrize(
     "key",
     ["guide.spline", "guide.other", "env", "env.reward", "learner.x", "track.train", "track.test.deep.er", "logger",
@@ -147,6 +190,11 @@ def test_file_that_no_run_writes_is_refused(text, message, tmp_path):
 
 GROUPS = ("env", "guide", "degrade", "learner", "logger", "method", "track", "action", "preset")
 MISSING = ["+env.recordings=[a.mcap]", "+track.dir=levels", "+guide.learned.run=other"]
+MISSING += [
+    "+guide.controller.of=coil_rl.guides:SplineGuide",
+    "+guide.recorded.file=a.csv",
+    "+guide.entry.key=steering",
+]
 
 
 @pytest.mark.slow

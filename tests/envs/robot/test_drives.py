@@ -98,7 +98,7 @@ def test_saved_drive_is_read_back_and_marked_as_simulated(tmp_path):
 
 
 def robots():
-    return SimulatedRobotEnv(num_cars=2, time_limit=25 / 5.5, seed=4)
+    return SimulatedRobotEnv(num_envs=2, time_limit=25 / 5.5, seed=4)
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_replay_has_the_observations_commands_and_poses_of_the_drive(files, live
 
 
 def test_recording_ends_with_the_episode_of_its_robot(tmp_path):
-    env = SimulatedRobotEnv(num_cars=1)
+    env = SimulatedRobotEnv(num_envs=1)
     record_drives(env, ConstantGuide(1.0), [tmp_path / "crash.mcap"])
     recording = read_recording(tmp_path / "crash.mcap")
     assert 5 < len(recording.log_time) == int(env.steps) < 40

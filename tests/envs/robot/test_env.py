@@ -6,6 +6,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 from ovals import ring_track
+from worlds import driving_measures
 
 import coil_rl.train.config  # noqa: F401  registers the typed roots
 from coil_rl import testing
@@ -20,7 +21,7 @@ EXACT = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
 
 
 def robots(count=2, **world) -> SimulatedRobotEnv:
-    return SimulatedRobotEnv(num_cars=count, **world)
+    return SimulatedRobotEnv(num_envs=count, **world)
 
 
 def steered(env, actions):
@@ -91,7 +92,7 @@ def test_state_dict_is_the_whole_state():
 
 @pytest.mark.parametrize("action", [1.0, 0.0])
 def test_constant_steering_crashes(action):
-    episodes = evaluate_policy(robots(2), ConstantGuide(action)).episodes
+    episodes = evaluate_policy(robots(2), ConstantGuide(action), measures=driving_measures("simulated_robot")).episodes
     assert all(episode["crashed"] and not episode["completed"] for episode in episodes)
     assert all(-0.03 < episode["clearance"] <= 0 for episode in episodes)
     assert all(episode["reward"] < -90 for episode in episodes)
@@ -108,12 +109,19 @@ def test_guide_completes_its_laps_on_tracks_of_both_directions():
     track = robot_track()
     mirrored = Track("mirrored", left=track.right * [1, -1], right=track.left * [1, -1])
     env = robots(2, tracks=[track, mirrored], assignment="cyclic", laps=1)
-    result = evaluate_policy(env, SplineGuide(), names=["one", "other"])
-    assert [episode["track"] for episode in result.episodes] == ["one", "other"]
+    result = evaluate_policy(
+        env,
+        SplineGuide(),
+        measures=driving_measures("simulated_robot"),
+        record={"pose": ("info", "pose")},
+        cases=["one", "other"],
+    )
+    assert [episode["case"] for episode in result.episodes] == ["one", "other"]
     assert all(episode["completed"] and not episode["crashed"] for episode in result.episodes)
     # A lap of 6 m takes 40 s at 0.15 m/s, a little less with cut corners.
     assert all(36 < episode["lap_time"] < 42 for episode in result.episodes)
-    assert result.lines[0][:, 1].mean() > 0.3 > -0.3 > result.lines[1][:, 1].mean()
+    one, other = result.histories["pose"]
+    assert one[:, 1].mean() > 0.3 > -0.3 > other[:, 1].mean()
     env = robots(64, tracks=[track, mirrored])
     first, second = (env.reset()["info", "track"] for _ in range(2))
     assert 15 < first.sum() < 49
@@ -123,7 +131,7 @@ def test_guide_completes_its_laps_on_tracks_of_both_directions():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"num_cars": 0}, "num_cars="),
+        ({"num_envs": 0}, "num_envs="),
         ({"speed": -1}, "speed="),
         ({"laps": 0}, "laps="),
         ({"max_steering": 100}, "max_steering="),
@@ -140,10 +148,10 @@ def test_invalid_options_are_refused(options, words):
 
 def test_configuration_agrees_with_the_defaults():
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("evaluate", ["env=simulated_robot", "track=robot", "budget.cars=2", "run_dir=unused"])
-    env = build_env(config, {**config.evaluation.env, "num_cars": 3}).base_env
+        config = compose("evaluate", ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"])
+    env = build_env(config, {**config.evaluation.env, "num_envs": 3}).base_env
     assert isinstance(env, SimulatedRobotEnv)
-    plain = SimulatedRobotEnv(num_cars=3, assignment="cyclic")
+    plain = SimulatedRobotEnv(num_envs=3, assignment="cyclic")
     for one, other in ((env, plain), (env.perception, plain.perception), (env.lidar, plain.lidar)):
         numbers = {name: value for name, value in vars(other).items() if isinstance(value, (int, float))}
         assert {name: vars(one)[name] for name in numbers} == pytest.approx(numbers, rel=1e-5)

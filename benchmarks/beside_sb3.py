@@ -1,0 +1,152 @@
+"""Our learners beside those of Stable-Baselines3: the same hyper-parameters, frames and Gymnasium envs.
+
+    python -m benchmarks.beside_sb3 ppo Pendulum-v1 --frames 40000 --seeds 3
+
+prints for both the mean return of deterministic episodes with fixed seeds after the training, with the standard
+deviation over the runs, and the frames per CPU second of the training. The extra `bench` of coil-rl installs what it
+needs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import torch
+from tabulate import tabulate
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from tqdm import tqdm
+
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.learners import DQN, PPO, SAC, Mlp
+from coil_rl.schedules import Linear
+from coil_rl.train.rollout import Rollout
+
+Act = Callable[[Tensor], Tensor]  # observations [B, D] to deterministic actions
+# Values of an algorithm on any env, with `every` frames to a minibatch; and what differs on some, as tuned for
+# Stable-Baselines3 by RL Zoo.
+VALUES: Mapping[str, Mapping[str, Any]] = {
+    "ppo": {"envs": 8, "steps": 256, "minibatch": 64, "epochs": 10, "learning_rate": 3e-4, "gamma": 0.99,
+            "gae_lambda": 0.95, "entropy": 0.0},
+    "sac": {"envs": 1, "steps": 1, "every": 1, "minibatch": 256, "learning_rate": 1e-3, "gamma": 0.99, "tau": 0.005,
+            "starts": 1_000, "hidden": (64, 64)},
+    "dqn": {"envs": 1, "steps": 4, "every": 4, "minibatch": 128, "learning_rate": 6e-4, "gamma": 0.99, "tau": 0.01,
+            "starts": 1_000, "hidden": (128, 128), "explore": 0.3, "epsilon": 0.05},
+}  # fmt: skip
+TUNED: Mapping[tuple[str, str], Mapping[str, Any]] = {
+    ("ppo", "Pendulum-v1"): {"envs": 4, "steps": 1024, "learning_rate": 1e-3, "gamma": 0.9},
+    ("ppo", "LunarLander-v3"): {"envs": 16, "steps": 1024, "epochs": 4, "gamma": 0.999, "gae_lambda": 0.98,
+                                "entropy": 0.01},
+}  # fmt: skip
+CAPACITY = 50_000
+EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
+
+
+def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> Act:
+    """Train our learner and return its deterministic policy."""
+    torch.manual_seed(seed)
+    env = GymnasiumEnv(env_id, values["envs"], seed=seed)
+    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")} | {"seed": seed}
+    learner: PPO | SAC | DQN
+    if algorithm == "ppo":
+        learner = PPO(
+            env, hidden=(64, 64), action_scale=1.0, squash=False, gae_lambda=values["gae_lambda"],
+            epochs=values["epochs"], minibatches=values["envs"] * values["steps"] // values["minibatch"],
+            entropy=values["entropy"], **common,
+        )  # fmt: skip
+    else:
+        replay = common | {name: values[name] for name in ("tau", "starts")} | {"capacity": CAPACITY}
+        replay |= {"batch_size": values["minibatch"], "ratio": values["minibatch"] / values["every"]}
+        network = Mlp(values["hidden"], "relu")
+        if algorithm == "sac":
+            # The default of Stable-Baselines3 is for actions in [-1, 1], ours for those of the env.
+            high, size = env.action_spec.space.high, env.action_spec.shape[-1]
+            entropy = -size + size * math.log(float(high.max()))
+            learner = SAC(env, network=network, target_entropy=entropy, temperature=1.0, max_grad_norm=1e6, **replay)
+        else:
+            epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
+            learner = DQN(env, network=network, epsilon=epsilon, double=False, **replay)
+    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
+    for update in range(frames // rollout.frames):
+        learner.update(rollout.collect(), update * rollout.frames / frames)
+
+    def act(observation: Tensor) -> Tensor:
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            action: Tensor = learner.policy(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
+        return action
+
+    return act
+
+
+def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> Act:
+    """Train the learner of Stable-Baselines3 and return its deterministic policy."""
+    import stable_baselines3
+    from stable_baselines3.common.env_util import make_vec_env
+
+    envs = make_vec_env(env_id, values["envs"], seed=seed)
+    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")}
+    common |= {"batch_size": values["minibatch"], "seed": seed, "device": "cpu"}
+    if algorithm == "ppo":
+        model = stable_baselines3.PPO(
+            "MlpPolicy", envs, n_steps=values["steps"], n_epochs=values["epochs"], gae_lambda=values["gae_lambda"],
+            ent_coef=values["entropy"], **common,
+        )  # fmt: skip
+    else:
+        common |= {"tau": values["tau"], "learning_starts": values["starts"], "buffer_size": CAPACITY}
+        common |= {"train_freq": values["steps"], "gradient_steps": values["steps"] // values["every"]}
+        common["policy_kwargs"] = {"net_arch": list(values["hidden"]), "activation_fn": nn.ReLU}
+        if algorithm == "sac":
+            model = stable_baselines3.SAC("MlpPolicy", envs, **common)
+        else:
+            model = stable_baselines3.DQN(
+                "MlpPolicy", envs, target_update_interval=values["every"], exploration_fraction=values["explore"],
+                exploration_final_eps=values["epsilon"], **common,
+            )  # fmt: skip
+    model.learn(frames)
+    return lambda observation: torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
+
+
+def mean_return(env_id: str, act: Act) -> float:
+    """Return the mean return of one episode from each of the fixed seeds."""
+    env = GymnasiumEnv(env_id, EPISODES, first_seed=FIRST_SEED)
+    carrier, running, total = env.reset(), torch.ones(EPISODES, 1, dtype=torch.bool), torch.zeros(EPISODES, 1)
+    while running.any():
+        step = env.step(carrier.set("action", act(carrier["observation"])))
+        total += step["next", "reward"] * running
+        running &= ~step["next", "done"]
+        carrier = step["next"].exclude("reward")
+    return float(total.mean())
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    """Train with both and print the comparison."""
+    parser = argparse.ArgumentParser("python -m benchmarks.beside_sb3", description=__doc__)
+    parser.add_argument("algorithm", choices=list(VALUES))
+    parser.add_argument("env", help="a Gymnasium id, e.g. Pendulum-v1 or LunarLander-v3")
+    parser.add_argument("--frames", type=int, default=20_000)
+    parser.add_argument("--seeds", type=int, default=3, help="runs, with the seeds 0, 1, ...")
+    args = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    values = {**VALUES[args.algorithm], **TUNED.get((args.algorithm, args.env), {})}
+    rows = []
+    for name, train in tqdm([("ours", ours), ("Stable-Baselines3", theirs)], disable=None):
+        returns, rates = [], []
+        for seed in range(args.seeds):
+            start = time.process_time()
+            act = train(args.algorithm, args.env, values, args.frames, seed)
+            rates.append(args.frames / (time.process_time() - start))
+            returns.append(mean_return(args.env, act))
+        spread = statistics.stdev(returns) if len(returns) > 1 else math.nan
+        rows.append([name, statistics.mean(returns), spread, statistics.median(rates)])
+    print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
+    print(tabulate(rows, ["", "return", "sd", "frames per CPU second"], floatfmt=".0f"))
+
+
+if __name__ == "__main__":
+    main()

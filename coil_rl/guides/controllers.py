@@ -1,0 +1,257 @@
+"""Controllers of other people as guides: Python objects, functions, networks, entries of the env, recordings."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import io
+import os
+import pickle
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import nn
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from coil_rl.errors import did_you_mean
+from coil_rl.transforms.action_space import nested_key
+
+
+class PerRow(TensorDictModuleBase):
+    """Python controllers as a guide, one object for each row of the env, made when its row first acts.
+
+    `act(observation)` gets one NumPy array for each of `in_keys` and returns an action: numbers, an index or a one-hot
+    vector. `reset()`, if there is one, is called at the start of each episode; without it each episode gets a new
+    object. Objects with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
+    episodes begin when a run is resumed. They are called one after the other: a batched guide is many times faster.
+
+    Args:
+        make: makes an object; called without arguments.
+        in_keys: entries to read, [*batch, ...].
+        out_key: entry for the action, [*batch, A].
+
+    Example:
+        >>> from torchrl.envs import GymEnv, TransformedEnv
+        >>> from coil_rl.transforms import GuideActions
+        >>> class Lean:
+        ...     def act(self, observation):
+        ...         return int(observation[2] > 0)
+        >>> env = TransformedEnv(GymEnv("CartPole-v1"), GuideActions({"lean": PerRow(Lean)}))
+        >>> env.rollout(3)["guide_action"].shape
+        torch.Size([3, 1, 2])
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        in_keys: Sequence[NestedKey] = ("observation",),
+        out_key: NestedKey = "action",
+    ) -> None:
+        self.read = [nested_key(key) for key in in_keys]
+        self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
+        super().__init__()
+        self.make, self.objects = make, dict[int, Any]()
+        self.continues = (
+            True  # whether the last restored state holds those of the objects; else new episodes must begin
+        )
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        flat = tensordict.reshape(-1)
+        rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
+        observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
+        actions = [
+            np.atleast_1d(self._object(row, start).act(*observed))
+            for row, start, observed in zip(rows, starts, observations, strict=True)
+        ]
+        action = torch.as_tensor(np.stack(actions), device=tensordict.device)
+        return tensordict.set(self.out_keys[0], action.reshape(*tensordict.batch_size, *action.shape[1:]))
+
+    def _object(self, row: int, start: bool) -> Any:
+        if row not in self.objects or (start and not hasattr(self.objects[row], "reset")):
+            self.objects[row] = self.make()
+        if start and hasattr(self.objects[row], "reset"):
+            self.objects[row].reset()
+        return self.objects[row]
+
+    def get_extra_state(self) -> dict[int, Any] | None:
+        """Return the states by row, None if an object has none; raises a `ValueError` for one that cannot be saved."""
+        things = self.objects.values()
+        if not all(hasattr(thing, "state_dict") and hasattr(thing, "load_state_dict") for thing in things):
+            return None
+        file = io.BytesIO()
+        torch.save({row: thing.state_dict() for row, thing in self.objects.items()}, file)
+        file.seek(0)
+        try:
+            states: dict[int, Any] = torch.load(file, weights_only=True)
+        except pickle.UnpicklingError as error:
+            name = type(next(iter(self.objects.values()))).__name__
+            raise ValueError(
+                f"state_dict() of the controller {name} may hold numbers, texts, lists, dictionaries and tensors only; "
+                "convert NumPy arrays by tolist()"
+            ) from error
+        return states
+
+    def set_extra_state(self, state: Mapping[int, Any] | None) -> None:
+        """Make objects with these states."""
+        self.continues = state is not None
+        if state is None:
+            name = getattr(self.make, "func", self.make).__name__
+            problem = f"the controller {name} has no state_dict() and load_state_dict(state), so new episodes begin"
+            warnings.warn(problem, stacklevel=2)
+            state = {}
+        self.objects = {row: self.make() for row in state}
+        for row, thing in self.objects.items():
+            thing.load_state_dict(state[row])
+
+
+class ControllerGuide(TensorDictModuleBase):
+    """A controller that is named by `MODULE:NAME`. What is found there decides how it is used.
+
+    | it is | it becomes |
+    | --- | --- |
+    | a class of TensorDictModules | the guide itself, with its own `in_keys` |
+    | another class of `nn.Module`s | a network from the entries [B, N] to the action [B, A] |
+    | a class with a method `act` | `PerRow`: one object for each row of the env |
+    | a function | from the entries [B, N] to the action [B, A], tensors |
+
+    Args:
+        of: such as `my_package.control:MyPID`.
+        in_keys: entries to read; None for `observation`, or for those of a TensorDictModule.
+        options: arguments of the class, or further ones of the function, by name.
+
+    Raises:
+        ValueError: if it cannot be imported, is nothing of the above, or takes other arguments.
+    """
+
+    def __init__(
+        self, of: str, in_keys: Sequence[NestedKey] | None = None, options: Mapping[str, Any] | None = None
+    ) -> None:
+        thing, options = load(of), dict(options or {})
+        keys = [nested_key(key) for key in in_keys or ["observation"]]
+        guide: TensorDictModuleBase
+        if not inspect.isclass(thing):
+            if not callable(thing) or isinstance(thing, nn.Module):
+                raise ValueError(f"of={of} is {type(thing).__name__}; name a class or a function")
+            _check_call(thing, of, keys, options)
+            guide = TensorDictModule(partial(thing, **options), in_keys=keys, out_keys=["action"])
+        elif issubclass(thing, nn.Module):
+            _check_call(thing, of, [], options)
+            guide = module = thing(**options)
+            if not isinstance(module, TensorDictModuleBase):
+                guide = TensorDictModule(module, in_keys=keys, out_keys=["action"])
+            elif in_keys is not None:
+                raise ValueError(f"of={of} has its own in_keys={module.in_keys}; leave in_keys out")
+        elif callable(act := getattr(thing, "act", None)):
+            _check_call(thing, of, [], options)
+            _check_call(act, f"{of}.act", ["self", *keys], {})
+            guide = PerRow(partial(thing, **options), keys)
+        else:
+            raise ValueError(f"of={of} is a class without act(observation); give it this method, or name a function")
+        self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
+        super().__init__()
+        self.guide, self.pure = guide, getattr(thing, "pure", False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        result: TensorDictBase = self.guide(tensordict)
+        return result
+
+
+class EntryGuide(TensorDictModule):
+    """The action in entry `key` [*batch, A] of the env, as of a controller inside, which may know more than agents."""
+
+    sees = "env"
+
+    def __init__(self, key: NestedKey | Sequence[str]) -> None:
+        super().__init__(nn.Identity(), in_keys=[nested_key(key)], out_keys=["action"])
+
+
+class RecordedGuide(TensorDictModuleBase):
+    """Actions of a recording, from the first step of every episode; the last one is held after the end.
+
+    Args:
+        file: CSV of numbers, [T, A] action units, one line for each step; a first line with names is left out.
+
+    Raises:
+        ValueError: for a file that cannot be read, or without finite numbers.
+    """
+
+    def __init__(self, file: str | os.PathLike[str]) -> None:
+        self.in_keys, self.out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
+        super().__init__()
+        self.actions: torch.Tensor = nn.Buffer(_read_actions(file), persistent=False)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action of the step, and the number of the next one."""
+        step = tensordict["recorded_step"]
+        action = self.actions[step.squeeze(-1).clamp(max=len(self.actions) - 1)]
+        return tensordict.set("action", action).set(("next", "recorded_step"), step + 1)
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Declare the number of the step as memory."""
+        return TensorDictPrimer({"recorded_step": Unbounded((1,), dtype=torch.int64)}, expand_specs=True)
+
+
+def load(of: str) -> Any:
+    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported."""
+    module, _, names = of.partition(":")
+    if not module or not names:
+        raise ValueError(f"of={of} must be MODULE:NAME, such as my_package.control:MyPID")
+    try:
+        thing: Any = importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if f"{module}.".startswith(f"{error.name}."):
+            problem = f"of={of}: there is no module {error.name}; install its package, or add its folder to PYTHONPATH"
+        else:
+            problem = f"of={of}: {module} needs {error.name}, which is missing; install it"
+        raise ValueError(problem) from error
+    except Exception as error:
+        raise ValueError(f"of={of}: {module} cannot be imported ({type(error).__name__}: {error})") from error
+    for name in names.split("."):
+        if not hasattr(thing, name):
+            raise ValueError(f"of={of}: {module} has no {names}{did_you_mean(name, vars(thing)) or '; name another'}")
+        thing = getattr(thing, name)
+    return thing
+
+
+def _check_call(function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]) -> None:
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # some functions written in C have none
+        return
+    try:
+        signature.bind(*entries, **options)
+    except TypeError as error:
+        given = ", ".join([*(str(entry) for entry in entries if entry != "self"), *(f"{key}=" for key in options)])
+        close = [did_you_mean(key, signature.parameters) for key in options if key not in signature.parameters]
+        raise ValueError(f"{title} takes {signature}, but is called with ({given}): {error}{''.join(close)}") from error
+
+
+def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
+    try:
+        with open(file, encoding="utf-8") as text:
+            lines = [line.strip() for line in text if line.strip()]
+        lines = lines[not _numbers(lines[0]) :] if lines else []
+        actions = np.array([_numbers(line) or line.split(",") for line in lines], dtype=np.float32)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"file={os.fspath(file)} cannot be read as numbers with commas ({error})") from error
+    if not actions.size or not np.isfinite(actions).all():
+        raise ValueError(f"file={os.fspath(file)} must hold at least one line of finite numbers")
+    return torch.from_numpy(actions)
+
+
+def _numbers(line: str) -> list[float]:
+    """Return the numbers of a line, none if it holds anything else."""
+    try:
+        return [float(field) for field in line.split(",")]
+    except ValueError:
+        return []

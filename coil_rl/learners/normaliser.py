@@ -1,0 +1,133 @@
+"""Running normalisation of observations to mean 0 and standard deviation 1.
+
+It is a part of the policy and not a transform of the env: the statistics are in the policy's own state, so whoever
+loads the policy has them, guides see the observations as they are, and an evaluation never changes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from coil_rl.learners.encoders import entry_specs
+from coil_rl.transforms import GuideActions
+
+LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
+
+
+class Normaliser(TensorDictModuleBase):
+    """Entries of an env minus their mean, divided by their standard deviation, over everything that `learn` has seen.
+
+    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the entries.
+
+    Args:
+        env: the env.
+        keys: the entries, all of floating point numbers.
+
+    Raises:
+        KeyError: if the env has no such entry.
+        ValueError: for advice, which shares the unit of the action, or an entry that does not hold such numbers.
+    """
+
+    def __init__(self, env: EnvBase, keys: Sequence[NestedKey]) -> None:
+        self.in_keys = list(keys)
+        self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]
+        super().__init__()
+        advice = advice_keys(env)
+        self.moments = nn.ModuleList()
+        for key, spec in zip(keys, entry_specs(env, keys), strict=True):
+            if key in advice:
+                raise ValueError(f"normalise: {key} is advice, in the unit of the action; leave it out")
+            if not spec.dtype.is_floating_point:
+                raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
+            self.moments.append(Moments(spec.shape[len(env.batch_size) :], spec.device))
+
+    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
+        """Return the keys that a network reads in place of `keys`."""
+        names = dict(zip(self.in_keys, self.out_keys, strict=True))
+        return [names.get(key, key) for key in keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the normalised entries."""
+        for key, name, moments in zip(self.in_keys, self.out_keys, self.moments, strict=True):
+            tensordict.set(name, moments(tensordict[key]))
+        return tensordict
+
+    def learn(self, batch: TensorDictBase) -> None:
+        """Add the entries of a batch of any shape to the statistics."""
+        for key, moments in zip(self.in_keys, self.moments, strict=True):
+            moments.add(batch[key])  # type: ignore[operator]
+
+
+class Moments(nn.Module):
+    """Count, mean and variance of each element of all vectors seen so far, by the method of Chan et al. (1979).
+
+    Args:
+        shape: of a vector.
+        device: of the statistics.
+    """
+
+    count: Tensor
+    mean: Tensor
+    variance: Tensor
+
+    def __init__(self, shape: torch.Size, device: torch.device | None = None) -> None:
+        super().__init__()
+        options: dict[str, Any] = {"dtype": torch.float64, "device": device}
+        self.register_buffer("count", torch.zeros((), **options))
+        self.register_buffer("mean", torch.zeros(shape, **options))
+        self.register_buffer("variance", torch.ones(shape, **options))
+
+    def forward(self, values: Tensor) -> Tensor:
+        """Normalise values [*batch, *shape]."""
+        scaled = (values - self.mean) / (self.variance + 1e-8).sqrt()
+        return scaled.clamp(-LIMIT, LIMIT).to(values.dtype)
+
+    @torch.no_grad()
+    def add(self, values: Tensor) -> None:
+        """Add values [*batch, *shape]."""
+        rows = values.reshape(-1, *self.mean.shape).double()
+        mean, variance = rows.mean(0), rows.var(0, correction=0)
+        total = self.count + len(rows)
+        share, change = len(rows) / total, mean - self.mean
+        spread = self.variance * (1 - share) + variance * share + change.square() * share * (1 - share)
+        self.mean += change * share
+        self.variance.copy_(spread)
+        self.count.copy_(total)
+
+
+def advice_keys(env: EnvBase) -> set[NestedKey]:
+    """Return the entries of an env that hold advice."""
+    return {key for module in env.modules() if isinstance(module, GuideActions) for key in module.out_keys}
+
+
+def normaliser(env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Sequence[NestedKey]) -> Normaliser | None:
+    """Return the normaliser of a learner.
+
+    `normalise` names the entries; True: all of `in_keys` that hold vectors of measurements, that is not advice, choices
+    or images. None if there are none.
+    """
+    if not isinstance(normalise, bool):
+        chosen = list(normalise)
+        if unread := [str(key) for key in chosen if key not in in_keys]:
+            raise ValueError(
+                f"normalise: {', '.join(unread)} is not observed; observed are {', '.join(map(str, in_keys))}"
+            )
+    elif normalise:
+        advice, batch_dims = advice_keys(env), len(env.batch_size)
+        chosen = [
+            key
+            for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True)
+            if key not in advice and spec.dtype.is_floating_point and len(spec.shape) - batch_dims < 3
+            and not hasattr(spec, "nvec") and getattr(spec, "domain", "continuous") == "continuous"
+        ]  # fmt: skip
+    else:
+        chosen = []
+    return Normaliser(env, chosen) if chosen else None

@@ -1,0 +1,83 @@
+"""What is measured in an episode besides its return: definitions, and means over episodes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
+from typing import Any
+
+# Reductions of the steps of an episode to one number.
+REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero")
+
+
+@dataclass(frozen=True)
+class Measure:
+    """A measure of an episode: an entry of the env, reduced over the steps.
+
+    Two measures have a meaning in reports: `completed`, the success that drivers are ordered by first, and `crashed`,
+    the failure that is counted by seed.
+
+    Args:
+        entry: key of one number a row, after a step.
+        reduction: `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`, or
+            their mean (`mean_nonzero`). Without a number, a mean is NaN.
+        where: key of a flag; only the steps with it count.
+        at_least: the measure becomes a flag: the number is at least this.
+        at_most: the measure becomes a flag: the number is at most this.
+        title: heading of its column; a measure without one is in the CSV files only.
+        format: of its numbers in tables.
+
+    Raises:
+        ValueError: for another reduction, or two bounds.
+    """
+
+    entry: str | tuple[str, ...]
+    reduction: str = "mean"
+    where: str | tuple[str, ...] | None = None
+    at_least: float | None = None
+    at_most: float | None = None
+    title: str = ""
+    format: str = ".1f"
+
+    def __post_init__(self) -> None:
+        if self.reduction not in REDUCTIONS:
+            raise ValueError(f"reduction={self.reduction} must be one of {', '.join(REDUCTIONS)}")
+        if self.at_least is not None and self.at_most is not None:
+            raise ValueError("at_least and at_most cannot both be given; give one")
+
+    @classmethod
+    def of(cls, entry: str | Sequence[str], where: str | Sequence[str] | None = None, **options: Any) -> Measure:
+        """Return a measure from values of a YAML file, in which keys are lists."""
+        return cls(_key(entry), where=None if where is None else _key(where), **options)
+
+    def pool(self, values: Sequence[float]) -> float:
+        """Return the mean of several episodes without NaN; of numbers, the minimum of minima, the maximum of maxima."""
+        numbers = [float(value) for value in values if not math.isnan(value)]
+        is_flag = self.at_least is not None or self.at_most is not None
+        pools: dict[str, Callable[[Sequence[float]], float]] = {} if is_flag else {"min": min, "max": max}
+        return pools.get(self.reduction, fmean)(numbers) if numbers else math.nan
+
+
+def _key(key: str | Sequence[str]) -> str | tuple[str, ...]:
+    return key if isinstance(key, str) else tuple(key)
+
+
+def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
+    """Return measures by name from the key `evaluation.measures` of a configuration."""
+    return {name: Measure.of(**node) for name, node in nodes.items()}
+
+
+def summarise(episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]) -> list[dict[str, Any]]:
+    """Return the means of each case in the order of the episodes, then their mean as the case `mean`."""
+    reward = {"reward": Measure("reward"), **measures}
+    cases: dict[str, list[Mapping[str, Any]]] = {}
+    for episode in episodes:
+        cases.setdefault(episode["case"], []).append(episode)
+
+    def pool(case: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+        return {"case": case} | {name: measure.pool([row[name] for row in rows]) for name, measure in reward.items()}
+
+    rows = [pool(case, group) for case, group in cases.items()]
+    return [*rows, pool("mean", rows)]

@@ -1,0 +1,210 @@
+"""Batches of single envs in one process, whose running episodes are saved as seeds and actions."""
+
+from __future__ import annotations
+
+import warnings
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase, StepCounter, TransformedEnv
+
+from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.limits import LARGEST_SEED, check_range
+
+SEEDS = 2**31  # seeds of drawn episodes are below
+REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
+
+
+class SeededRows(SeededEnv):
+    """Base of batched envs made of single ones; every episode begins with a seed of its own.
+
+    `state_dict` holds the generator and, for each running episode, its seed and actions. `load_state_dict` repeats
+    these actions: a deterministic env goes on to the bit. `continues` says whether it did. If not, because the last
+    observations differ or an episode is longer than 20,000 steps, a warning is given, and the env must be reset.
+
+    Args:
+        rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or none if the episode is
+            over; then the row stays as it is, with reward 0.
+        seed: of the draw of the episodes' seeds.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to draw the seeds.
+        cases: number of different episodes, by default that of the rows.
+        device: of all tensors.
+    """
+
+    remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
+
+    def __init__(
+        self,
+        rows: Sequence[Any],
+        seed: int,
+        first_seed: int | None,
+        cases: int | None,
+        device: torch.device | str,
+    ) -> None:
+        check_range(0, LARGEST_SEED, seed=seed, first_seed=first_seed or 0)
+        check_range(1, cases=1 if cases is None else cases)
+        if cases is not None and first_seed is None:
+            raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([len(rows)]))
+        self.rows, self.first_seed, self.cases = rows, first_seed, cases or len(rows)
+        self.generator = torch.Generator()
+        self.seeds: list[int] = []  # of the running episodes; none before the first reset
+        self.ages = np.zeros(len(rows), dtype=np.int64)  # steps since the reset
+        self.actions: deque[NDArray[Any]] = deque(maxlen=REMEMBERED)
+        self.continues = True
+        self.set_seed(seed)
+
+    @abstractmethod
+    def _decode(self, actions: NDArray[Any]) -> Any:
+        """Return actions [..., B, *A] as the rows take them, with the same leading dimensions."""
+
+    @abstractmethod
+    def _output(self, *, stepped: bool) -> TensorDict:
+        """Return the entries of all rows after a reset, or after a step."""
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None or not self.seeds else tensordict.get("_reset", None)
+        count = len(self.rows)
+        # One draw per row, reset or not, keeps the random sequence independent of the data.
+        seeds = [(self.first_seed or 0) + row % self.cases for row in range(count)]
+        if self.first_seed is None:
+            seeds = torch.randint(SEEDS, (count,), generator=self.generator).tolist()
+        self.seeds = self.seeds or seeds
+        for row in range(count) if mask is None else mask.view(-1).nonzero().view(-1).tolist():
+            self.rows[row].begin(seeds[row])
+            self.seeds[row], self.ages[row] = seeds[row], 0
+        while len(self.actions) > self.ages.max():
+            self.actions.popleft()
+        return self._output(stepped=False)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict[self.action_key].detach().cpu().numpy().copy()
+        self.actions.append(actions)
+        self.ages += 1
+        for row, action in zip(self.rows, self._decode(actions), strict=True):
+            row.step(action)
+        return self._output(stepped=True)
+
+    def _observed(self) -> TensorDictBase:
+        return self._output(stepped=False).select(*self.observation_spec.keys(True, True))
+
+    def get_extra_state(self) -> dict[str, Any]:  # type: ignore[override]
+        """Return the state of the generator and of the running episodes."""
+        state: dict[str, Any] = {"generator": self.generator.get_state(), "seeds": list(self.seeds)}
+        if self.seeds:
+            state["ages"] = self.ages.tolist()
+            none = torch.empty(0, *self.action_spec.shape)
+            state["actions"] = torch.from_numpy(np.stack(self.actions)) if self.actions else none
+            state["observed"] = self._observed().to_dict()
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:  # type: ignore[override]
+        """Restore the generator, and the running episodes by repeating their actions."""
+        self.generator.set_state(state["generator"].cpu())
+        self.seeds, self.continues = list(state["seeds"]), True
+        self.actions.clear()
+        if not self.seeds:
+            return
+        self.ages[:] = state["ages"]
+        actions = state["actions"].cpu().numpy()
+        self.actions.extend(actions)
+        steps, longest = self._decode(actions), len(actions)
+        self.continues = longest >= self.ages.max()
+        for row, (seed, age) in enumerate(zip(self.seeds, self.ages, strict=True)):
+            self.rows[row].begin(seed)
+            for step in steps[longest - age :] if self.continues else ():
+                self.rows[row].step(step[row])
+        self.continues = self.continues and _same(self._observed().to_dict(), state["observed"])
+        if not self.continues:
+            problem = "the env cannot go on with its running episodes to the bit, so new ones begin"
+            warnings.warn(problem + self.remedy, stacklevel=2)
+
+
+def _same(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(_same(value, other[key]) for key, value in one.items())
+    return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
+
+
+class _EnvRow:
+    """One TorchRL env of a batch; see `rows` of `SeededRows`."""
+
+    def __init__(self, env: EnvBase) -> None:
+        self.env = env
+
+    def begin(self, seed: int) -> None:
+        # TorchRL's envs may seed the global generators, from which policies sample.
+        with torch.random.fork_rng(range(torch.cuda.device_count())):
+            self.env.set_seed(seed)
+            self.after = self.state = self.env.reset()
+
+    def step(self, action: Tensor) -> None:
+        reward = self.env.reward_key
+        if self.after["done"].any():
+            self.after = self.after.copy().set(reward, self.env.full_reward_spec[reward].zero())
+            return
+        step = self.env.step(self.state.copy().set(self.env.action_key, action.to(self.env.device)))
+        self.after, self.state = step["next"], self.env.step_mdp(step)
+
+
+class EnvBatch(SeededRows):
+    """TorchRL envs without batch as one env of batch size [num_envs], stepped one after the other.
+
+    The entries are those of the single env, with the batch dimension in front. Entries that the single env reads beside
+    its action come from its own last step. An env that draws from PyTorch's global generator in its steps cannot be
+    continued to the bit; see `continues` of `SeededRows`.
+
+    Args:
+        of: makes one env.
+        num_envs: B.
+        max_steps: steps after which an episode is truncated, for an env that does not end by itself.
+        seed, first_seed, cases: of the episodes, as for `SeededRows`.
+
+    Raises:
+        ValueError: if the env has a batch or more than one action, or for a number out of range.
+
+    Example:
+        >>> from torchrl.envs import PendulumEnv
+        >>> EnvBatch(PendulumEnv, num_envs=3).rollout(5)["next", "th"].shape
+        torch.Size([3, 5])
+    """
+
+    def __init__(
+        self,
+        of: Callable[[], EnvBase],
+        num_envs: int = 1,
+        *,
+        max_steps: int | None = None,
+        seed: int = 0,
+        first_seed: int | None = None,
+        cases: int | None = None,
+    ) -> None:
+        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
+        envs = [of() for _ in range(num_envs)]
+        if max_steps is not None:
+            envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]
+        one = envs[0]
+        name = type(one).__name__
+        if one.batch_size:
+            raise ValueError(f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without batch")
+        if len(one.action_keys) != 1:
+            raise ValueError(f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}")
+        super().__init__([_EnvRow(env) for env in envs], seed, first_seed, cases, one.device or "cpu")
+        for spec in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
+            full = f"full_{spec}"
+            setattr(self, full, getattr(one, full).expand(num_envs).to(self.device))
+
+    def _decode(self, actions: NDArray[Any]) -> Tensor:
+        return torch.from_numpy(actions)
+
+    def _output(self, *, stepped: bool) -> TensorDict:
+        specs = [self.full_observation_spec, self.full_done_spec, *([self.full_reward_spec] if stepped else [])]
+        keys = [key for spec in specs for key in spec.keys(True, True)]
+        return torch.stack([row.after.select(*keys) for row in self.rows]).to(self.device)

@@ -1,0 +1,275 @@
+"""Gymnasium envs as one batched TorchRL env, with controllers beside them."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import error as errors
+from gymnasium import spaces
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+
+from coil_rl.envs.env_batch import SeededRows
+from coil_rl.envs.gymnasium_spaces import Entry, action_spec, leaves, start
+from coil_rl.envs.limits import check_range
+
+# What an error about a missing package mentions, and the extra of coil-rl that installs it.
+EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
+RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
+
+Env = gymnasium.Env[Any, Any]
+
+
+class GymnasiumEnv(SeededRows):
+    """Gymnasium envs as one env of batch size [num_envs], stepped one after the other in this process.
+
+    Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation: `observation`, or one
+    entry a key of a Dict space (nested as there; a Tuple has the keys "0", "1", ...). A Box is a tensor of `dtype`, but
+    uint8 stays uint8; Discrete and MultiDiscrete are one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts
+    are left out. Actions are bounded or unbounded for a Box (and clamped to its bounds), indices for Discrete [B] and
+    MultiDiscrete [B, n], and 0 or 1 for MultiBinary.
+
+    A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state goes on to the bit if
+    the env is deterministic, see `SeededRows`.
+
+    Args:
+        id: registered name; "MODULE:NAME" imports the module first.
+        num_envs: B.
+        options: keyword arguments of `gymnasium.make`.
+        wrappers: callables that take an env and return one, applied in this order.
+        max_steps: steps after which an episode is truncated, instead of the registered number.
+        seed: of the draw of the episodes' seeds.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to draw the seeds.
+        cases: number of different episodes, by default `num_envs`.
+        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where missing.
+        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets one object an env,
+            `THING(env)`, with a method `act(observation)` and, if it wants, `reset()`, called at the start of an
+            episode; a function is called as `THING(env, observation)`. Either may be a `functools.partial`. Its action
+            for the present observation is written as ("controller", NAME), not clamped; after a termination it is the
+            last one.
+        fresh: whether every episode has a new env, for those whose reset leaves something of the past. BipedalWalker is
+            one: without `fresh`, its episodes depend on the seed and, a little, on those before.
+        render: whether `render` gives pictures.
+        device: of all tensors.
+        dtype: of all floating-point tensors.
+
+    Attributes:
+        rate: steps per second at which the env is drawn, NaN if it does not say.
+
+    Raises:
+        ValueError: for an env that cannot be made, an unsupported space, a controller that cannot be used, or a number
+            out of range.
+
+    Example:
+        >>> from coil_rl.envs import GymnasiumEnv
+        >>> env = GymnasiumEnv("CartPole-v1", num_envs=4)
+        >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
+        torch.Size([4, 3, 4])
+    """
+
+    remedy = "; fresh=true helps where a reset leaves something of the past"
+
+    def __init__(
+        self,
+        id: str,
+        num_envs: int = 1,
+        *,
+        options: Mapping[str, Any] | None = None,
+        wrappers: Sequence[Callable[[Env], Env]] = (),
+        max_steps: int | None = None,
+        seed: int = 0,
+        first_seed: int | None = None,
+        cases: int | None = None,
+        info: Sequence[str] = (),
+        controllers: Mapping[str, str | Callable[..., Any]] | None = None,
+        fresh: bool = False,
+        render: bool = False,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
+        makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
+        settings = {**(options or {}), **({} if max_steps is None else {"max_episode_steps": max_steps})}
+        if render and "rgb_array" in _make(id, wrappers, settings).metadata.get("render_modes", ()):
+            drawn = settings | {"render_mode": "rgb_array"}
+        else:
+            drawn = settings
+        rows = [
+            _Row(partial(_make, id, wrappers, settings if row else drawn), makers, fresh) for row in range(num_envs)
+        ]
+        super().__init__(rows, seed, first_seed, cases, device)
+        env = rows[0].env
+        self.shown, self.info = drawn is not settings, tuple(info)
+        self.floats = torch.empty(0, dtype=dtype).numpy().dtype
+        self.rate = float(env.metadata.get("render_fps") or "nan")
+        self.space = env.action_space
+        self._declare_specs(id, env.observation_space, tuple(makers), dtype)
+
+    def _declare_specs(self, id: str, space: spaces.Space[Any], controllers: Sequence[str], dtype: torch.dtype) -> None:
+        action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
+        self.entries = [Entry(id, path, leaf, self.floats) for path, leaf in leaves(space)]
+        observation = Composite()
+        for entry in self.entries:
+            if entry.key[0] in RESERVED:
+                raise ValueError(f"the observation of {id} has an entry {entry.key[0]!r}: rename it with a wrapper")
+            observation[entry.key] = entry.spec
+        for name in self.info:
+            observation["info", name] = number.clone()
+        for name in controllers:
+            # Advice is written as given, and may be out of bounds.
+            advice = Unbounded(action.shape, dtype=dtype) if isinstance(action, Bounded) else action.clone()
+            observation["controller", name] = advice
+        ends = Composite({name: Binary(1, dtype=torch.bool) for name in ("done", "terminated", "truncated")})
+        self.observation_spec, self.done_spec, self.action_spec, self.reward_spec = (
+            spec.to(self.device).expand(*self.batch_size, *spec.shape) for spec in (observation, ends, action, number)
+        )
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture of row 0, [height, width, 3]; None if there are none."""
+        try:
+            picture: NDArray[np.uint8] | None = self.rows[0].env.render() if self.shown else None
+        except errors.DependencyNotInstalled as error:
+            self.shown = False
+            warnings.warn(f"no pictures of the env: {error}", stacklevel=2)
+            return None
+        return picture
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close all envs."""
+        for row in self.rows:
+            row.env.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+    def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
+        if isinstance(self.space, spaces.Box):
+            shaped = actions.astype(self.space.dtype) if self.space.shape else actions.astype(self.space.dtype)[..., 0]
+            return np.clip(shaped, self.space.low, self.space.high)
+        return actions + start(self.space)
+
+    def _output(self, *, stepped: bool) -> TensorDict:
+        rows = self.rows
+        observations = [row.observation for row in rows]
+        terminated, truncated = ([getattr(row, end) for row in rows] for end in ("terminated", "truncated"))
+        ends = np.array([terminated, truncated], dtype=bool)[..., None]
+        data = TensorDict(
+            {
+                "terminated": torch.from_numpy(ends[0]),
+                "truncated": torch.from_numpy(ends[1]),
+                "done": torch.from_numpy(ends.any(0)),
+            },
+            self.batch_size,
+        )
+        if stepped:
+            data["reward"] = self._numbers([row.reward for row in rows])
+        for entry in self.entries:
+            data[entry.key] = torch.from_numpy(entry(observations))
+        for name in self.info:
+            try:
+                data["info", name] = self._numbers([row.info.get(name, 0) for row in rows])
+            except (TypeError, ValueError) as error:
+                raise ValueError(f"info entry {name!r} is not a number") from error
+        for name in rows[0].controllers:
+            advice = torch.from_numpy(np.array([row.advice[name] for row in rows]))
+            spec = self.observation_spec["controller", name]
+            data["controller", name] = advice.to(spec.dtype).reshape(spec.shape)
+        return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
+
+    def _numbers(self, values: list[Any]) -> torch.Tensor:
+        return torch.from_numpy(np.array(values, dtype=self.floats).reshape(-1, 1))
+
+
+class _Row:
+    """One Gymnasium env and the controllers beside it; see `rows` of `SeededRows`."""
+
+    def __init__(self, make: Callable[[], Env], makers: Mapping[str, Callable[..., Any]], fresh: bool) -> None:
+        self.make, self.makers, self.fresh = make, makers, fresh
+        self.advice: dict[str, NDArray[Any]] = {}
+        self._open()
+
+    def _open(self) -> None:
+        self.env = self.make()
+        self.controllers = {name: _controller(name, maker, self.env) for name, maker in self.makers.items()}
+
+    def begin(self, seed: int) -> None:
+        if self.fresh:
+            self.env.close()
+            self._open()
+        self.observation, self.info = self.env.reset(seed=seed)
+        self.reward, self.terminated, self.truncated = 0.0, False, False
+        for _, reset in self.controllers.values():
+            reset()
+        self._advise()
+
+    def step(self, action: Any) -> None:
+        if self.terminated or self.truncated:
+            self.reward = 0.0
+            return
+        self.observation, reward, self.terminated, self.truncated, self.info = self.env.step(action)
+        self.reward = float(reward)
+        if not self.terminated:
+            self._advise()
+
+    def _advise(self) -> None:
+        space = self.env.action_space
+        for name, (act, _) in self.controllers.items():
+            advice = np.asarray(act(self.observation))
+            if isinstance(space, spaces.Box):
+                fits = advice.shape == space.shape and np.isfinite(advice).all()
+            else:
+                fits = space.contains(advice)
+            if not fits:
+                raise ValueError(f"controller {name} gave {advice.tolist()}, not an action of {space}")
+            self.advice[name] = advice - start(space)
+
+
+def _make(id: str, wrappers: Sequence[Callable[[Env], Env]], settings: Mapping[str, Any]) -> Env:
+    """Return an env of Gymnasium in its wrappers; raises a `ValueError` of one sentence if it cannot be made."""
+    try:
+        env: Env = gymnasium.make(id, **{"disable_env_checker": True, **settings})
+    except (errors.Error, ImportError, TypeError, AssertionError, OSError, ValueError) as error:
+        reason = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".") or type(error).__name__
+        extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
+        if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
+            reason = f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+        elif isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)) and "mean" not in reason:
+            reason += f"; if a package registers it, write PACKAGE:{id}"
+        raise ValueError(f"the env {id} cannot be made: {reason}") from error
+    for wrapper in wrappers:
+        env = wrapper(env)
+    return env
+
+
+def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Return a controller by its import path PACKAGE.MODULE:THING."""
+    if not isinstance(thing, str):
+        return thing
+    module, _, attribute = thing.partition(":")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(
+            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
+        ) from error
+
+
+def _controller(name: str, maker: Callable[..., Any], env: Env) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
+    """Return what gives the action for an observation, and what to call at the start of an episode."""
+    if not inspect.isclass(getattr(maker, "func", maker)):
+        return partial(maker, env), lambda: None
+    try:
+        controller = maker(env)
+    except TypeError as error:
+        raise ValueError(f"controller {name} cannot be made with its env: {error}") from error
+    if not callable(getattr(controller, "act", None)):
+        raise ValueError(f"controller {name}: {type(controller).__name__} needs a method act(observation)")
+    return controller.act, getattr(controller, "reset", lambda: None)

@@ -1,0 +1,95 @@
+"""Gymnasium's spaces as specs and entries of TorchRL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, TensorSpec, Unbounded
+
+
+class Entry:
+    """One entry of the observation: where it is in a Gymnasium observation, its spec, and its conversion.
+
+    Args:
+        id: of the env, for errors.
+        path: keys of Dict spaces and indices of Tuple spaces.
+        space: of the entry.
+        floats: of entries that are not uint8.
+
+    Raises:
+        ValueError: for a space that is not supported.
+    """
+
+    def __init__(self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]) -> None:
+        self.path, self.dtype, self.start = path, floats, start(space)
+        # Not the entry of a Dict space: the observation itself, or within a Tuple.
+        whole = not path or isinstance(path[0], int)
+        self.key: tuple[str, ...] = (*(("observation",) if whole else ()), *map(str, path))
+        self.choices = _choices(space)
+        dtype = torch.from_numpy(np.empty(0, floats)).dtype
+        if self.choices:
+            self.spec: TensorSpec = MultiOneHot(self.choices, dtype=dtype)
+            # Places of the first choices in the vector.
+            self.first = np.cumsum([0, *self.choices[:-1]])
+        elif isinstance(space, spaces.Box) and space.dtype == np.uint8:
+            self.dtype, self.spec = np.dtype(np.uint8), Unbounded(space.shape or (1,), dtype=torch.uint8)
+        elif isinstance(space, spaces.Box):
+            self.spec = Unbounded(space.shape or (1,), dtype=dtype)
+        elif isinstance(space, spaces.MultiBinary):
+            self.spec = Bounded(0, 1, space.shape, dtype=dtype)
+        else:
+            raise ValueError(f"the observation of {id} has a {type(space).__name__} space: replace it with a wrapper")
+
+    def __call__(self, observations: Sequence[Any]) -> NDArray[Any]:
+        """Return this entry of observations, [B, *shape]."""
+        for part in self.path:
+            observations = [observation[part] for observation in observations]
+        if not self.choices:
+            return np.array(observations, dtype=self.dtype).reshape(len(observations), *self.spec.shape)
+        chosen = (np.array(observations) - self.start).reshape(len(observations), -1) + self.first
+        vectors = np.zeros((len(observations), *self.spec.shape), self.dtype)
+        np.put_along_axis(vectors, chosen, 1, 1)
+        return vectors
+
+
+def leaves(space: spaces.Space[Any], path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, spaces.Space[Any]]]:
+    """Yield the path and the space of all entries but texts."""
+    if isinstance(space, (spaces.Dict, spaces.Tuple)):
+        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        for name, part in parts:
+            yield from leaves(part, (*path, name))
+    elif space.dtype is None or space.dtype.kind != "U":
+        yield path, space
+
+
+def _choices(space: spaces.Space[Any]) -> list[int]:
+    """Return the numbers of choices of a Discrete or MultiDiscrete space; none for another."""
+    sizes = space.n if isinstance(space, spaces.Discrete) else getattr(space, "nvec", [])
+    return [int(size) for size in np.ravel(sizes)]
+
+
+def start(space: spaces.Space[Any]) -> Any:
+    """Return the lowest value of a Discrete or MultiDiscrete space; 0 for another."""
+    return getattr(space, "start", 0)
+
+
+def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
+    """Return the spec of an action of one env; raises a `ValueError` with its id for a space that is not supported."""
+    if isinstance(space, spaces.Box):
+        shape = space.shape or (1,)
+        if not space.is_bounded():
+            return Unbounded(shape, dtype=dtype)
+        low, high = (torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high))
+        return Bounded(low, high, shape, dtype=dtype)
+    if isinstance(space, spaces.Discrete):
+        return Categorical(int(space.n), dtype=torch.int64)
+    if isinstance(space, spaces.MultiDiscrete) and len(space.shape) == 1:
+        return MultiCategorical(_choices(space), dtype=torch.int64)
+    if isinstance(space, spaces.MultiBinary):
+        return Binary(shape=space.shape, dtype=torch.int8)
+    raise ValueError(f"the action of {id} is a {type(space).__name__} space: replace it with a wrapper")

@@ -1,0 +1,256 @@
+"""Controllers of other people: Python objects, functions, networks, entries of the env, recordings."""
+
+import importlib
+import io
+import textwrap
+
+import numpy as np
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.envs import Compose, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import ControllerGuide, EntryGuide, PerRow, RecordedGuide
+from coil_rl.train.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+SOURCE = """
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+class Net(torch.nn.Module):
+    def __init__(self, size=1):
+        super().__init__()
+        self.layer = torch.nn.Linear(20, size)
+
+    def forward(self, x):
+        return torch.tanh(self.layer(x))
+
+class Guide(TensorDictModuleBase):
+    in_keys, out_keys, pure = ["steering"], ["action"], True
+
+    def __init__(self, gain=1.0):
+        super().__init__()
+        self.gain = gain
+
+    def forward(self, tensordict):
+        return tensordict.set("action", self.gain * tensordict["steering"])
+
+class Counter:
+    def __init__(self, step=0.01):
+        self.step, self.count = step, 0
+
+    def reset(self):
+        self.count = 0
+
+    def act(self, observation):
+        assert observation.shape == (20,)
+        self.count += 1
+        return self.step * self.count
+
+    def state_dict(self):
+        return {"count": self.count}
+
+    def load_state_dict(self, state):
+        self.count = state["count"]
+
+class Other:
+    pass
+
+def half(observation, gain=0.5):
+    return gain * observation[..., :1]
+
+number = 3
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def control(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    (folder / "my_control.py").write_text(textwrap.dedent(SOURCE))
+    (folder / "my_needy.py").write_text("import no_such_package\n")
+    (folder / "my_broken.py").write_text("1 / 0\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield importlib.import_module("my_control")
+
+
+def cones(guide, cars=6, seed=0):
+    env = ConeTrackEnv(shipped_tracks("test"), cars, rate=6, seed=seed)
+    return TransformedEnv(env, Compose(GuideActions({"theirs": guide}))).train()
+
+
+def driven(env, steps=80):
+    torch.manual_seed(1)
+    rollout = env.rollout(steps, break_when_any_done=False)
+    assert rollout["next", "done"].sum() > 3, "random driving should have crashed, so that resets are covered"
+    return rollout, rollout["guide_action"][:, :, 0]
+
+
+def steps_of_episode(rollout):
+    """Number of each step in its episode, from 1, [B, T]."""
+    done, number = rollout["next", "done"].squeeze(-1), torch.zeros(len(rollout), dtype=torch.long)
+    numbers = []
+    for step in range(rollout.shape[1]):
+        number = number + 1
+        numbers.append(number)
+        number = torch.where(done[:, step], 0, number)
+    return torch.stack(numbers, 1)
+
+
+def test_class_of_guides_is_the_guide():
+    rollout, advice = driven(cones(ControllerGuide("my_control:Guide", options={"gain": 0.5})))
+    assert torch.equal(advice, rollout["steering"] / 2)
+
+
+def test_network_and_function_act_on_the_batch():
+    guide = ControllerGuide("my_control:Net")
+    rollout, advice = driven(cones(guide))
+    with torch.no_grad():
+        torch.testing.assert_close(advice, guide.guide.module(rollout["observation"]))
+    rollout, advice = driven(cones(ControllerGuide("my_control:half", ["steering"], {"gain": 0.25})))
+    assert torch.equal(advice, rollout["steering"] / 4)
+
+
+def test_python_objects_are_one_a_row_and_reset_with_their_episodes():
+    rollout, advice = driven(cones(ControllerGuide("my_control:Counter", options={"step": 0.001})))
+    torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
+
+
+def test_object_without_reset_is_made_anew_for_each_episode():
+    class Forgetful:
+        count = 0
+
+        def act(self, observation, steering):
+            observation[:], self.count = 9.0, self.count + 1
+            return np.float32(self.count / 1000)
+
+    rollout, advice = driven(cones(PerRow(Forgetful, ["observation", "steering"])))
+    torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
+    assert (rollout["observation"] < 9).all(), "what a controller does with its array should not change the data"
+
+
+def test_states_of_the_objects_are_in_the_checkpoint():
+    def rollout(seed):
+        policy = TensorDictModule(lambda x: torch.tanh(x[:, :1]), ["observation"], ["action"])
+        return Rollout(cones(ControllerGuide("my_control:Counter"), seed=seed), policy, 8)
+
+    first, second = rollout(3), rollout(4)
+    first.collect()
+    file = io.BytesIO()
+    torch.save(first.state_dict(), file)
+    file.seek(0)
+    second.load_state_dict(torch.load(file, weights_only=True))
+    expected = first.collect()
+    assert (expected == second.collect()).all()
+    assert expected["guide_action"][:, 0].max() > 0.02, "episodes should go on"
+
+
+class Stateless:
+    def act(self, observation):
+        return 0.0
+
+
+def test_state_that_a_checkpoint_cannot_hold_is_refused():
+    class Stateful(Stateless):
+        def state_dict(self):
+            return {"x": np.zeros(2)}
+
+        def load_state_dict(self, state):
+            pass
+
+    env = cones(PerRow(Stateful), cars=2)
+    env.rollout(2)
+    with pytest.raises(
+        ValueError, match=r"state_dict\(\) of the controller Stateful may hold numbers, .*; convert NumPy"
+    ):
+        env.state_dict()
+
+
+def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
+    guide = PerRow(Stateless)
+    env = cones(guide, cars=2)
+    env.rollout(2)
+    with pytest.warns(UserWarning, match="the controller Stateless has no state_dict"):
+        env.load_state_dict(env.state_dict())
+    assert not guide.continues
+
+
+@pytest.mark.parametrize(
+    ("of", "options", "message"),
+    [
+        ("my_control", {}, "of=my_control must be MODULE:NAME, such as my_package.control:MyPID"),
+        ("my_contrl:Net", {}, "there is no module my_contrl; install its package, or add its folder to PYTHONPATH"),
+        ("my_needy:Net", {}, "my_needy needs no_such_package, which is missing; install it"),
+        ("my_broken:Net", {}, r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)"),
+        ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
+        ("my_control:number", {}, "of=my_control:number is int; name a class or a function"),
+        ("my_control:Other", {}, r"is a class without act\(observation\); give it this method, or name a function"),
+        (
+            "my_control:Counter",
+            {"stpe": 1},
+            r"takes \(step=0.01\), but is called with \(stpe=\): .* mean step",
+        ),
+        ("my_control:half", {"k": 1}, r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)"),
+        ("my_control:Guide", {"k": 1}, r"my_control:Guide takes \(gain=1.0\), but is called with \(k=\)"),
+    ],
+)
+def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, message):
+    with pytest.raises(ValueError, match=message) as error:
+        ControllerGuide(of, options=options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("of", "message"),
+    [
+        ("my_control:Counter", r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)"),
+        ("my_control:Guide", r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out"),
+    ],
+)
+def test_entries_that_a_controller_does_not_take_are_refused(of, message):
+    with pytest.raises(ValueError, match=message):
+        ControllerGuide(of, ["a", "b"])
+
+
+def test_entry_of_the_env_is_advice():
+    guide = EntryGuide(["controller", "theirs"])
+    data = TensorDict({"controller": {"theirs": torch.rand(3, 2)}}, [3])
+    assert torch.equal(guide(data)["action"], data["controller", "theirs"])
+    assert guide.sees == "env"
+    rollout, advice = driven(cones(EntryGuide("steering")))
+    assert torch.equal(advice, rollout["steering"])
+
+
+@pytest.mark.parametrize("header", ["", "steering\n"])
+def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tmp_path):
+    file = tmp_path / "actions.csv"
+    file.write_text(header + "".join(f"{step / 100:e}\n" for step in range(10)))
+    rollout, advice = driven(cones(RecordedGuide(file)))
+    expected = (steps_of_episode(rollout) - 1).clamp(max=9) / 100
+    torch.testing.assert_close(advice.squeeze(-1), expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "actions.csv cannot be read as numbers"),
+        (
+            "0.1\nleft\n",
+            r"actions.csv cannot be read as numbers with commas \(could not convert string to float: 'left'",
+        ),
+        ("", "must hold at least one line of finite numbers"),
+        ("a,b\n", "must hold at least one line of finite numbers"),
+        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(setting an array element"),
+        ("nan\n0.1\n", "must hold at least one line of finite numbers"),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_file_without_actions_is_refused(text, message, tmp_path):
+    file = tmp_path / "actions.csv"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        RecordedGuide(file)

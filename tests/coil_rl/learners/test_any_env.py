@@ -1,0 +1,178 @@
+"""Learners with all kinds of actions and observations."""
+
+import pytest
+import torch
+from any_env import FLOAT64, AnyEnv
+from tensordict import TensorDict
+from torch.distributions import Bernoulli, Normal
+from torch.distributions import Categorical as Choice
+from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, Unbounded
+from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
+
+from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Reinforce
+from coil_rl.train.rollout import Rollout
+
+ACTIONS = {
+    "bounded": Bounded(-1, 1, (2,)),
+    "one_number": Bounded(0.0, 2.0, (1,)),
+    "scalar": Bounded(-1, 1, ()),
+    "matrix": Bounded(-1, 1, (2, 3)),
+    "float64": Bounded(-1, 1, (2,), **FLOAT64),
+    "half_bounded": Bounded(torch.zeros(2), torch.full((2,), torch.inf), (2,)),
+    "unbounded": Unbounded((2,)),
+    "unbounded_matrix": Unbounded((2, 2), **FLOAT64),
+    "categorical": Categorical(3, ()),
+    "categorical_column": Categorical(3, (1,)),
+    "one_hot": OneHot(3),
+    "multi_categorical": MultiCategorical([2, 4, 3]),
+    "binary": Binary(3),
+}  # fmt: skip
+ON_POLICY = [PPO, A2C, Reinforce, TRPO]
+
+
+def env_with(name, count=8):
+    return AnyEnv(count, ACTIONS[name], dtype=torch.float64 if "float64" in name else torch.float32)
+
+
+def trained(learner, env, updates=2, steps=8):
+    """The metrics of some updates."""
+    rollout = Rollout(env, learner.policy, steps, learner.keys)
+    return [learner.update(rollout.collect(), 0.0) for _ in range(updates)]
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+def test_test_env_keeps_its_specs(name):
+    check_env_specs(env_with(name))
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+@pytest.mark.parametrize("kind", ON_POLICY)
+def test_on_policy_learner_updates_with_any_action(kind, name):
+    torch.manual_seed(0)
+    env = env_with(name)
+    learner = kind(env, minibatches=2)
+    before = torch.nn.utils.parameters_to_vector(learner.policy.parameters()).clone()
+    metrics = trained(learner, env)
+    after = torch.nn.utils.parameters_to_vector(learner.policy.parameters())
+    assert all(torch.tensor(list(each.values())).isfinite().all() for each in metrics)
+    assert after.isfinite().all()
+    assert not torch.equal(after, before)
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+@pytest.mark.parametrize("squash", [True, False])
+def test_log_probability_is_that_of_pytorch(name, squash):
+    torch.manual_seed(0)
+    env = env_with(name, 64)
+    policy = PPO(env, action_gain=2.0, squash=squash).policy
+    data = policy(env.reset())
+    action, spec = data["action"], env.action_spec
+    assert spec.is_in(action) or name in ("binary", "one_hot")  # int64
+    if spec.dtype.is_floating_point:
+        sample = data.get("unclipped_action", action)
+        tanh = "unbounded" not in name and "unclipped_action" not in data
+        assert tanh == (squash and name not in ("half_bounded", "unbounded", "unbounded_matrix"))
+        middle, half = ((spec.high + spec.low) / 2, (spec.high - spec.low) / 2) if tanh else (0, 1)
+        raw = ((sample - middle) / half).atanh() if tanh else sample
+        expected = Normal(data["loc"], data["scale"]).log_prob(raw)
+        if tanh:
+            expected = expected - (half * (1 - raw.tanh().square())).log()
+        expected = expected.reshape(64, -1).sum(-1)
+    elif name == "binary":
+        expected = Bernoulli(logits=data["logits"][..., 1] - data["logits"][..., 0]).log_prob(action.float()).sum(-1)
+    elif name == "one_hot":
+        expected = Choice(logits=data["logits"]).log_prob(action.long().argmax(-1))
+    elif name == "multi_categorical":
+        parts = [data["logits"][:, index, :n] for index, n in enumerate((2, 4, 3))]
+        expected = sum(Choice(logits=part).log_prob(action[:, index]) for index, part in enumerate(parts))
+    else:
+        expected = Choice(logits=data["logits"]).log_prob(action).reshape(64)
+    torch.testing.assert_close(data["action_log_prob"], expected.to(data["action_log_prob"]), rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["matrix", "float64", "multi_categorical", "categorical_column", "binary"])
+def test_deterministic_action_is_the_mode_after_ppo_has_learned_the_best_action(name):
+    torch.manual_seed(0)
+    env = env_with(name, 64)
+    learner = PPO(env, learning_rate=1e-2, minibatches=4)
+    trained(learner, env, updates=15)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        reward = env.step(learner.policy(env.reset()))["next", "reward"].mean()
+    assert reward > (-0.05 if env.action_spec.dtype.is_floating_point else 0.9)
+
+
+@pytest.mark.parametrize("name", ["bounded", "scalar", "matrix", "float64", "unbounded"])
+def test_sac_updates_with_any_continuous_action(name):
+    env = env_with(name)
+    learner = SAC(env, starts=16, batch_size=16)
+    assert learner.loss.target_entropy == -max(ACTIONS[name].shape.numel(), 1)
+    metrics = trained(learner, env)[-1]
+    assert metrics["minibatches"] > 0
+    assert torch.tensor(list(metrics.values())).isfinite().all()
+
+
+@pytest.mark.parametrize("name", ["categorical", "one_hot"])
+def test_dqn_updates_with_one_discrete_action(name):
+    env = env_with(name)
+    metrics = trained(DQN(env, starts=16, batch_size=16), env)[-1]
+    assert metrics["minibatches"] > 0
+    assert torch.tensor(list(metrics.values())).isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PPO(AnyEnv(action=MultiOneHot([2, 3]))), "the action of this env is MultiOneHot .* transform it"),
+        (lambda: PPO(AnyEnv(action=Unbounded((2,), dtype=torch.long))), "the action of this env is Unbounded.*int64"),
+        (lambda: DQN(env_with("multi_categorical")), "DQN needs one discrete action, .* use PPO"),
+        (lambda: DQN(env_with("binary")), "DQN needs one discrete action, .* use PPO"),
+        (lambda: DQN(env_with("bounded")), "DQN needs discrete actions"),
+        (lambda: SAC(env_with("multi_categorical")), "SAC needs continuous actions"),
+        (lambda: SAC(AnyEnv(agents=True)), r"SAC needs one entry action .* RenameTransform, or use PPO"),
+        (lambda: PPO(AnyEnv(), ["sight"]), "the env has no entry sight to observe; it has observation"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_one_sentence(make, message):
+    with pytest.raises((ValueError, KeyError), match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_entries_of_all_kinds_are_read():
+    observations = {
+        "number": Unbounded((), **FLOAT64),
+        ("agents", "observation"): Unbounded((2, 3)),
+        "place": Categorical(5, ()),
+        "switches": MultiCategorical([2, 3]),
+        "flag": Binary(1, dtype=torch.bool),
+        "count": Unbounded((1,), dtype=torch.long),
+        "image": Bounded(0, 255, (2, 2, 3), dtype=torch.uint8),
+    }
+    env = AnyEnv(4, observations=observations)
+    check_env_specs(env)
+    in_keys = [["agents", "observation"], *(key for key in observations if isinstance(key, str))]
+    learner = PPO(env, in_keys, minibatches=2)
+    concat = next(module for module in learner.policy.modules() if hasattr(module, "width"))
+    assert concat.width == 6 + 1 + 5 + 5 + 1 + 1 + 12
+    data = env.reset()
+    read = concat(*(data[key] for key in learner.policy.in_keys))
+    assert read.dtype == torch.float32
+    assert torch.equal(read[:, 7:12], torch.nn.functional.one_hot(data["place"], 5).float())
+    assert torch.equal(read[:, 12:14], torch.nn.functional.one_hot(data["switches"][:, 0], 2).float())
+    assert torch.equal(read[:, -12:], data["image"].flatten(1) / 255)
+    trained(learner, env)
+
+
+def test_ppo_trains_the_joint_action_of_several_agents_for_the_sum_of_their_rewards():
+    torch.manual_seed(0)
+    env = AnyEnv(64, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True)
+    check_env_specs(env)
+    learner = PPO(env, [("agents", "observation")], learning_rate=1e-2, minibatches=4)
+    trained(learner, env, updates=15)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        data = env.step(learner.policy(env.reset()))
+    assert data["next", "agents", "reward"].mean() > -0.1
+    batch = Rollout(env, learner.policy, 4, learner.keys).collect()
+    rows = learner.prepare(batch, 0.0)
+    assert torch.equal(batch["next", "reward"], batch["next", "agents", "reward"].sum(-2))
+    assert isinstance(rows, TensorDict)

@@ -1,0 +1,90 @@
+"""Networks by YAML: widths, activations and images."""
+
+import pytest
+import torch
+from any_env import AnyEnv
+from torch import nn
+from torchrl.data import Bounded, Categorical, Unbounded
+
+from coil_rl.learners import DQN, PPO, SAC
+from coil_rl.learners.encoders import Cnn, Mlp, ObservationNetwork
+from coil_rl.train.rollout import Rollout
+
+SMALL = {"channels": [4, 8], "kernels": [3, 3], "strides": [2, 1], "hidden": [16]}
+
+
+def linears(module):
+    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
+
+
+def images(*shape, dtype=torch.uint8, action=None):
+    image = Bounded(0, 255, shape, dtype=dtype) if dtype == torch.uint8 else Unbounded(shape, dtype=dtype)
+    return AnyEnv(4, action, {"image": image, "speed": Unbounded((2,))})
+
+
+def test_default_network_is_that_of_hidden_to_the_bit():
+    weights = []
+    for options in ({"hidden": [8, 4]}, {"network": Mlp([8, 4])}, {"network": Mlp([8, 4], "relu")}):
+        torch.manual_seed(0)
+        weights.append(nn.utils.parameters_to_vector(PPO(AnyEnv(), **options).policy.parameters()))
+    assert torch.equal(weights[0], weights[1])
+    assert not torch.equal(weights[0], weights[2])
+
+
+@pytest.mark.parametrize("activation", ["relu", "elu", "silu"])
+def test_activation_is_used_and_gain_scales_the_last_layer(activation):
+    env = AnyEnv()
+    policy = PPO(env, network=Mlp([8], activation), action_gain=0.0).policy
+    assert any(type(module).__name__.lower() == activation for module in policy.modules())
+    assert (policy(env.reset())["loc"] == 0).all()
+
+
+@pytest.mark.parametrize("kind", [PPO, SAC, DQN])
+@pytest.mark.parametrize("shape", [(3, 16, 12), (16, 12, 3)])
+def test_learners_update_with_images_and_vectors(kind, shape):
+    torch.manual_seed(0)
+    env = images(*shape, action=Categorical(3, ()) if kind is DQN else None)
+    options = {"minibatches": 2} if kind is PPO else {"starts": 8, "batch_size": 8}
+    learner = kind(env, ["image", "speed"], network=Cnn(**SMALL), **options)
+    convolutions = [module for module in learner.policy.modules() if isinstance(module, nn.Conv2d)]
+    assert [(layer.in_channels, layer.out_channels) for layer in convolutions] == [(3, 4), (4, 8)]
+    before = convolutions[0].weight.clone()
+    rollout = Rollout(env, learner.policy, 8, learner.keys)
+    assert torch.tensor(list(learner.update(rollout.collect()).values())).isfinite().all()
+    assert not torch.equal(convolutions[0].weight, before)
+
+
+def test_image_is_read_the_same_with_channels_first_and_last_in_bytes_and_fractions():
+    torch.manual_seed(0)
+    image, speed = torch.randint(256, (5, 6, 16, 12, 3), dtype=torch.uint8), torch.randn(5, 6, 2)
+    outputs = []
+    for dtype in (torch.uint8, torch.float32):
+        values = image if dtype == torch.uint8 else image / 255
+        for last in (True, False):
+            torch.manual_seed(1)
+            env = images(*((16, 12, 3) if last else (3, 16, 12)), dtype=dtype)
+            network = ObservationNetwork(env, ["image", "speed"], Cnn(**SMALL), 7, 1.0)
+            outputs.append(network(values if last else values.movedim(-1, -3), speed))
+            one = network((values if last else values.movedim(-1, -3))[0, 0], speed[0, 0])
+            torch.testing.assert_close(one, outputs[-1][0, 0])
+    assert outputs[0].shape == (5, 6, 7)
+    for each in outputs[1:]:
+        torch.testing.assert_close(each, outputs[0])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Mlp([0]), "hidden=0 must be at least 1"),
+        (lambda: Mlp(activation="sigmoid"), "activation='sigmoid' must be one of tanh, relu"),
+        (lambda: Cnn(channels=[1], kernels=[3], strides=[]), "must have one number for each convolution"),
+        (lambda: Cnn(channels=[], kernels=[], strides=[]), "must have one number for each convolution"),
+        (lambda: Cnn(channels=[4], kernels=[0], strides=[1]), "kernels=0 must be at least 1"),
+        (lambda: PPO(AnyEnv(), network=Cnn()), "needs an image among observation.* use network=mlp"),
+        (lambda: PPO(images(7, 7, 3), ["image"], network=Cnn()), r"the image image of shape \[7, 7, 3\] is too small"),
+    ],
+)
+def test_networks_that_cannot_be_built_are_refused_in_one_sentence(make, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)

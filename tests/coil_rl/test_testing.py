@@ -1,0 +1,223 @@
+"""Each contract check finds its defect in a part that is broken on purpose."""
+
+import numpy as np
+import pytest
+import torch
+import worlds
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torchrl.data import Unbounded
+from torchrl.envs import PendulumEnv, TensorDictPrimer, Transform
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import PerRow, RandomGuide, SplineGuide
+from coil_rl.testing import check_env, check_guide, check_transform
+
+
+def cones(cars=3):
+    return ConeTrackEnv(shipped_tracks("test"), cars, rate=6)
+
+
+class Guide(TensorDictModuleBase):
+    """Adds up the steering of an episode; its variants are broken."""
+
+    in_keys, out_keys = ["steering", "total", "is_init"], ["action", ("next", "total")]
+
+    def forward(self, tensordict):
+        total = tensordict["total"] + tensordict["steering"] / 100
+        return tensordict.set("action", self.action(total)).set(("next", "total"), total)
+
+    def action(self, total):
+        return total
+
+    def make_tensordict_primer(self):
+        return TensorDictPrimer({"total": Unbounded((1,))}, expand_specs=True)
+
+
+class OneNumber:
+    """A controller of one row."""
+
+    total = 0.0
+
+    def reset(self):
+        self.total = 0.0
+
+    def act(self, steering):
+        self.total += float(steering[0]) / 100
+        return self.total
+
+
+def with_action(change):
+    guide = Guide()
+    guide.action = change
+    return guide
+
+
+class SeesAllRows(Guide):
+    def forward(self, tensordict):
+        super().forward(tensordict)
+        return tensordict.set("action", tensordict["action"] + tensordict["is_init"].any() / 10)
+
+
+class Hidden(TensorDictModuleBase):
+    """Remembers in an attribute, which no reset reaches."""
+
+    in_keys, out_keys, count = ["steering"], ["action"], 0.0
+
+    def forward(self, tensordict):
+        self.count += 0.001
+        return tensordict.set("action", torch.full_like(tensordict["steering"], self.count))
+
+
+class NeverReset(OneNumber):
+    def reset(self):
+        pass
+
+
+class ForgetsAlone(TensorDictModuleBase):
+    """Forgets at the start of an episode of all rows, not of some."""
+
+    in_keys, out_keys = ["steering", "is_init"], ["action"]
+    total = None
+
+    def forward(self, tensordict):
+        steering = tensordict["steering"] / 100
+        if tensordict["is_init"].all() and len(steering) == 3:
+            self.total = torch.zeros_like(steering)
+        rows = slice(0, len(steering))
+        self.total[rows] += steering
+        return tensordict.set("action", self.total[rows].clone())
+
+
+def test_guides_with_a_memory_pass():
+    check_guide(Guide(), cones())
+    check_guide(PerRow(OneNumber, ["steering"]), cones())
+    check_guide(SplineGuide(), cones())
+    lean = TensorDictModule(lambda x: (x[..., 2] > 0).long(), in_keys=["observation"], out_keys=["action"])
+    check_guide(lean, worlds.carts().base_env)
+    turn = TensorDictModule(lambda x: -x.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
+    check_guide(turn, PendulumEnv())
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: with_action(lambda total: total.squeeze(-1)), r"has the shape \[3\], but must have \[3, 1\]"),
+        (lambda: with_action(lambda total: (total * 0).long()), "is of torch.int64, but the env's of torch.float32"),
+        (lambda: with_action(lambda total: total + 1.5), "lies outside the bounds of the env's action"),
+        (lambda: with_action(lambda total: total / total.abs().clamp(max=0)), "holds a number that is not finite"),
+        (RandomGuide, "another one for the same history"),
+        (Hidden, "another one for the same history; it draws, or remembers earlier episodes"),
+        (lambda: PerRow(NeverReset, ["steering"]), "another one for the same history"),
+        (ForgetsAlone, "after the reset of a row depends on what was before it"),
+    ],
+    ids=["shape", "dtype", "bounds", "nan", "random", "hidden memory", "no reset", "whole batch"],
+)
+def test_defect_of_a_guide_is_found(make, message):
+    with pytest.raises(ValueError, match=message):
+        check_guide(make(), cones())
+
+
+def test_reset_that_touches_other_rows_is_found():
+    everyone = []
+
+    class Shared(OneNumber):
+        def __init__(self):
+            everyone.append(self)
+
+        def reset(self):
+            for other in everyone:
+                other.total = 0.0
+
+    with pytest.raises(ValueError, match="for a row depends on the reset of another row"):
+        check_guide(PerRow(Shared, ["steering"]), cones())
+
+
+def test_guide_with_a_memory_needs_an_env():
+    with pytest.raises(ValueError, match="depends on earlier steps: give check_guide an env in place of data"):
+        check_guide(Guide(), cones().reset())
+
+
+class Unseeded(PendulumEnv):
+    rng_of_numpy = np.random.default_rng()
+
+    def _reset(self, tensordict, **options):
+        data = super()._reset(tensordict, **options)
+        return data.set("th", data["th"] * float(self.rng_of_numpy.random()))
+
+
+class NotANumber(PendulumEnv):
+    @staticmethod
+    def _step(tensordict):
+        data = PendulumEnv._step(tensordict)
+        return data.set("reward", data["reward"] * torch.nan)
+
+
+class InPlace(PendulumEnv):
+    @staticmethod
+    def _step(tensordict):
+        data = PendulumEnv._step(tensordict)
+        tensordict["th"].copy_(data["th"])
+        return data
+
+
+class ResetsAll(ConeTrackEnv):
+    def _reset(self, tensordict=None, **options):
+        return super()._reset(None, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (Unseeded, "the same seed gives other values of th"),
+        (NotANumber, r"\('next', 'reward'\) holds a number that is not finite|reward"),
+        (InPlace, "a step changed th of the data before it; write new tensors"),
+        (lambda: ResetsAll(shipped_tracks("test"), 3), "resetting row 0 changed .* of other rows"),
+    ],
+)
+def test_defect_of_an_env_is_found(make, message):
+    with pytest.raises(ValueError, match=message):
+        check_env(make(), steps=4)
+
+
+def test_envs_with_and_without_a_batch_pass():
+    check_env(PendulumEnv(), steps=4)
+    check_env(cones(), steps=4)
+
+
+class Noise(Transform):
+    """Noise whose generator is not part of the state."""
+
+    def __init__(self):
+        super().__init__(in_keys=["steering"], out_keys=["steering"])
+        self.generator = torch.Generator().manual_seed(0)
+
+    def _call(self, next_tensordict):
+        noise = torch.rand(next_tensordict["steering"].shape, generator=self.generator)
+        return next_tensordict.set("steering", next_tensordict["steering"] * noise)
+
+    def _reset(self, tensordict, tensordict_reset):
+        return self._call(tensordict_reset)
+
+
+class Overwrites(Transform):
+    def _step(self, tensordict, next_tensordict):
+        tensordict["steering"].fill_(0.5)
+        return next_tensordict
+
+
+class Undeclared(Transform):
+    def _call(self, next_tensordict):
+        return next_tensordict.set("more", next_tensordict["steering"])
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (Noise, ValueError, "the same seed gives other values of steering"),
+        (Overwrites, ValueError, "a step changed steering of the data before it"),
+        (Undeclared, AssertionError, "more"),
+    ],
+)
+def test_defect_of_a_transform_is_found(make, error, message):
+    with pytest.raises(error, match=message):
+        check_transform(cones(), make())

@@ -1,0 +1,375 @@
+import io
+import warnings
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
+
+from coil_rl.envs import GymnasiumEnv
+from coil_rl.testing import check_env
+
+LIMIT = 7  # steps of an episode of `Echo`
+
+
+class Echo(gymnasium.Env):
+    """Shows its last action and the time, in spaces of all kinds."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+
+    def __init__(self, action_space=None, leak=0.0, render_mode=None):
+        self.action_space = action_space or spaces.Box(-2.0, 3.0, (2,), np.float64)
+        self.leak, self.resets, self.render_mode = leak, 0, render_mode
+        self.observation_space = spaces.Dict(
+            {
+                "real": spaces.Box(-np.inf, np.inf, (3,), np.float64),
+                "image": spaces.Box(0, 255, (4, 5, 3), np.uint8),
+                "place": spaces.Discrete(LIMIT + 1, start=10),
+                "inner": spaces.Dict({"pair": spaces.MultiDiscrete([2, 3]), "bits": spaces.MultiBinary(3)}),
+                "both": spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1, (), np.float32)]),
+                "mission": spaces.Text(8),
+            }
+        )
+
+    def observe(self):
+        return {
+            "real": np.array([self.time, self.noise, np.sum(self.last)]),
+            "image": np.full((4, 5, 3), self.time, np.uint8),
+            "place": 10 + self.time,
+            "inner": {"pair": np.array([1, self.time % 3]), "bits": np.array([0, 1, 1], np.int8)},
+            "both": (1, np.float32(0.25)),
+            "mission": "go",
+        }
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.last = 0, np.zeros(1)
+        self.noise = self.np_random.uniform() + self.leak * self.resets
+        self.resets += 1
+        return self.observe(), {}
+
+    def step(self, action):
+        assert self.time < LIMIT, "stepped after its end"
+        assert self.action_space.contains(np.asarray(action)), action
+        self.time, self.last = self.time + 1, action
+        return self.observe(), 1.0, self.time == LIMIT, False, {"success": self.time > 3, "words": "x"}
+
+    def render(self):
+        return np.full((2, 2, 3), self.time, np.uint8)
+
+
+gymnasium.register("Echo-v0", Echo)
+
+
+class Counter:
+    """Controller whose action is the number of its calls in this episode, in steps of `size`."""
+
+    def __init__(self, env, size=1.0):
+        self.size, self.shape = size, env.action_space.shape
+
+    def reset(self):
+        self.calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return np.full(self.shape, self.calls * self.size)
+
+
+def first_real(env, observation):
+    return observation["real"][:2] * (env.unwrapped.time >= 0)
+
+
+def act(env, observation):
+    return 11 - 10 * (observation["place"] > 12)
+
+
+def drive(env, steps, carrier=None, seed=0):
+    """Return the entries after each step, under actions that a seed determines, and the carrier."""
+    carrier = env.reset() if carrier is None else carrier
+    after = []
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        actions = [env.rand_action()["action"] for _ in range(steps)]
+    for action in actions:
+        step, carrier = env.step_and_maybe_reset(carrier.set("action", action))
+        after.append(step["next"])
+    return after, carrier
+
+
+def same(one, other):
+    return all((a == b).all() for a, b in zip(one, other, strict=True))
+
+
+def saved(env):
+    file = io.BytesIO()
+    torch.save(env.state_dict(), file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+ENVS = {
+    "CartPole-v1": {},
+    "Pendulum-v1": {},
+    "Echo-v0": {"info": ["success"], "controllers": {"count": Counter}},
+    "LunarLander-v3": {"options": {"continuous": True}},
+    "BipedalWalker-v3": {"fresh": True},
+}
+
+
+def build(id, num_envs=3, **arguments):
+    if id in ("LunarLander-v3", "BipedalWalker-v3"):
+        pytest.importorskip("Box2D", reason="Box2D is not installed")
+    return GymnasiumEnv(id, num_envs, **(ENVS.get(id, {}) | arguments))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("id", ENVS)
+def test_env_fits_its_specs(id, dtype):
+    check_env(build(id, dtype=dtype), steps=30)
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_seed_determines_all_episodes(id):
+    one, other, third = (drive(build(id, seed=seed), 60)[0] for seed in (1, 1, 2))
+    assert same(one, other)
+    assert not same(one, third)
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_saved_env_goes_on_to_the_bit(id):
+    env = build(id, 4, seed=5)
+    _, carrier = drive(env, 45)
+    state, start = saved(env), carrier.clone()
+    later = drive(env, 60, carrier, seed=1)[0]
+    other = build(id, 4, seed=6)
+    drive(other, 10)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        other.load_state_dict(state)
+    assert other.continues
+    assert same(later, drive(other, 60, start, seed=1)[0])
+
+
+@pytest.mark.parametrize("id", ENVS)
+def test_env_saved_at_its_first_reset_goes_on_to_the_bit(id):
+    env, other = build(id, seed=5), build(id, seed=6)
+    carrier = env.reset()
+    other.load_state_dict(saved(env))
+    assert other.continues
+    assert same(drive(env, 30, carrier.clone())[0], drive(other, 30, carrier)[0])
+
+
+def test_env_saved_before_its_first_reset_draws_the_same_episodes():
+    env, other = build("CartPole-v1", seed=5), build("CartPole-v1", seed=6)
+    other.load_state_dict(saved(env))
+    assert same(drive(env, 30)[0], drive(other, 30)[0])
+
+
+def test_env_that_keeps_something_at_a_reset_is_noticed():
+    env = build("Echo-v0", options={"leak": 0.5})
+    drive(env, 2 * LIMIT + 2)
+    other = build("Echo-v0", options={"leak": 0.5})
+    with pytest.warns(UserWarning, match=r"cannot go on with its running episodes to the bit.*fresh=true") as caught:
+        other.load_state_dict(saved(env))
+    assert len(caught) == 1
+    assert not other.continues
+    drive(other, 5)
+    fresh, other = (build("Echo-v0", options={"leak": 0.5}, fresh=True) for _ in range(2))
+    drive(fresh, 2 * LIMIT + 2)
+    other.load_state_dict(saved(fresh))
+    assert other.continues
+
+
+def test_episode_longer_than_the_memory_is_not_repeated(monkeypatch):
+    monkeypatch.setattr("coil_rl.envs.env_batch.REMEMBERED", 20)
+    env = build("Pendulum-v1")
+    drive(env, 25)
+    with pytest.warns(UserWarning, match="cannot go on"):
+        env.load_state_dict(saved(env))
+
+
+def test_actions_are_kept_for_running_episodes_only():
+    env = build("Echo-v0")
+    drive(env, 5 * LIMIT + 2)
+    assert len(env.actions) == 2
+
+
+def test_rows_begin_with_the_seeds_of_their_cases():
+    env = build("Pendulum-v1", 5, first_seed=40, cases=2)
+    alone = [gymnasium.make("Pendulum-v1").reset(seed=seed)[0] for seed in (40, 41, 40, 41, 40)]
+    for _ in range(2):
+        np.testing.assert_array_equal(env.reset()["observation"].numpy(), alone)
+    drawn = build("Pendulum-v1", 5)
+    assert not torch.equal(drawn.reset()["observation"], drawn.reset()["observation"])
+
+
+def test_numbers_are_those_of_gymnasium():
+    env, single = build("Pendulum-v1", 1, first_seed=3), gymnasium.make("Pendulum-v1")
+    carrier, _ = env.reset(), single.reset(seed=3)
+    for action in np.linspace(-3, 3, 20, dtype=np.float32):  # beyond the bounds, which are 2
+        after = env.step(carrier.set("action", torch.full((1, 1), float(action))))["next"]
+        carrier = after.clone()
+        observation, reward, *_ = single.step(np.clip([action], -2, 2))
+        np.testing.assert_array_equal(after["observation"][0].numpy(), observation)
+        assert after["reward"].item() == np.float32(reward)
+
+
+def test_spaces_become_entries():
+    env = build("Echo-v0", dtype=torch.float64)
+    after = drive(env, 4)[0][-1]
+    real, place, pair = after["real"], after["place"], after["inner", "pair"]
+    assert real.dtype == place.dtype == pair.dtype == after["inner", "bits"].dtype == torch.float64
+    assert real[:, 0].tolist() == [4.0] * 3
+    assert after["image"].dtype == torch.uint8
+    assert after["image"].shape == (3, 4, 5, 3)
+    assert after["image"].unique().tolist() == [4]
+    assert place.tolist() == [[0, 0, 0, 0, 1, 0, 0, 0]] * 3
+    assert pair.tolist() == [[0, 1, 0, 1, 0]] * 3  # 1 of 2, 1 of 3
+    assert after["inner", "bits"].tolist() == [[0, 1, 1]] * 3
+    assert after["both", "0"].tolist() == [[0, 1]] * 3
+    assert after["both", "1"].tolist() == [[0.25]] * 3
+    assert "mission" not in after
+    assert after["info", "success"].tolist() == [[1.0]] * 3
+    assert env.reset()["info", "success"].tolist() == [[0.0]] * 3
+    assert build("Echo-v0").reset()["real"].dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("space", "spec", "shape"),
+    [
+        (spaces.Box(-2.0, 3.0, (2,), np.float64), Bounded, (2,)),
+        (spaces.Box(-1, 1, (), np.float32), Bounded, (1,)),
+        (spaces.Box(-np.inf, np.inf, (2, 2), np.float32), Unbounded, (2, 2)),
+        (spaces.Discrete(3, start=5), Categorical, ()),
+        (spaces.MultiDiscrete([2, 4]), MultiCategorical, (2,)),
+        (spaces.MultiBinary(3), torch.int8, (3,)),
+    ],
+)
+def test_actions_of_a_space_reach_the_env(space, spec, shape):
+    # `Echo` verifies that what arrives is in its space.
+    env = GymnasiumEnv("Echo-v0", 2, options={"action_space": space})
+    assert env.action_spec.dtype == spec if isinstance(spec, torch.dtype) else isinstance(env.action_spec, spec)
+    assert env.action_spec.shape == (2, *shape)
+    carrier = env.reset()
+    action = env.rand_action()["action"]
+    given = action.double().reshape(2, -1).sum(-1) + float(np.sum(getattr(space, "start", 0)))
+    torch.testing.assert_close(env.step(carrier.set("action", action))["next", "real"][:, 2].double(), given)
+
+
+def test_finished_row_stays_as_it_is():
+    env = build("Echo-v0")
+    carrier = env.reset()
+    for _ in range(LIMIT + 3):  # Echo refuses to be stepped after its end
+        after = env.step(env.rand_action(carrier))["next"]
+        carrier = after.clone()
+    assert after["terminated"].all()
+    assert after["real"][:, 0].tolist() == [LIMIT] * 3
+    assert after["reward"].tolist() == [[0.0]] * 3
+
+
+def test_time_limit_truncates():
+    env = GymnasiumEnv("Pendulum-v1", 2, max_steps=5)
+    ends = env.rollout(5, break_when_any_done=False)["next"]
+    assert ends["truncated"][:, -1].all()
+    assert not ends["terminated"].any()
+    assert ends["done"].sum() == 2
+
+
+def test_wrappers_are_applied_in_order():
+    double, shift = (
+        partial(gymnasium.wrappers.TransformReward, func=func) for func in (lambda r: 2 * r, lambda r: r + 3)
+    )
+    after = drive(build("Echo-v0", wrappers=[double, shift]), 1)[0][0]
+    assert after["reward"].tolist() == [[5.0]] * 3
+
+
+def test_controllers_act_beside_their_envs():
+    controllers = {"count": Counter, "fast": partial(Counter, size=10), "real": first_real}
+    env = build("Echo-v0", controllers=controllers)
+    carrier = env.reset()
+    for steps in range(LIMIT - 1):
+        assert carrier["controller", "count"].tolist() == [[steps + 1.0] * 2] * 3
+        assert carrier["controller", "fast"].tolist() == [[steps * 10 + 10.0] * 2] * 3  # out of bounds, as given
+        assert torch.equal(carrier["controller", "real"], carrier["real"][:, :2])
+        step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+        assert torch.equal(step["next", "controller", "count"], carrier["controller", "count"])
+    step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+    assert step["next", "terminated"].all()
+    assert step["next", "controller", "count"].tolist() == [[float(LIMIT)] * 2] * 3
+    assert carrier["controller", "count"].tolist() == [[1.0] * 2] * 3
+
+
+def test_heuristic_of_gymnasium_lands():
+    path = "gymnasium.envs.box2d.lunar_lander:heuristic"
+    env = build("LunarLander-v3", 4, first_seed=0, controllers={"heuristic": path})
+    carrier, total = env.reset(), torch.zeros(4, 1)
+    while not carrier["done"].all():
+        carrier = env.step(carrier.set("action", carrier["controller", "heuristic"]))["next"]
+        total += carrier["reward"]
+    assert (total > 200).all()  # 280 with a standard deviation of 15
+
+
+def test_discrete_controller_gives_indices():
+    env = GymnasiumEnv("Echo-v0", 2, options={"action_space": spaces.Discrete(12)}, controllers={"a": act})
+    assert env.reset()["controller", "a"].tolist() == [11, 11]
+    assert drive(env, 4)[0][-1]["controller", "a"].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("advice", [[0.0], [0.0, float("nan")], None])
+def test_wrong_advice_names_the_controller(advice):
+    env = GymnasiumEnv("Echo-v0", controllers={"broken": lambda env, observation: advice})
+    with pytest.raises(ValueError, match=r"controller broken gave .*, not an action of Box"):
+        env.reset()
+
+
+def test_pictures_show_the_first_row():
+    env = build("Echo-v0", render=True)
+    drive(env, 3)
+    assert env.rate == 20
+    assert env.render().tolist() == np.full((2, 2, 3), 3).tolist()
+    assert build("Echo-v0").render() is None
+    assert [row.env.render_mode for row in env.rows] == ["rgb_array", None, None]
+
+
+@pytest.mark.parametrize(
+    ("id", "arguments", "message"),
+    [
+        ("CartPol-v1", {}, "the env CartPol-v1 cannot be made: .*Did you mean: `CartPole`"),
+        ("MyPlant-v0", {}, "write PACKAGE:MyPlant-v0"),
+        ("no_such_module:X-v0", {}, "No module named 'no_such_module'"),
+        ("CartPole-v1", {"options": {"colour": 1}}, "unexpected keyword argument 'colour'$"),
+        ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),
+        ("CartPole-v1", {"max_steps": 0}, "max_steps=0 must be at least 1"),
+        ("CartPole-v1", {"cases": 3}, "cases=3 needs first_seed"),
+        ("CartPole-v1", {"controllers": {"pid": "math:PID"}}, "controller pid: 'math:PID' cannot be imported"),
+        ("CartPole-v1", {"controllers": {"pid": "builtins:str"}}, r"controller pid: str needs a method act\(obs"),
+        ("CartPole-v1", {"controllers": {"pid": "fractions:Fraction"}}, "controller pid cannot be made with its env"),
+        ("Echo-v0", {"options": {"action_space": spaces.Text(3)}}, "the action of Echo-v0 is a Text space"),
+    ],
+)
+def test_mistake_is_one_sentence(id, arguments, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        GymnasiumEnv(id, **arguments)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("key", ["reward", "info"])
+def test_reserved_entry_is_refused(key):
+    def rename(env):
+        space = spaces.Dict({key: env.observation_space})
+        return gymnasium.wrappers.TransformObservation(env, lambda observation: {key: observation}, space)
+
+    with pytest.raises(ValueError, match=f"has an entry '{key}'"):
+        GymnasiumEnv("CartPole-v1", wrappers=[rename])
+
+
+def test_missing_package_is_named(monkeypatch):
+    def fail(*args, **settings):
+        raise gymnasium.error.DependencyNotInstalled("MuJoCo is not installed")
+
+    monkeypatch.setattr(gymnasium, "make", fail)
+    with pytest.raises(ValueError, match=r"python -m pip install 'coil-rl\[mujoco\]'"):
+        GymnasiumEnv("Ant-v5")

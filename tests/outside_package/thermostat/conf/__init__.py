@@ -1,0 +1,1 @@
+"""Configuration files, found by `--config-dir` or `hydra.searchpath=[pkg://thermostat.conf]`."""

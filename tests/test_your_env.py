@@ -1,0 +1,67 @@
+"""docs/your_env.md: its commands and Python blocks run, at toy size, and its other code is that of the package."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+from outside_package.install import PROXY, SOURCE, TINY, install
+from programs import ROOT, called
+
+PAGE = (ROOT / "docs" / "your_env.md").read_text()
+BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
+EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
+COMMANDS = [
+    shlex.split(line, comments=True) for language, block in BLOCKS if not language for line in block.splitlines()
+]
+TOY = {
+    "coil-train": TINY,
+    "coil-evaluate": ["evaluation.cases=2", "evaluation.repeats=1"],
+    "coil-listen": ["evaluation.repeats=1", "donors=2"],
+    "coil-report": [],
+    "coil-distill": PROXY,
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return the folder of the package, which is installed for this process."""
+    folder = tmp_path_factory.mktemp("your_env")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(install(folder))
+        yield folder / "source"
+
+
+@pytest.mark.parametrize("block", EXCERPTS, ids=[block.splitlines()[0].strip() for block in EXCERPTS])
+def test_excerpt_is_a_part_of_the_package(block):
+    texts = [file.read_text() for file in SOURCE.rglob("*") if file.suffix in (".py", ".yaml", ".toml")]
+    assert any(block in text for text in texts)
+
+
+def test_files_that_are_named_or_linked_are_there():
+    for link in re.findall(r"\]\(([^)#]+)\)", PAGE):
+        assert (ROOT / "docs" / link).exists(), link
+    for name in re.findall(r"`(thermostat/[\w/]+\.\w+)`", PAGE):
+        assert (SOURCE / name).is_file(), name
+
+
+@pytest.mark.parametrize("program", PROGRAMS, ids=["from Python", "checks"])
+def test_python_runs_as_printed(program, folder):
+    assert len([line for line in program.splitlines() if line]) <= 10
+    found: dict = {}
+    exec(compile(program, "your_env.md", "exec"), found)
+    if "result" in found:
+        assert [episode["steps"] for episode in found["result"].episodes] == [96] * 4
+
+
+@pytest.mark.slow
+def test_commands_run_in_the_order_of_the_page(folder):
+    assert len(COMMANDS) == 15
+    for name, *arguments in COMMANDS:
+        toy = [] if any(argument.startswith("resume=") for argument in arguments) else TOY[name]
+        called(name.removeprefix("coil-"), *arguments, *toy, cwd=folder)
+    outputs = folder / "outputs"
+    assert {path.parent.relative_to(outputs).parts[0] for path in outputs.rglob("*.md")} >= {"room", "ppo", "sweep"}
+    assert (outputs / "sweep" / "report.png").is_file()
+    assert Path(outputs / "room" / "learning_curve.png").is_file()

@@ -1,0 +1,59 @@
+"""Memory of guides by TorchRL's convention, carried from step to step by the env's data."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import unravel_key
+from torchrl.data import Composite
+from torchrl.envs import Compose
+from torchrl.modules.utils import get_primers_from_module
+
+SUPPLIED = ("is_init", "row", "last_action")  # what a guide may read besides the entries of the env
+
+
+class GuideMemory:
+    """What a guide reads as `k` and writes as `("next", k)`, declared by its `make_tensordict_primer()`.
+
+    Args:
+        name: of the guide, for messages.
+        guide: without a declaration it has no memory.
+
+    Raises:
+        ValueError: for an entry that is not declared, or one without a fixed value at the start of an episode.
+    """
+
+    def __init__(self, name: str, guide: TensorDictModuleBase) -> None:
+        primers = get_primers_from_module(guide, warn=False)
+        parts = primers.transforms if isinstance(primers, Compose) else [primers] if primers else []
+        written = {unravel_key(key[1:]) for key in guide.out_keys if isinstance(key, tuple) and key[0] == "next"}
+        self.specs, self.first = {}, {}
+        for primer in parts:
+            if primer.random or primer.single_default_value:
+                raise ValueError(f"the memory of guide {name!r} must begin with a number or function for each entry")
+            row = (0,) * len(primer.primers.shape)
+            for key, spec in primer.primers.items(True, True):
+                if key in written:
+                    self.specs[key], self.first[key] = spec[row] if row else spec, primer.default_value[key]
+        if undeclared := written - self.specs.keys():
+            raise ValueError(
+                f"guide {name!r} writes {sorted(map(str, undeclared))} for its next step, but nothing says how they "
+                "begin; give it make_tensordict_primer()"
+            )
+
+    def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
+        """Return the spec of the memory."""
+        spec = Composite(shape=batch, device=device)
+        for key, row in self.specs.items():
+            spec[key] = row.to(device).expand(*batch, *row.shape) if device else row.expand(*batch, *row.shape)
+        return spec
+
+    def start(self, batch: torch.Size, device: torch.device | None) -> TensorDictBase:
+        """Return the memory at the start of episodes."""
+        memory = TensorDict({}, batch, device=device)
+        for key, spec in self.specs.items():
+            first = self.first[key]
+            value = first() if callable(first) else torch.full(spec.shape, first, dtype=spec.dtype, device=device)
+            memory.set(key, value.expand(*batch, *spec.shape).clone())
+        return memory
