@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.limits import check_range
@@ -77,6 +78,7 @@ class TrackSections:
     """
 
     names = SECTIONS
+    record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
 
     def __init__(
         self, tracks: Sequence[Track], *, turn_radius: float = 10.0, approach: float = 4.0, bin: float = 1.0

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -31,6 +32,7 @@ class Sections(Protocol):
     """Division of the states of an env into sections, and the pictures of a survey."""
 
     names: tuple[str, ...]  # of the sections
+    record: ClassVar[Mapping[str, NestedKey]]  # entries of every step that `draw` needs, by name
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
         """Return where the rows of a state [B] are, [B, ...] each."""

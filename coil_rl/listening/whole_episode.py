@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.listening.measures import PICTURES
@@ -25,6 +27,7 @@ class WholeEpisode:
     """No sections; the pictures show each measure along the steps of the episodes."""
 
     names: tuple[str, ...] = ()
+    record: ClassVar[Mapping[str, NestedKey]] = {}
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
         """Return nothing: the step is known."""

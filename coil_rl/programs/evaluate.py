@@ -46,7 +46,7 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
     """
     from coil_rl.errors import UserError
     from coil_rl.train.build import build_env
-    from coil_rl.train.check import check_values
+    from coil_rl.train.check import check_measures, check_values
     from coil_rl.train.load import load_policy
     from coil_rl.train.run_folder import read_config
 
@@ -71,7 +71,9 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
     check_values(config)
     if config.method.observes is None:
         return config, None
-    return config, load_policy(run, config, build_env(config), config.evaluation.policy)
+    env = build_env(config)
+    check_measures(config, env)
+    return config, load_policy(run, config, env, config.evaluation.policy)
 
 
 def check(config: DictConfig) -> None:

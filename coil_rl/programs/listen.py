@@ -41,7 +41,7 @@ def listen(config: DictConfig) -> None:
     from coil_rl.programs.evaluate import restore
     from coil_rl.report import markdown_table, write_csv
     from coil_rl.train.build import build, build_env
-    from coil_rl.train.evaluate_run import build_evaluation, build_pictures
+    from coil_rl.train.evaluate_run import build_evaluation
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
@@ -54,7 +54,7 @@ def listen(config: DictConfig) -> None:
         raise UserError(f"the agent of run={config.run} does not use advice: {error}") from error
     node = run.evaluation.sections
     sections: surveys.Sections = build(node, "evaluation.sections") if node else WholeEpisode()
-    evaluation = build_evaluation(run, build_pictures(run))
+    evaluation = build_evaluation(run, sections.record)
     rows = len(evaluation.cases) * run.evaluation.repeats
     folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)  # for guides with random actions

@@ -65,7 +65,7 @@ class Returns(Picture):
 
     def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw one row for each driver, with a dot for each episode and a line at the mean."""
-        names = list(drives)[::-1]
+        names, strokes = list(drives)[::-1], style.strokes(drives)
         with style.picture(folder / "returns.png", None, [], 0.9 + 0.45 * len(names)) as figure:
             axes = figure.add_subplot(xlabel="return of an episode")
             style.lighten(axes)
@@ -73,8 +73,8 @@ class Returns(Picture):
                 rewards = np.array([episode["reward"] for episode in drives[name].episodes])
                 # Spread evenly, so that equal returns stay visible.
                 heights = row + 0.3 * (np.arange(len(rewards)) / max(1, len(rewards) - 1) - 0.5)
-                axes.plot(rewards, heights, "o", color=style.AGENTS[0], ms=4, alpha=0.5, mew=0)
-                axes.plot([rewards.mean()] * 2, [row - 0.3, row + 0.3], color=style.AGENTS[0], lw=2)
+                axes.plot(rewards, heights, "o", color=strokes[name].colour, ms=4, alpha=0.5, mew=0)
+                axes.plot([rewards.mean()] * 2, [row - 0.3, row + 0.3], color=strokes[name].colour, lw=2)
             axes.set_yticks(range(len(names)), names)
 
 

@@ -34,7 +34,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         built = hydra.utils.instantiate(node, **arguments, _convert_="all")
     except hydra.errors.InstantiationException as error:
         cause = error.__cause__
-        if isinstance(cause, (UserError, ValueError, KeyError, TypeError, OSError)):
+        if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
             raise UserError(f"{name}: {message}") from error
         if isinstance(cause, ImportError):

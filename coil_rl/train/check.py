@@ -40,7 +40,7 @@ from coil_rl.train.build import (
 )
 from coil_rl.train.config import TrainConfig
 from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
-from coil_rl.train.evaluate_run import build_evaluation, build_pictures
+from coil_rl.train.evaluate_run import build_evaluation, build_pictures, recorded
 from coil_rl.train.measures import measures_of
 from coil_rl.transforms import GuideActions
 
@@ -67,10 +67,9 @@ def check_parts(config: DictConfig) -> None:
     has_agent = trains and config.method.observes is not None
     if has_agent:
         _check_learner_kind(config)
-    pictures = build_pictures(config)
-    cases = len(build_evaluation(config, pictures).cases)
+    cases, record = len(build_evaluation(config).cases), recorded(build_pictures(config))
     if trains or OmegaConf.select(config, "run") is None:
-        _check_drivers(config, cases, [key for picture in pictures for key in picture.record.values()])
+        _check_drivers(config, cases, record.values())
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
@@ -150,17 +149,18 @@ def _evaluation_env(config: DictConfig, recorded: Iterable[NestedKey]) -> EnvBas
         )
     check_node(config.env, "env")
     env = build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
-    measured = {
-        f"evaluation.measures.{name}": key
-        for name, measure in measures_of(config.evaluation.measures).items()
-        for key in (measure.entry, measure.where)
-        if key is not None
-    }
-    for name, key in measured.items():
-        _check_entry(env, key, name)
+    check_measures(config, env)
     for key in recorded:
         _check_entry(env, key, "evaluation.pictures")
     return env
+
+
+def check_measures(config: DictConfig, env: EnvBase) -> None:
+    """Raise a `UserError` if an env does not write an entry that is measured."""
+    for name, measure in measures_of(config.evaluation.measures).items():
+        for key in (measure.entry, measure.where):
+            if key is not None:
+                _check_entry(env, key, f"evaluation.measures.{name}")
 
 
 def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
@@ -190,6 +190,9 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
     except (KeyError, TypeError, ValueError) as error:
         problem = str(error.args[0] if error.args else error).replace("the action of guide 'guide'", "its action")
         raise UserError(f"{name}: {problem}") from error
+    except RuntimeError as error:
+        problem = str(error).partition("\n")[0]
+        raise UserError(f"{name}: it cannot act on the observations of this env ({problem})") from error
 
 
 def _check_cases(config: DictConfig, cases: int, build_drive: Callable[..., Any]) -> None:

@@ -46,8 +46,8 @@ class Evaluation:
         return evaluate_policy(env, policy, cases=self.cases, measures=self.measures, record=self.record, **options)
 
 
-def build_evaluation(config: DictConfig, pictures: Iterable[Picture] = ()) -> Evaluation:
-    """Return the evaluation of a configuration.
+def build_evaluation(config: DictConfig, record: Mapping[str, NestedKey] | None = None) -> Evaluation:
+    """Return the evaluation of a configuration, with entries to record by name.
 
     Raises:
         UserError: for cases that are neither a number nor names, or without one.
@@ -57,14 +57,18 @@ def build_evaluation(config: DictConfig, pictures: Iterable[Picture] = ()) -> Ev
     names = list(map(str, range(names))) if isinstance(names, int) else names
     if not isinstance(names, (list, tuple, ListConfig)) or not names:
         raise UserError(f"evaluation.cases={cases} must be at least 1, or the names of the cases")
-    record = {name: key for picture in pictures for name, key in picture.record.items()}
-    return Evaluation(list(map(str, names)), measures_of(config.evaluation.measures), record)
+    return Evaluation(list(map(str, names)), measures_of(config.evaluation.measures), record or {})
 
 
 def build_pictures(config: DictConfig) -> list[Picture]:
     """Return the pictures of a configuration; without any, the returns."""
     nodes = config.evaluation.pictures.items()
     return [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node] or [Returns()]
+
+
+def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
+    """Return the entries that pictures need, by name."""
+    return {name: key for picture in pictures for name, key in picture.record.items()}
 
 
 def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int) -> None:
@@ -76,7 +80,7 @@ def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder:
     The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
     """
     pictures = build_pictures(config)
-    evaluation = build_evaluation(config, pictures)
+    evaluation = build_evaluation(config, recorded(pictures))
     count = len(evaluation.cases)
     table: list[dict[str, Any]] = []
     episodes: list[dict[str, Any]] = []

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
+from coil_rl.errors import UserError
+
 # Reductions of the steps of an episode to one number.
 REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero")
 
@@ -60,13 +62,27 @@ class Measure:
         return pools.get(self.reduction, fmean)(numbers) if numbers else math.nan
 
 
-def _key(key: str | Sequence[str]) -> str | tuple[str, ...]:
-    return key if isinstance(key, str) else tuple(key)
+def _key(key: Any) -> str | tuple[str, ...]:
+    if isinstance(key, str):
+        return key
+    if not isinstance(key, Sequence) or not key or not all(isinstance(part, str) for part in key):
+        raise ValueError(f"{key} is no entry; name one, as in reward or [info, lap]")
+    return tuple(key)
 
 
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
-    """Return measures by name from the key `evaluation.measures` of a configuration."""
-    return {name: Measure.of(**node) for name, node in nodes.items()}
+    """Return measures by name from the key `evaluation.measures` of a configuration.
+
+    Raises:
+        UserError: for an invalid one.
+    """
+    measures = {}
+    for name, node in nodes.items():
+        try:
+            measures[name] = Measure.of(**node)
+        except ValueError as error:
+            raise UserError(f"evaluation.measures.{name}: {error}") from error
+    return measures
 
 
 def summarise(episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]) -> list[dict[str, Any]]:

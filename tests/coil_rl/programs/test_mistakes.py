@@ -108,6 +108,8 @@ def refusal(name, *arguments):
         (f"method={'x' * 300}", "... cannot be used (File name too long); choose a shorter name"),
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
+        ("evaluation.measures.laps.entry=1", "evaluation.measures.laps: 1 is no entry; name one, as in reward or"),
+        ("guide=linear_feedback", "guide.linear_feedback: it cannot act on the observations of this env (The size of"),
         ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
         ("method=coil degrade=[shuffled] track.train.count=2", "each case of the evaluation has one row, 1 in all: "),
         ("method=coil +degrade@evaluation.advice.other=shuffled", "1 in all: method.transforms: ShuffledAdvice"),

@@ -4,7 +4,7 @@ from omegaconf import OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.train.build import build_guides
-from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides
+from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides, recorded
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -40,7 +40,7 @@ def test_given_guides_are_not_cached(composed):
 
 def test_evaluation_has_the_cases_and_measures_of_the_env_and_the_entries_of_its_pictures(composed):
     config = composed()
-    evaluation = build_evaluation(config, build_pictures(config))
+    evaluation = build_evaluation(config, recorded(build_pictures(config)))
     assert evaluation.cases == ["test_1", "test_2", "test_3"]
     assert list(evaluation.measures) == list(config.evaluation.measures)
     assert evaluation.record == {"pose": ("info", "pose")}
