@@ -50,17 +50,17 @@ def test_command_runs_no_code_from_a_folder(command, received, tmp_path):
 
 def test_outside_part_of_a_run_needs_trust_on_the_command_line(received, tmp_path, monkeypatch):
     shutil.copytree(received, tmp_path, dirs_exist_ok=True)
-    (tmp_path / "their_package.py").write_text(
+    (tmp_path / "neighbours_package.py").write_text(
         "from pathlib import Path\nfrom coil_rl.guides import ZeroGuide\n\n"
         "class TheirGuide(ZeroGuide):\n    def __init__(self):\n        super().__init__()\n"
         "        Path('marker').touch()\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with_guide(tmp_path / "run", {"_target_": "their_package.TheirGuide"})
+    with_guide(tmp_path / "run", {"_target_": "neighbours_package.TheirGuide"})
     refused = called("evaluate", "run=run", cwd=tmp_path, code=2).stderr
-    assert "allow it with trust=[their_package] on the command line" in refused
+    assert "allow it with trust=[neighbours_package] on the command line" in refused
     assert not (tmp_path / "marker").exists()
-    small = ["track=generated", "track.test.count=1", "evaluation.repeats=1", "trust=[their_package]"]
+    small = ["track=generated", "track.test.count=1", "evaluation.repeats=1", "trust=[neighbours_package]"]
     called("evaluate", "run=run", *small, cwd=tmp_path)
     assert (tmp_path / "marker").exists()
     assert "allow it with trust" in called("train", "resume=run", cwd=tmp_path, code=2).stderr
