@@ -10,6 +10,7 @@ needs.
 from __future__ import annotations
 
 import argparse
+import itertools
 import math
 import statistics
 import time
@@ -39,10 +40,11 @@ VALUES: Mapping[str, Mapping[str, Any]] = {
     "dqn": {"envs": 1, "steps": 4, "every": 4, "minibatch": 128, "learning_rate": 6e-4, "gamma": 0.99, "tau": 0.01,
             "starts": 1_000, "hidden": (128, 128), "explore": 0.3, "epsilon": 0.05},
 }  # fmt: skip
+LANDER = {"envs": 16, "steps": 1024, "epochs": 4, "gamma": 0.999, "gae_lambda": 0.98, "entropy": 0.01}
 TUNED: Mapping[tuple[str, str], Mapping[str, Any]] = {
     ("ppo", "Pendulum-v1"): {"envs": 4, "steps": 1024, "learning_rate": 1e-3, "gamma": 0.9},
-    ("ppo", "LunarLander-v3"): {"envs": 16, "steps": 1024, "epochs": 4, "gamma": 0.999, "gae_lambda": 0.98,
-                                "entropy": 0.01},
+    ("ppo", "LunarLander-v3"): LANDER,
+    ("ppo", "LunarLanderContinuous-v3"): LANDER,
 }  # fmt: skip
 CAPACITY = 50_000
 EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
@@ -128,22 +130,26 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Train with both and print the comparison."""
     parser = argparse.ArgumentParser("python -m benchmarks.beside_sb3", description=__doc__)
     parser.add_argument("algorithm", choices=list(VALUES))
-    parser.add_argument("env", help="a Gymnasium id, e.g. Pendulum-v1 or LunarLander-v3")
+    parser.add_argument("env", help="a Gymnasium id, e.g. Pendulum-v1 or LunarLanderContinuous-v3")
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--seeds", type=int, default=3, help="runs, with the seeds 0, 1, ...")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     values = {**VALUES[args.algorithm], **TUNED.get((args.algorithm, args.env), {})}
+    learners = {"ours": ours, "Stable-Baselines3": theirs}
+    returns: dict[str, list[float]] = {name: [] for name in learners}
+    rates: dict[str, list[float]] = {name: [] for name in learners}
+    # In turns, so that a machine that becomes slower or faster is so for both.
+    runs = list(itertools.product(range(args.seeds), learners.items()))
+    for seed, (name, train) in tqdm(runs, disable=None):
+        start = time.process_time()
+        act = train(args.algorithm, args.env, values, args.frames, seed)
+        rates[name].append(args.frames / (time.process_time() - start))
+        returns[name].append(mean_return(args.env, act))
     rows = []
-    for name, train in tqdm([("ours", ours), ("Stable-Baselines3", theirs)], disable=None):
-        returns, rates = [], []
-        for seed in range(args.seeds):
-            start = time.process_time()
-            act = train(args.algorithm, args.env, values, args.frames, seed)
-            rates.append(args.frames / (time.process_time() - start))
-            returns.append(mean_return(args.env, act))
-        spread = statistics.stdev(returns) if len(returns) > 1 else math.nan
-        rows.append([name, statistics.mean(returns), spread, statistics.median(rates)])
+    for name in learners:
+        spread = statistics.stdev(returns[name]) if args.seeds > 1 else math.nan
+        rows.append([name, statistics.mean(returns[name]), spread, statistics.median(rates[name])])
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
     print(tabulate(rows, ["", "return", "sd", "frames per CPU second"], floatfmt=".0f"))
 

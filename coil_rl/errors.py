@@ -1,7 +1,5 @@
 """User errors, and messages of one sentence for them."""
 
-from __future__ import annotations
-
 import difflib
 import errno
 import textwrap

@@ -1,6 +1,4 @@
-"""Atomic writes: files and folders appear complete or not at all, also if the process is killed."""
-
-from __future__ import annotations
+"""Atomic writes: files appear complete or not at all, also if the process is killed."""
 
 import os
 import re
@@ -16,14 +14,12 @@ from coil_rl.errors import UserError
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path with the same suffix that becomes `path` at the end of the block.
 
-    Parents are made and an older file is replaced. If the block raises, the temporary file is removed.
-
-    Raises:
-        UserError: if a folder is in its place, or a file in that of a parent.
+    Parents are made and an older file is replaced. If the block raises, the temporary file is removed. A folder in its
+    place, or a file in that of a parent, is a `UserError`.
     """
     path = Path(path)
     _make_folder(path.parent)
-    unfinished = _temporary(path)
+    unfinished = temporary(path)
     try:
         yield unfinished
         if path.is_dir():
@@ -44,30 +40,9 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         unfinished.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
 
 
-@contextmanager
-def whole_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Yield a temporary folder that becomes `path` at the end of the block.
-
-    Parents are made. If the block raises, the temporary folder is removed.
-
-    Raises:
-        OSError: if `path` is a folder that is not empty.
-        UserError: if `path` or a parent is a file.
-    """
-    path = Path(path)
-    _make_folder(path.parent)
-    if path.is_file():
-        raise UserError(f"{path} is a file, but a folder is to be made there; remove it")
-    unfinished = _temporary(path)
-    unfinished.mkdir()
-    try:
-        yield unfinished
-        for name in [*unfinished.rglob("*"), unfinished]:
-            (folder_to_disk if name.is_dir() else _to_disk)(name)
-        unfinished.rename(path)
-        folder_to_disk(path.parent)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+def temporary(path: Path) -> Path:
+    """Return the path beside `path` under which this process makes it."""
+    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
 def remove_unfinished(folder: Path) -> None:
@@ -89,10 +64,6 @@ def _make_folder(path: Path) -> None:
     except (FileExistsError, NotADirectoryError) as error:
         obstacle = next((place for place in (path, *path.parents) if place.is_file()), path)
         raise UserError(f"{obstacle} is a file, but a folder is to be made there; remove it") from error
-
-
-def _temporary(path: Path) -> Path:
-    return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
 def _to_disk(path: Path) -> None:

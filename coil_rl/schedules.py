@@ -3,8 +3,6 @@
 A schedule is called with the progress of the run, 0 at the start and 1 at the end, and returns a number.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,24 +11,29 @@ Schedule = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Linear:
-    """Linear interpolation between two values; raises a `ValueError` if `until` is out of range.
+    """Linear interpolation between two values; raises a `ValueError` if `since` or `until` is out of range.
 
     Example:
         >>> Linear(1.0, 0.0)(0.25)
         0.75
     """
 
-    start: float  # value at progress 0
+    start: float  # value up to progress `since`
     end: float  # value from progress `until` on
     until: float = 1.0  # progress at which `end` is reached, in (0, 1]
+    since: float = 0.0  # in [0, until]; with both equal the value jumps
 
     def __post_init__(self) -> None:
         if not 0 < self.until <= 1:
             raise ValueError(f"until={self.until} must be more than 0 and at most 1: it is a share of the run")
+        if not 0 <= self.since <= self.until:
+            raise ValueError(f"since={self.since} must be at least 0 and at most until={self.until}")
 
     def __call__(self, progress: float) -> float:
         """Return the value at this progress."""
-        return self.start + (self.end - self.start) * min(1.0, progress / self.until)
+        if progress >= self.until:
+            return self.end
+        return self.start + (self.end - self.start) * max(0.0, progress - self.since) / (self.until - self.since or 1.0)
 
 
 def schedule(value: float | Schedule) -> Schedule:

@@ -5,57 +5,38 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from coil_rl.envs.cone_track import ConeTrackEnv
-from coil_rl.envs.driving_tasks import DrivingTasksEnv
-from coil_rl.envs.env_batch import EnvBatch
-from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_track, shipped_tracks, track_names
-from coil_rl.envs.recordings.mcap_files import RecordingWriter
-from coil_rl.envs.recordings.reading import Recording, RecordingError, read_recording
-from coil_rl.envs.recordings.replay_env import McapReplayEnv
-from coil_rl.envs.robot.course import robot_track, robot_tracks
-from coil_rl.envs.robot.drives import SimulatedDrive, labelling_drives, record_drives, save_drive, simulated_drive
-from coil_rl.envs.robot.env import SimulatedRobotEnv
-from coil_rl.envs.robot.lidar import SimulatedLidar
-from coil_rl.envs.robot.perception import ConeClassifier, Perception, simulated_cone_classifier
-from coil_rl.envs.track import Track, TrackError
-from coil_rl.envs.track_generator import random_track, random_tracks
+from coil_rl.envs.cone_track import ConeTrackEnv as ConeTrackEnv
+from coil_rl.envs.driving_tasks import DrivingTasksEnv as DrivingTasksEnv
+from coil_rl.envs.env_batch import EnvBatch as EnvBatch
+from coil_rl.envs.level_files import load_track as load_track
+from coil_rl.envs.level_files import load_tracks as load_tracks
+from coil_rl.envs.level_files import save_track as save_track
+from coil_rl.envs.level_files import shipped_track as shipped_track
+from coil_rl.envs.level_files import shipped_tracks as shipped_tracks
+from coil_rl.envs.level_files import track_names as track_names
+from coil_rl.envs.recordings.mcap_files import RecordingWriter as RecordingWriter
+from coil_rl.envs.recordings.reading import Recording as Recording
+from coil_rl.envs.recordings.reading import RecordingError as RecordingError
+from coil_rl.envs.recordings.reading import read_recording as read_recording
+from coil_rl.envs.recordings.replay_env import McapReplayEnv as McapReplayEnv
+from coil_rl.envs.robot.course import robot_track as robot_track
+from coil_rl.envs.robot.course import robot_tracks as robot_tracks
+from coil_rl.envs.robot.drives import SimulatedDrive as SimulatedDrive
+from coil_rl.envs.robot.drives import record_drives as record_drives
+from coil_rl.envs.robot.drives import save_drive as save_drive
+from coil_rl.envs.robot.drives import simulated_drive as simulated_drive
+from coil_rl.envs.robot.env import SimulatedRobotEnv as SimulatedRobotEnv
+from coil_rl.envs.robot.lidar import SimulatedLidar as SimulatedLidar
+from coil_rl.envs.robot.perception import ConeClassifier as ConeClassifier
+from coil_rl.envs.robot.perception import Perception as Perception
+from coil_rl.envs.robot.perception import simulated_cone_classifier as simulated_cone_classifier
+from coil_rl.envs.track import Track as Track
+from coil_rl.envs.track import TrackError as TrackError
+from coil_rl.envs.track_generator import random_track as random_track
+from coil_rl.envs.track_generator import random_tracks as random_tracks
 
 if TYPE_CHECKING:
-    from coil_rl.envs.gymnasium_env import GymnasiumEnv
-
-__all__ = [
-    "ConeClassifier",
-    "ConeTrackEnv",
-    "DrivingTasksEnv",
-    "EnvBatch",
-    "GymnasiumEnv",
-    "McapReplayEnv",
-    "Perception",
-    "Recording",
-    "RecordingError",
-    "RecordingWriter",
-    "SimulatedDrive",
-    "SimulatedLidar",
-    "SimulatedRobotEnv",
-    "Track",
-    "TrackError",
-    "labelling_drives",
-    "load_track",
-    "load_tracks",
-    "random_track",
-    "random_tracks",
-    "read_recording",
-    "record_drives",
-    "robot_track",
-    "robot_tracks",
-    "save_drive",
-    "save_track",
-    "shipped_track",
-    "shipped_tracks",
-    "simulated_cone_classifier",
-    "simulated_drive",
-    "track_names",
-]
+    from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
 
 
 def __getattr__(name: str) -> Any:

@@ -4,8 +4,6 @@ Each car drives on a closed track between two rings of cones at constant speed a
 cones ahead. The reward pays for laps, newly visible cones and each step, and charges for rough steering and crashes.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial, reduce

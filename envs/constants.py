@@ -4,8 +4,6 @@ On a small batch an operation with a Python number takes twice as long as one wi
 the number on every call. Creating the numbers 0, 1, 2, ... takes as long as two operations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -5,8 +5,6 @@ changes at random, so one agent has to learn all tasks, as in the puppeteer exam
 and one agent that learns from all guides.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -39,16 +37,11 @@ class DrivingTasksEnv(ConeTrackEnv):
     `PositionWeights`.
 
     Args:
-        tracks: the tracks.
-        num_envs: B.
+        tracks, num_envs, world: as for `ConeTrackEnv`.
         tasks: name to weights, of `RewardWeights` and `PositionWeights`.
         only: a task that all cars keep; by default they change between all tasks.
         duration: s, mean time until a task changes to another one, drawn every step with equal probabilities.
-        reward: weights that a task does not set, see `RewardWeights` and `PositionWeights`.
-        world: other arguments of `ConeTrackEnv`.
-
-    Raises:
-        ValueError: as `ConeTrackEnv`, and for unknown tasks and weights.
+        reward: weights that a task does not set.
 
     Example:
         >>> from coil_rl.envs import DrivingTasksEnv, shipped_tracks

@@ -1,11 +1,10 @@
 """Batches of single envs in one process, whose running episodes are saved as seeds and actions."""
 
-from __future__ import annotations
-
 import warnings
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -35,18 +34,12 @@ class SeededRows(SeededEnv):
         seed: of the draw of the episodes' seeds.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to draw the seeds.
         cases: number of different episodes, by default that of the rows.
-        device: of all tensors.
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
 
     def __init__(
-        self,
-        rows: Sequence[Any],
-        seed: int,
-        first_seed: int | None,
-        cases: int | None,
-        device: torch.device | str,
+        self, rows: Sequence[Any], seed: int, first_seed: int | None, cases: int | None, device: torch.device | str
     ) -> None:
         check_range(0, LARGEST_SEED, seed=seed, first_seed=first_seed or 0)
         check_range(1, cases=1 if cases is None else cases)
@@ -133,11 +126,11 @@ def _same(one: Any, other: Any) -> bool:
     return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
 
 
+@dataclass
 class _EnvRow:
     """One TorchRL env of a batch; see `rows` of `SeededRows`."""
 
-    def __init__(self, env: EnvBase) -> None:
-        self.env = env
+    env: EnvBase
 
     def begin(self, seed: int) -> None:
         # TorchRL's envs may seed the global generators, from which policies sample.
@@ -162,13 +155,10 @@ class EnvBatch(SeededRows):
     continued to the bit; see `continues` of `SeededRows`.
 
     Args:
-        of: makes one env.
+        of: makes one env, without a batch and with one action.
         num_envs: B.
         max_steps: steps after which an episode is truncated, for an env that does not end by itself.
         seed, first_seed, cases: of the episodes, as for `SeededRows`.
-
-    Raises:
-        ValueError: if the env has a batch or more than one action, or for a number out of range.
 
     Example:
         >>> from torchrl.envs import PendulumEnv

@@ -3,13 +3,15 @@
 Importing this module registers the id; `gymnasium.make("coil_rl.envs.gym:coil_rl/ConeTrack-v0")` does both at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 import torch
+from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -17,14 +19,6 @@ from tensordict.nn import TensorDictModuleBase
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.level_files import Split, shipped_tracks
 from coil_rl.envs.track import Track
-
-try:
-    import gymnasium
-except ImportError as error:
-    raise ImportError("coil_rl.envs.gym needs Gymnasium: python -m pip install 'coil-rl[gym]'") from error
-from gymnasium.spaces import Box
-from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space
 
 ID = "coil_rl/ConeTrack-v0"
 
@@ -144,8 +138,7 @@ def _info(state: TensorDictBase) -> dict[str, Any]:
     """Return `info` as nested arrays, [B] or [B, n]; empty for an env without it."""
     if "info" not in state:
         return {}
-    info: dict[str, Any] = state["info"].apply(lambda entry: entry.squeeze(-1).cpu().clone()).numpy()
-    return info
+    return state["info"].apply(lambda entry: entry.squeeze(-1).cpu().clone()).numpy()
 
 
 def _first_row(info: dict[str, Any]) -> dict[str, Any]:

@@ -1,9 +1,7 @@
 """Gymnasium envs as one batched TorchRL env, with controllers beside them."""
 
-from __future__ import annotations
-
-import importlib
 import inspect
+import pkgutil
 import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -66,10 +64,6 @@ class GymnasiumEnv(SeededRows):
     Attributes:
         rate: steps per second at which the env is drawn, NaN if it does not say.
 
-    Raises:
-        ValueError: for an env that cannot be made, an unsupported space, a controller that cannot be used, or a number
-            out of range.
-
     Example:
         >>> from coil_rl.envs import GymnasiumEnv
         >>> env = GymnasiumEnv("CartPole-v1", num_envs=4)
@@ -100,16 +94,14 @@ class GymnasiumEnv(SeededRows):
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
         settings = {**(options or {}), **({} if max_steps is None else {"max_episode_steps": max_steps})}
-        if render and "rgb_array" in _make(id, wrappers, settings).metadata.get("render_modes", ()):
-            drawn = settings | {"render_mode": "rgb_array"}
-        else:
-            drawn = settings
-        rows = [
-            _Row(partial(_make, id, wrappers, settings if row else drawn), makers, fresh) for row in range(num_envs)
-        ]
+        makes = [partial(_make, id, wrappers, settings)] * num_envs
+        self.shown = render and "rgb_array" in makes[0]().metadata.get("render_modes", ())
+        if self.shown:
+            makes[0] = partial(_make, id, wrappers, settings | {"render_mode": "rgb_array"})
+        rows = [_Row(make, makers, fresh) for make in makes]
         super().__init__(rows, seed, first_seed, cases, device)
         env = rows[0].env
-        self.shown, self.info = drawn is not settings, tuple(info)
+        self.info = tuple(info)
         self.floats = torch.empty(0, dtype=dtype).numpy().dtype
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
@@ -159,16 +151,10 @@ class GymnasiumEnv(SeededRows):
     def _output(self, *, stepped: bool) -> TensorDict:
         rows = self.rows
         observations = [row.observation for row in rows]
-        terminated, truncated = ([getattr(row, end) for row in rows] for end in ("terminated", "truncated"))
-        ends = np.array([terminated, truncated], dtype=bool)[..., None]
-        data = TensorDict(
-            {
-                "terminated": torch.from_numpy(ends[0]),
-                "truncated": torch.from_numpy(ends[1]),
-                "done": torch.from_numpy(ends.any(0)),
-            },
-            self.batch_size,
-        )
+        terminated = np.array([[row.terminated] for row in rows], dtype=bool)
+        truncated = np.array([[row.truncated] for row in rows], dtype=bool)
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        data = TensorDict({name: torch.from_numpy(end) for name, end in ends.items()}, self.batch_size)
         if stepped:
             data["reward"] = self._numbers([row.reward for row in rows])
         for entry in self.entries:
@@ -253,9 +239,8 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
     """Return a controller by its import path PACKAGE.MODULE:THING."""
     if not isinstance(thing, str):
         return thing
-    module, _, attribute = thing.partition(":")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return pkgutil.resolve_name(thing)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(
             f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"

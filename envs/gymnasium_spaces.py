@@ -1,7 +1,5 @@
 """Gymnasium's spaces as specs and entries of TorchRL."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -16,13 +14,10 @@ class Entry:
     """One entry of the observation: where it is in a Gymnasium observation, its spec, and its conversion.
 
     Args:
-        id: of the env, for errors.
+        id: of the env, for the `ValueError` about a space that is not supported.
         path: keys of Dict spaces and indices of Tuple spaces.
         space: of the entry.
-        floats: of entries that are not uint8.
-
-    Raises:
-        ValueError: for a space that is not supported.
+        floats: dtype of entries that are not uint8.
     """
 
     def __init__(self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]) -> None:

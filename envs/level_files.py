@@ -1,7 +1,5 @@
 """Level files: tracks as CSV in the format of the paper's authors, and the ten shipped tracks."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -28,11 +26,8 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
     """Read a level file: CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down).
 
     Args:
-        path: the file; extra columns, blank lines and case are ignored.
+        path: the file; extra columns, blank lines and case are ignored. A `TrackError` names it and its fault.
         start: x in m, y in m (pointing up), heading in degrees; see `Track` for the default.
-
-    Raises:
-        TrackError: naming the file and the fault in one sentence.
     """
     path = Path(path)
     sides: dict[str, list[tuple[float, float]]] = {"LEFT": [], "RIGHT": []}
@@ -40,11 +35,10 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
         if side.upper() not in sides:
             raise TrackError(f"{path}, line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT.")
         try:
-            x, y = map(float, cells)
+            x, y = np.asarray_chkfinite(cells, dtype=np.float64)
         except ValueError:
-            x = y = math.nan
-        if not math.isfinite(x) or not math.isfinite(y):
-            raise TrackError(f"{path}, line {line}: Cone_X, Cone_Y are {cells}; they must be finite numbers in m.")
+            fault = f"Cone_X, Cone_Y are {cells}; they must be finite numbers in m"
+            raise TrackError(f"{path}, line {line}: {fault}.") from None
         sides[side.upper()].append((x, -y))
     left, right = (np.reshape(cones, (-1, 2)) for cones in sides.values())
     pose = None
@@ -88,11 +82,9 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
 
 def shipped_tracks(split: Split) -> list[Track]:
     """Return the project's own tracks: seven to "train" on, three to "test" on, or "all" ten."""
-    if split == "all":
-        return shipped_tracks("train") + shipped_tracks("test")
-    if split not in ("train", "test"):
+    if split not in ("train", "test", "all"):
         raise ValueError(f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'.")
-    return list(_shipped(split))
+    return [track for part in ("train", "test") if split in (part, "all") for track in _shipped(part)]
 
 
 def track_names(tracks: Sequence[Track]) -> list[str]:
@@ -115,7 +107,8 @@ def _shipped(split: str) -> list[Track]:
         return load_tracks(folder)
 
 
-def _read_text(path: Path) -> str:
+def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line number and the cells under `COLUMNS` of each row that is not blank; missing cells are empty."""
     try:
         status = path.stat()
         # Pipes and devices may never end.
@@ -130,12 +123,7 @@ def _read_text(path: Path) -> str:
         raise TrackError(f"{path} is no file of at most {MAX_BYTES} bytes; give the path of a level file.")
     if not text.strip():
         raise TrackError(f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}.")
-    return text
-
-
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the cells under `COLUMNS` of each row that is not blank; missing cells are empty."""
-    reader = csv.reader(io.StringIO(_read_text(path)))
+    reader = csv.reader(io.StringIO(text))
     try:
         header = [name.strip() for name in next(reader)]
         columns = [name.casefold() for name in header]

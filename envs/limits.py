@@ -1,7 +1,5 @@
 """Checks of numbers and choices among the arguments of a constructor."""
 
-from __future__ import annotations
-
 import math
 
 LARGEST_SEED = 2**63 - 1
@@ -10,7 +8,7 @@ LARGEST_STARTS = 10**5  # places of a world where an episode may begin
 
 
 def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:
-    """Raise a `ValueError` for the first of some values that is not from `low` to `high`, or is NaN or infinite.
+    """Raise a `ValueError` for the first value outside of [low, high], and for NaN and infinity.
 
     `above` excludes `low` itself.
     """

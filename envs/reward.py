@@ -1,7 +1,5 @@
 """The reward of the cone worlds (paper 4.1.1)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from functools import reduce

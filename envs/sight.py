@@ -3,8 +3,6 @@
 The batch comes last; the two sides are `[..., 2, B]`, left first.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -78,15 +76,12 @@ def view(local: Tensor, limit: int) -> View:
 
 
 def encode_samples(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tensor:
-    """Return the paper's observation (4.1): distance and angle of each sample, scaled to [-1, 1].
+    """Return the paper's observation (4.1), [B, 20]: r1, theta1, ..., r10, theta10, left first, scaled to [-1, 1].
 
     Args:
         samples: boundary samples in the car's frame, [2, 5, 2, B] m.
         known: [2, B], 1 or 0; a side not estimated yet is encoded as zeros.
         sight: m, encoded as 1.
-
-    Returns:
-        [B, 20]: r1, theta1, ..., r10, theta10, left side first.
     """
     x, y = samples.transpose(1, 2).unbind(0)
     distance = torch.addcmul(x * x, y, y).sqrt_()

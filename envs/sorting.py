@@ -4,8 +4,6 @@
 applies a few dozen operations to all columns at once, which is faster for many columns.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 
@@ -25,10 +23,8 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     Args:
         values: [N, *batch], from 0 to 1e12.
         masked: [N, *batch], 1 for entries to skip, else 0.
-        k: number of rows to return, at most N.
-
-    Returns:
-        Rows, [k, *batch], int32 (int64 for float64). Masked entries fill up columns with fewer than k, in any order.
+        k: number of rows to return, at most N: [k, *batch], int32 (int64 for float64). Masked entries fill up columns
+            with fewer, in any order.
     """
     rows_padded = 1 << max(1, (len(values) - 1).bit_length())
     integer = _BITS[values.dtype]

@@ -11,8 +11,6 @@ Sums are taken in slot order and no branch depends on data, so a row's result de
 last bit. Masks are numbers 0 and 1, which are much faster than booleans in PyTorch's CPU kernels.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import reduce
@@ -160,11 +158,7 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
 class SelfEvolvingSpline(nn.Module):
     """A smoothing spline that is refitted whenever points are added (definition A.2); all state is in buffers.
 
-    Args:
-        capacity: number of points kept per row, at least 2; the oldest are dropped.
-        batch_size: number of rows B.
-        smoothing: see `smoothing_spline`, m^3.
-        dtype: floating type of the state.
+    Of each of the `batch_size` rows the last `capacity` points are kept, at least 2; `smoothing` is in m^3.
 
     Example:
         >>> path = SelfEvolvingSpline(capacity=8, batch_size=1, smoothing=0.1)
@@ -258,25 +252,19 @@ def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Ten
 
     The main diagonal is [K-2, *batch], the off-diagonals `near` and `far` one and two shorter, the right-hand side
     `turns` [D, K-2, *batch]. Unknowns that are not `real` are 0. Pivots fall below `least` only by rounding errors of
-    nearly coincident points: those of R alone are at least (h + h') / 4, and Q'Q adds to them.
-
-    Returns:
-        [D, K, *batch], zeros in the first and the last slot.
+    nearly coincident points: those of R alone are at least (h + h') / 4, and Q'Q adds to them. The result is
+    [D, K, *batch], zeros in the first and the last slot.
     """
     nears, fars = list(near.unbind(0)), far.unbind(0)
     lower, lowest, right, inverse = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()
     rows = zip(diagonal.unbind(0), turns.unbind(1), real.unbind(0), least.unbind(0), strict=True)
     for i, (pivot, turn, is_real, floor) in enumerate(rows):
         if i > 0:
-            pivot, turn = (
-                _minus_product(pivot, nears[i - 1], lower[i - 1]),
-                _minus_product(turn, lower[i - 1], right[i - 1]),
-            )
+            pivot = _minus_product(pivot, nears[i - 1], lower[i - 1])
+            turn = _minus_product(turn, lower[i - 1], right[i - 1])
         if i > 1:
-            pivot, turn = (
-                _minus_product(pivot, fars[i - 2], lowest[i - 2]),
-                _minus_product(turn, lowest[i - 2], right[i - 2]),
-            )
+            pivot = _minus_product(pivot, fars[i - 2], lowest[i - 2])
+            turn = _minus_product(turn, lowest[i - 2], right[i - 2])
         # An inverse of 0 removes the unknown from its own row and, through L, from all others.
         inverse.append(is_real / torch.maximum(pivot, floor))
         right.append(turn)
@@ -299,5 +287,4 @@ def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Ten
 
 
 def _minus_product(x: Tensor, a: Tensor, b: Tensor) -> Tensor:
-    """Return x - a b."""
     return torch.addcmul(x, a, b, value=-1)

@@ -1,7 +1,5 @@
 """Cone tracks: two closed rings of cones and the boundary curves through them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -74,17 +72,15 @@ class Track:
         object.__setattr__(self, "start", pose)
         for name, point in (("start", np.array(pose[:2])), ("finish", self.finish)):
             if _encloses(rings["left"], point) == _encloses(rings["right"], point):
-                fault = (
-                    f"The {name} of track {self.name!r} at {np.round(point, 2).tolist()} is not between its two sides"
-                )
+                place = np.round(point, 2).tolist()
+                fault = f"The {name} of track {self.name!r} at {place} is not between its two sides"
                 remedy = "give a start on the track, y pointing up, and list both sides from the same place on"
                 raise TrackError(f"{fault}; {remedy}.")
 
     @property
     def finish(self) -> Array:
         """Return the midpoint of the first left and the first right cone: [2], m."""
-        midpoint: Array = (self.left[0] + self.right[0]) / 2
-        return midpoint
+        return (self.left[0] + self.right[0]) / 2
 
     @property
     def length(self) -> float:
@@ -92,17 +88,14 @@ class Track:
         return float(np.mean([np.linalg.norm(_edges(self.boundary(side)), axis=1).sum() for side in SIDES]))
 
     def boundary(self, side: Side, spacing: float = 0.05) -> Array:
-        """Sample a boundary, the closed cubic spline through a side's cones by chord length.
+        """Sample a boundary, the closed cubic spline through a side's cones by chord length: [P, 2], m.
 
-        Returns:
-            [P, 2], m, at most `spacing` m apart along the chords, from the first cone on in driving order; the first
-            point is not repeated at the end.
+        Points are at most `spacing` m apart along the chords, from the first cone on, which is not repeated at the end.
         """
         cones: Array = getattr(self, side)
         chord = np.concatenate([[0.0], np.linalg.norm(_edges(cones), axis=1).cumsum()])
         curve = CubicSpline(chord, np.vstack([cones, cones[:1]]), bc_type="periodic")
-        points: Array = curve(np.linspace(0, chord[-1], int(np.ceil(chord[-1] / spacing)), endpoint=False))
-        return points
+        return curve(np.linspace(0, chord[-1], int(np.ceil(chord[-1] / spacing)), endpoint=False))
 
     def middle(self, spacing: float = 0.05) -> Array:
         """Return the midpoints of left boundary points and their nearest right boundary points: [P, 2], m."""
@@ -120,7 +113,9 @@ class Track:
             fault = "two sides cross each other" if len(sides) == 2 else f"{sides.pop()} side crosses itself"
             remedy = "list each side's cones in driving order and keep the two sides apart"
             raise TrackError(f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; {remedy}.")
-        anticlockwise = [_area(rings[side]) > 0 for side in SIDES]
+        # By the sign of the enclosed areas.
+        lines = [rings[side] @ AS_COMPLEX for side in SIDES]
+        anticlockwise = [(line.conj() * np.roll(line, -1)).imag.sum() > 0 for line in lines]
         # The left ring is the inner one of a track driven anticlockwise.
         inner, outer = SIDES if anticlockwise[0] else SIDES[::-1]
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
@@ -131,8 +126,7 @@ class Track:
 def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:
     """Choose places where an episode may begin: place i is on track i mod len(tracks), in the middle of its width.
 
-    The places of a track are spread along the lap, also if only the first ones are used. `count=None` gives the starts
-    of the tracks.
+    The places of a track are spread along the lap, also if only the first ones are used; None gives the tracks' starts.
 
     Returns:
         Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish in m, [P], NaN for
@@ -185,14 +179,7 @@ def _check_cones(side: str, cones: Array) -> None:
 
 
 def _edges(ring: Array) -> Array:
-    edges: Array = np.roll(ring, -1, axis=0) - ring
-    return edges
-
-
-def _area(ring: Array) -> float:
-    """Return the area enclosed by a ring [P, 2], in m^2, positive if it runs anticlockwise."""
-    points = ring @ AS_COMPLEX
-    return float((points.conj() * np.roll(points, -1)).imag.sum() / 2)
+    return np.roll(ring, -1, axis=0) - ring
 
 
 def _encloses(ring: Array, point: Array) -> bool:

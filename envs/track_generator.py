@@ -6,8 +6,6 @@ smoothed. Draws that are too tight or too close to themselves are rejected. Poin
 module, lengths are in m and curvatures in 1/m.
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np
@@ -36,12 +34,7 @@ MAX_TRACKS = 10_000  # takes minutes
 
 
 def random_track(seed: int, name: str | None = None) -> Track:
-    """Return the track of a seed; its name is "random_SEED" by default.
-
-    Raises:
-        ValueError: for a seed that is not an integer of at least 0.
-        TrackError: if no draw makes a track within the limit of tries.
-    """
+    """Return the track of a seed, an integer of at least 0; its name is "random_SEED" by default."""
     return _draw(seed, 0, name or f"random_{seed}")
 
 

@@ -4,8 +4,6 @@ All static geometry is computed once: for each square metre and each of 12 headi
 visible, and on a fine grid the distance to each boundary. A step of thousands of cars then reads a few numbers per car.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
@@ -82,23 +80,17 @@ class TrackMap(nn.Module):
         A block holds the candidates of one cell in all sectors; cells without candidates share block 0. The count is
         that of the side with more candidates.
         """
-        missing = self.slots - 1
-        padding = np.array([[missing], [self.slots + missing]])
-        candidates, blocks, nears = [padding * np.ones((SECTORS, 1, 1), dtype=np.int64)], [], []
-        filled = 1
-        for track in tracks:
-            (used, visible, near), left = nearby_cones(track, dtype), len(track.left)
-            blocks.append(np.where(used, filled + np.cumsum(used) - 1, 0))
-            filled += int(used.sum())
-            slots = np.where(visible < 0, missing, visible) + np.array([[0], [self.slots]])
-            candidates.append(slots.reshape(-1, 2, slots.shape[-1]))
-            nears.append(np.where(near < 0, missing, np.where(near < left, near, near - left + self.slots)))
-        candidate = _stack(candidates, padding)
-        self.most = candidate.shape[-1]
-        self.candidate: Tensor = _buffer(candidate.swapaxes(-1, -2).reshape(-1, 2 * self.most), torch.int16)
-        self.candidate_count: Tensor = _buffer((candidate != padding).sum(-1).max(-1).reshape(-1), torch.int16)
-        self.block: Tensor = _buffer(np.concatenate(blocks), torch.int64)
-        self.near: Tensor = _buffer(_stack(nears, np.array([missing])), torch.int32)
+        used, visible, near = zip(*(nearby_cones(track, dtype) for track in tracks), strict=True)
+        filled = np.concatenate(used)
+        self.block: Tensor = _buffer(np.where(filled, filled.cumsum(), 0), torch.int64)
+        candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
+        self.candidate_count: Tensor = _buffer((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16)
+        self.most, missing = candidate.shape[-1], self.slots - 1
+        slot = np.where(candidate < 0, missing, candidate) + np.array([[0], [self.slots]])
+        self.candidate: Tensor = _buffer(slot.swapaxes(-1, -2).reshape(-1, 2 * self.most), torch.int16)
+        lefts = [len(track.left) for track in tracks]
+        decisive = _stack([np.where(n < k, n, n - k + self.slots) for n, k in zip(near, lefts, strict=True)])
+        self.near: Tensor = _buffer(np.where(decisive < 0, missing, decisive), torch.int32)
 
     def locate(self, track: Tensor, position: Tensor) -> Location:
         """Locate positions [2, B] m on tracks [B]; positions off the map are moved to its edge."""
@@ -228,10 +220,8 @@ def _batch_last(rows: Tensor) -> Tensor:
     return rows.t().to(torch.int32, memory_format=torch.contiguous_format)
 
 
-def _stack(tables: list[NDArray[np.int64]], padding: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Concatenate tables [rows, ..., N], the narrower ones filled up with padding [..., 1]."""
+def _stack(tables: Sequence[NDArray[np.integer]]) -> NDArray[np.integer]:
+    """Concatenate tables [rows, ..., N], the narrower ones filled up with -1."""
     most = max(table.shape[-1] for table in tables)
-    wide = [padding * np.ones((*table.shape[:-1], most), dtype=np.int64) for table in tables]
-    for filled, table in zip(wide, tables, strict=True):
-        filled[..., : table.shape[-1]] = table
-    return np.concatenate(wide)
+    ends = [[*[(0, 0)] * (table.ndim - 1), (0, most - table.shape[-1])] for table in tables]
+    return np.concatenate([np.pad(t, end, constant_values=-1) for t, end in zip(tables, ends, strict=True)])

@@ -6,6 +6,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags import rosbag2
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
+from coil_rl.envs import simulated_drive
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, ros_types, twist
 
@@ -40,6 +41,11 @@ def drive(path, scans=60, odometry=False, commands=False, seed=0):
             if commands:
                 writer.add("/cmd_vel", TWIST, time, twist(0.15, 0.15))
     return path
+
+
+def labelling_drives(seeds):
+    """Simulated drives past the left cones alone and past the right cones alone, a pair for each seed."""
+    return [simulated_drive(side, seed) for seed in seeds for side in ("left", "right")]
 
 
 def store(path, *messages, kind=SCAN, topic="/scan", **channel):

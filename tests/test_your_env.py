@@ -1,5 +1,6 @@
 """docs/your_env.md: its commands and Python blocks run, at toy size, and its other code is that of the package."""
 
+import math
 import re
 import shlex
 from pathlib import Path
@@ -9,7 +10,9 @@ from outside_package.install import PROXY, SOURCE, TINY, install
 from programs import ROOT, called
 
 PAGE = (ROOT / "docs" / "your_env.md").read_text()
-BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+ALL_BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+BLOCKS = [(language, block) for language, block in ALL_BLOCKS if "vmas" not in block]
+(SEVERAL_AGENTS,) = (block for _, block in ALL_BLOCKS if "vmas" in block)
 PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
 EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
 COMMANDS = [
@@ -53,6 +56,16 @@ def test_python_runs_as_printed(program, folder):
     exec(compile(program, "your_env.md", "exec"), found)
     if "result" in found:
         assert [episode["steps"] for episode in found["result"].episodes] == [96] * 4
+
+
+def test_several_agents_learn_as_printed():
+    pytest.importorskip("vmas", reason="vmas is not installed")
+    found: dict = {}
+    exec(compile(SEVERAL_AGENTS, "your_env.md", "exec"), found)
+    assert math.isfinite(found["metrics"]["loss_critic"])
+    assert len(found["result"].episodes) == 64
+    assert max(episode["steps"] for episode in found["result"].episodes) <= 100
+    assert math.isfinite(found["result"].mean_reward)
 
 
 @pytest.mark.slow

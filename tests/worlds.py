@@ -1,5 +1,6 @@
 """Small envs with a guide, and the measures of the cone world."""
 
+import io
 from functools import cache
 
 import torch
@@ -47,6 +48,40 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
+
+
+def drive(env, steps, carrier=None, seed=0):
+    """Return the entries after each step, under actions that a seed determines, and the carrier."""
+    carrier = env.reset() if carrier is None else carrier
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        actions = [env.rand_action()["action"] for _ in range(steps)]
+    after = []
+    for action in actions:
+        step, carrier = env.step_and_maybe_reset(carrier.set("action", action))
+        after.append(step["next"])
+    return after, carrier
+
+
+def same(one, other):
+    """Return whether two lists of entries are equal."""
+    return all((a == b).all() for a, b in zip(one, other, strict=True))
+
+
+def reloaded(state):
+    """Return a state as a checkpoint gives it back."""
+    file = io.BytesIO()
+    torch.save(state, file)
+    file.seek(0)
+    return torch.load(file, weights_only=True)
+
+
+def continued(make):
+    """Return the second batch of a rollout, and that of one with another seed that was restored after the first."""
+    first, second = make(3), make(4)
+    first.collect()
+    second.load_state_dict(reloaded(first.state_dict()))
+    return first.collect(), second.collect()
 
 
 class Script(EnvBase):

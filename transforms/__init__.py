@@ -1,40 +1,24 @@
 """TorchRL transforms for guides in any env: advice, combined actions, reward coupling, degraded advice."""
 
-from coil_rl.transforms.combined_actions import JumpStart, MixedAction, ResidualAction, Takeover
-from coil_rl.transforms.degraded_advice import (
-    BiasedAdvice,
-    DegradedAdvice,
-    DelayedAdvice,
-    NoisyAdvice,
-    PartialAdvice,
-    RandomAdvice,
-    RemovedAdvice,
-    ScaledAdvice,
-    ShuffledAdvice,
-)
-from coil_rl.transforms.discrete_actions import DiscreteActions
-from coil_rl.transforms.guide_actions import GuideActions, Guides
-from coil_rl.transforms.guide_transform import GuideTransform, set_progress
-from coil_rl.transforms.reward_coupling import RewardCoupling
-
-__all__ = [
-    "BiasedAdvice",
-    "DegradedAdvice",
-    "DelayedAdvice",
-    "DiscreteActions",
-    "GuideActions",
-    "GuideTransform",
-    "Guides",
-    "JumpStart",
-    "MixedAction",
-    "NoisyAdvice",
-    "PartialAdvice",
-    "RandomAdvice",
-    "RemovedAdvice",
-    "ResidualAction",
-    "RewardCoupling",
-    "ScaledAdvice",
-    "ShuffledAdvice",
-    "Takeover",
-    "set_progress",
-]
+from coil_rl.transforms.advice_dropout import AdviceDropout as AdviceDropout
+from coil_rl.transforms.combined_actions import AdaptiveMixedAction as AdaptiveMixedAction
+from coil_rl.transforms.combined_actions import GradualResidual as GradualResidual
+from coil_rl.transforms.combined_actions import JumpStart as JumpStart
+from coil_rl.transforms.combined_actions import MixedAction as MixedAction
+from coil_rl.transforms.combined_actions import ResidualAction as ResidualAction
+from coil_rl.transforms.combined_actions import Takeover as Takeover
+from coil_rl.transforms.degraded_advice import BiasedAdvice as BiasedAdvice
+from coil_rl.transforms.degraded_advice import DegradedAdvice as DegradedAdvice
+from coil_rl.transforms.degraded_advice import DelayedAdvice as DelayedAdvice
+from coil_rl.transforms.degraded_advice import NoisyAdvice as NoisyAdvice
+from coil_rl.transforms.degraded_advice import PartialAdvice as PartialAdvice
+from coil_rl.transforms.degraded_advice import RandomAdvice as RandomAdvice
+from coil_rl.transforms.degraded_advice import RemovedAdvice as RemovedAdvice
+from coil_rl.transforms.degraded_advice import ScaledAdvice as ScaledAdvice
+from coil_rl.transforms.degraded_advice import ShuffledAdvice as ShuffledAdvice
+from coil_rl.transforms.discrete_actions import DiscreteActions as DiscreteActions
+from coil_rl.transforms.guide_actions import GuideActions as GuideActions
+from coil_rl.transforms.guide_actions import Guides as Guides
+from coil_rl.transforms.guide_transform import GuideTransform as GuideTransform
+from coil_rl.transforms.guide_transform import set_progress as set_progress
+from coil_rl.transforms.reward_coupling import RewardCoupling as RewardCoupling

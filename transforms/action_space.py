@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 import torch
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
@@ -15,8 +15,8 @@ Key = TypeVar("Key", NestedKey, NestedKey | None)
 
 
 def nested_key(key: Key) -> Key:
-    """Return a key as TensorDict takes it; YAML has lists for tuples."""
-    return tuple(key) if isinstance(key, list) else key
+    """Return the key of an entry as TensorDict takes it; YAML has lists for tuples."""
+    return key if key is None or isinstance(key, str) else unravel_key(tuple(key))
 
 
 class ActionSpace:

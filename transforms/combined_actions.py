@@ -1,11 +1,11 @@
 """Env actions combined from the actions of agent and guide.
 
-The data keep the agent's own action, so its log-probability stays valid. `ResidualAction` and `MixedAction` add the two
-actions. `Takeover` and `JumpStart` replace the agent's action in some steps and write `agent_acts` [*batch, 1] with the
-observation; learners leave the steps of the guide out of the policy loss.
+`action` remains the agent's own action, so its log-probability stays valid. The action that the env was given is
+`("next", "executed_action")` [*batch, *A], in the unit of the env's action. `ResidualAction`, `MixedAction` and
+`AdaptiveMixedAction` add the two actions. `Takeover`, `JumpStart` and `GradualResidual` let the guide act alone in some
+steps and write `agent_acts` [*batch, 1] with the observation; on-policy learners leave these steps out of the policy
+loss, learners with replay learn from the executed action where the agent could have chosen it.
 """
-
-from __future__ import annotations
 
 from typing import Any
 
@@ -13,32 +13,53 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.data import Binary, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
 
+EXECUTED = "executed_action"
 
-class _ActionSum(GuideTransform):
-    """Base class: sum of agent and guide action, clamped to the bounds of the action."""
+
+class CombinedAction(GuideTransform):
+    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset."""
+
+    written: tuple[str, ...] = (EXECUTED,)
+    adds = False  # whether the guide's action is added to the agent's, not put in its place
+    taken: Tensor  # number of steps in training, over all rows
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.register_buffer("taken", torch.zeros((), dtype=torch.int64))
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        executed = self._executed(tensordict)
+        # The transform next to the env is the last one here, so its action remains.
+        return tensordict.set(self.action_key, executed).set(EXECUTED, executed)
+
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        raise NotImplementedError
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        self.taken = self.taken + self.training * tensordict.numel()
+        return next_tensordict.set(EXECUTED, tensordict[EXECUTED])
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return tensordict_reset.set(EXECUTED, self.action_space.spec.zero())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Check that there is advice and that actions are continuous; raises a `ValueError` for discrete actions."""
-        if not self.action_space.continuous:
+        """Add what it writes; raises a `ValueError` if discrete actions would have to be added."""
+        if self.adds and not self.action_space.continuous:
             raise ValueError(
                 f"{type(self).__name__} needs continuous actions, but this env has {self.action_space.size} discrete "
                 "ones; use Takeover, which replaces the agent's action in some steps"
             )
-        return super().transform_observation_spec(observation_spec)
-
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
-        combined = self._combine(tensordict[self.action_key], self.advice(tensordict))
-        return tensordict.set(self.action_key, self.action_space.clamp(combined))
-
-    def _combine(self, action: Tensor, advice: Tensor) -> Tensor:
-        raise NotImplementedError
+        observation_spec = super().transform_observation_spec(observation_spec)
+        spec = self.action_space.spec  # not its own spec, as 0 need not be an action
+        observation_spec[EXECUTED] = Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)
+        return observation_spec
 
 
-class ResidualAction(_ActionSum):
+class ResidualAction(CombinedAction):
     """Residual policy: the env action is g + scale * a, clamped (Johannink et al. 2019).
 
     Args:
@@ -47,17 +68,19 @@ class ResidualAction(_ActionSum):
     """
 
     mdp_parameter = "scale"
+    adds = True
 
     def __init__(self, scale: float | Schedule = 1.0, **options: Any) -> None:
         super().__init__(**options)
         self.scale = scale
 
-    def _combine(self, action: Tensor, advice: Tensor) -> Tensor:
-        return advice + self.current(self.scale) * action
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        residual = self.current(self.scale) * tensordict[self.action_key]
+        return self.action_space.clamp(self.advice(tensordict) + residual)
 
 
-class MixedAction(_ActionSum):
-    """Weighted mean: the env action is weight * a + (1 - weight) * g.
+class MixedAction(CombinedAction):
+    """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
     Args:
         weight: weight of the agent, a number or a schedule over the run. With 1 the agent acts alone.
@@ -65,20 +88,88 @@ class MixedAction(_ActionSum):
     """
 
     mdp_parameter = "weight"
+    adds = True
 
     def __init__(self, weight: float | Schedule, **options: Any) -> None:
         super().__init__(**options)
         self.weight = weight
 
-    def _combine(self, action: Tensor, advice: Tensor) -> Tensor:
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
         weight = self.current(self.weight)
-        return weight * action + (1 - weight) * advice
+        return self.action_space.clamp(weight * tensordict[self.action_key] + (1 - weight) * self.advice(tensordict))
 
 
-class _ActionSwitch(GuideTransform):
+class AdaptiveMixedAction(CombinedAction):
+    """Weighted mean in which the agent weighs more the surer its critics are: CHEQ (Cramer et al. 2024).
+
+    The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low` in the first step of
+    an episode, then a linear function of `("next", "uncertainty")` [*batch, 1], which the policy wrote in the step
+    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none.
+
+    Args:
+        low: smallest weight of the agent.
+        high: largest weight of the agent.
+        certain: uncertainty up to which the weight is `high`.
+        uncertain: uncertainty from which on the weight is `low`.
+        warm_up: number of steps at the start of the run, over all rows, in which the weight is drawn from `low` to
+            `warm_up_high` instead.
+        warm_up_high: see `warm_up`.
+        seed: of the draws.
+        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+
+    Raises:
+        ValueError: if the weights are not in order within [0, 1], or the uncertainties not in order.
+    """
+
+    written = (EXECUTED, "agent_weight")
+    adds = True
+
+    def __init__(
+        self, low: float = 0.2, high: float = 1.0, certain: float = 0.03, uncertain: float = 0.15,
+        warm_up: int = 10_000, warm_up_high: float = 0.3, seed: int = 0, **options: Any,
+    ) -> None:  # fmt: skip
+        super().__init__(**options)
+        if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
+            raise ValueError(
+                f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, from 0 to 1, and "
+                f"certain={certain} at least 0 and less than uncertain={uncertain}"
+            )
+        self.low, self.high, self.certain, self.uncertain = low, high, certain, uncertain
+        self.warm_up, self.warm_up_high, self.rng = warm_up, warm_up_high, SeededGenerator(seed)
+
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        advice, weight = self.advice(tensordict), tensordict["agent_weight"].squeeze(-1)
+        weight = expand_as_right(weight, advice)
+        return self.action_space.clamp(weight * tensordict[self.action_key] + (1 - weight) * advice)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        doubt = next_tensordict.pop("uncertainty", None)
+        weight = torch.full_like(tensordict["agent_weight"], self.low)
+        if doubt is not None:
+            share = ((doubt - self.certain) / (self.uncertain - self.certain)).clamp(0, 1).to(weight.dtype)
+            weight = self.high - (self.high - self.low) * share
+        if self.learns:
+            draw = torch.rand(weight.shape, generator=self.rng.generator).to(weight)
+            drawn = self.low + (self.warm_up_high - self.low) * draw
+            weight = torch.where((self.taken < self.warm_up).to(weight.device), drawn, weight)
+        return super()._step(tensordict, next_tensordict).set("agent_weight", weight)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        weight = self.advice(tensordict_reset).new_full((*tensordict_reset.batch_size, 1), self.low)
+        return super()._reset(tensordict, tensordict_reset).set("agent_weight", weight)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add `executed_action` and `agent_weight`."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        shape, dtype = (*self.parent.batch_size, 1), self.action_space.dtype
+        observation_spec["agent_weight"] = Bounded(self.low, self.high, shape, device=self.parent.device, dtype=dtype)
+        return observation_spec
+
+
+class _ActionSwitch(CombinedAction):
     """Base class: the env gets the guide's action where `agent_acts` is false."""
 
-    written: tuple[str, ...] = ("agent_acts",)
+    written: tuple[str, ...] = (EXECUTED, "agent_acts")
 
     def __init__(self, seed: int = 0, **options: Any) -> None:
         super().__init__(**options)
@@ -89,16 +180,32 @@ class _ActionSwitch(GuideTransform):
         shape = (*self.parent.batch_size, 1)
         return torch.rand(shape, generator=self.rng.generator).to(self.parent.device)
 
-    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+    def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the env's action where the agent acts."""
+        action: Tensor = tensordict[self.action_key]
+        return action
+
+    def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        action = self._of_agent(tensordict)
         if not self.learns:
-            return tensordict
-        action, advice = tensordict[self.action_key], self.action_space.actions(self.advice(tensordict))
+            return action
+        advice = self.action_space.actions(self.advice(tensordict))
         # `agent_acts` has one more dimension than a discrete action.
         agent = tensordict["agent_acts"].reshape(tensordict.batch_size)
-        return tensordict.set(self.action_key, torch.where(expand_as_right(agent, action), action, advice))
+        return torch.where(expand_as_right(agent, action), action, advice)
+
+    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
+        """Return whether the agent acts in a state, [*batch, 1]."""
+        raise NotImplementedError
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return super()._step(tensordict, next_tensordict).set("agent_acts", self._agent_acts(next_tensordict))
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        return super()._reset(tensordict, tensordict_reset).set("agent_acts", self._agent_acts(tensordict_reset))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `agent_acts`."""
+        """Add `executed_action` and `agent_acts`."""
         observation_spec = super().transform_observation_spec(observation_spec)
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         observation_spec["agent_acts"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
@@ -112,20 +219,44 @@ class Takeover(_ActionSwitch):
 
     Args:
         probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
+        frames: number of steps at the start of the run, over all rows, after which the agent always acts, as in RLPD
+            and WSRL; None: no limit.
         options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
-    def __init__(self, probability: float | Schedule = 1.0, **options: Any) -> None:
+    def __init__(self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any) -> None:
         super().__init__(**options)
-        self.probability = probability
+        self.probability, self.frames = probability, frames
 
-    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
         draw = self._draw()
-        agent = draw >= self.current(self.probability) if self.learns else torch.ones_like(draw, dtype=torch.bool)
-        return next_tensordict.set("agent_acts", agent)
+        if not self.learns:
+            return torch.ones_like(draw, dtype=torch.bool)
+        agent = draw >= self.current(self.probability)
+        return agent if self.frames is None else agent | (self.taken >= self.frames).to(agent.device)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return self._call(tensordict_reset)
+
+class GradualResidual(Takeover):
+    """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
+
+    The env action is g with a probability that decreases over the run, else g + scale * a, clamped; in evaluation
+    always the latter.
+
+    Args:
+        scale: factor of the agent's action, a number or a schedule over the run.
+        options: `probability` of g alone and other arguments as for `Takeover`.
+    """
+
+    mdp_parameter = "scale"
+    adds = True
+
+    def __init__(self, scale: float | Schedule = 0.2, **options: Any) -> None:
+        super().__init__(**options)
+        self.scale = scale
+
+    def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
+        residual = self.current(self.scale) * super()._of_agent(tensordict)
+        return self.action_space.clamp(self.advice(tensordict) + residual)
 
 
 class JumpStart(_ActionSwitch):
@@ -139,27 +270,29 @@ class JumpStart(_ActionSwitch):
         options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
-    written = ("agent_acts", "guide_steps")
+    written = (EXECUTED, "agent_acts", "guide_steps")
 
     def __init__(self, horizon: float | Schedule, random: bool = False, **options: Any) -> None:
         super().__init__(**options)
         self.horizon, self.random = horizon, random
+
+    def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
+        agent: Tensor = tensordict["guide_steps"] == 0
+        return agent
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         draw = self._draw()
         horizon = max(self.current(self.horizon), 0.0) if self.learns else 0.0
         # Rounded down, so that 0, 1 ... horizon are equally likely.
         steps = (draw * (horizon + 1)).long() if self.random else torch.full_like(draw, horizon).long()
-        return self._write(tensordict_reset, steps)
+        return super()._reset(tensordict, tensordict_reset.set("guide_steps", steps))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict, (tensordict["guide_steps"] - 1).clamp(0))
-
-    def _write(self, tensordict: TensorDictBase, steps: Tensor) -> TensorDictBase:
-        return tensordict.set("guide_steps", steps).set("agent_acts", steps == 0)
+        next_tensordict.set("guide_steps", (tensordict["guide_steps"] - 1).clamp(0))
+        return super()._step(tensordict, next_tensordict)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `agent_acts` and `guide_steps`."""
+        """Add `executed_action`, `agent_acts` and `guide_steps`."""
         shape, device = (*self.parent.batch_size, 1), self.parent.device
         observation_spec["guide_steps"] = Unbounded(shape, device=device, dtype=torch.int64)
         return super().transform_observation_spec(observation_spec)

@@ -4,8 +4,6 @@ Each transform follows `GuideActions` and changes its entry in place, within the
 Biased, scaled, partial, delayed and noisy advice degrade a guide. Random, shuffled and removed advice are placebos.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Discrete actions for an env with one bounded continuous action."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -17,6 +17,14 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 
 
+class UnfitActionError(ValueError):
+    """The action of a guide does not fit the env; `problem` says why."""
+
+    def __init__(self, guide: str, problem: str) -> None:
+        super().__init__(f"the action of guide {guide!r} {problem}")
+        self.problem = problem
+
+
 class Guides(TensorDictModuleBase):
     """Several guides as one module that writes their actions side by side.
 
@@ -317,7 +325,7 @@ class GuideActions(Transform):
                 self._checked.add(name)
             return self.action_space.advice(action, batch)
         except ValueError as error:
-            raise ValueError(f"the action of guide {name!r} {error}") from None
+            raise UnfitActionError(name, str(error)) from None
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the advice and the memory.

@@ -1,7 +1,5 @@
 """Memory of guides by TorchRL's convention, carried from step to step by the env's data."""
 
-from __future__ import annotations
-
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -43,7 +41,7 @@ class GuideMemory:
             )
 
     def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
-        """Return the spec of the memory."""
+        """Return the spec of the memory of all rows of an env, given their batch size and device."""
         spec = Composite(shape=batch, device=device)
         for key, row in self.specs.items():
             spec[key] = row.to(device).expand(*batch, *row.shape) if device else row.expand(*batch, *row.shape)

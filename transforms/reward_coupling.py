@@ -1,7 +1,5 @@
 """Reward coupling (RFC): a penalty on the distance between the actions of agent and guide (paper equation 93)."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any, Literal
 

@@ -1,19 +1,12 @@
 """Guides: controllers that advise an agent. Each is a TensorDictModule that writes an action."""
 
-from coil_rl.guides.controllers import ControllerGuide, EntryGuide, PerRow, RecordedGuide
-from coil_rl.guides.racing_line import RacingLineGuide
-from coil_rl.guides.simple import ConstantGuide, FollowAdvice, RandomGuide, ZeroGuide
-from coil_rl.guides.spline import SplineGuide
-
-__all__ = [
-    "ConstantGuide",
-    "ControllerGuide",
-    "EntryGuide",
-    "FollowAdvice",
-    "PerRow",
-    "RacingLineGuide",
-    "RandomGuide",
-    "RecordedGuide",
-    "SplineGuide",
-    "ZeroGuide",
-]
+from coil_rl.guides.controllers import ControllerGuide as ControllerGuide
+from coil_rl.guides.controllers import EntryGuide as EntryGuide
+from coil_rl.guides.controllers import PerRow as PerRow
+from coil_rl.guides.controllers import RecordedGuide as RecordedGuide
+from coil_rl.guides.racing_line import RacingLineGuide as RacingLineGuide
+from coil_rl.guides.simple import ConstantGuide as ConstantGuide
+from coil_rl.guides.simple import FollowAdvice as FollowAdvice
+from coil_rl.guides.simple import RandomGuide as RandomGuide
+from coil_rl.guides.simple import ZeroGuide as ZeroGuide
+from coil_rl.guides.spline import SplineGuide as SplineGuide

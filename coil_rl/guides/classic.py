@@ -1,7 +1,5 @@
 """Public controllers of well-known envs of Gymnasium, to compare with."""
 
-from __future__ import annotations
-
 import importlib
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
@@ -17,7 +15,6 @@ from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.envs.limits import check_choice
-from coil_rl.guides.controllers import PerRow
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
@@ -62,7 +59,7 @@ def linear_feedback(observation: Tensor, weights: Sequence[float] = (0.1, 0.3, 1
 
 
 class ClassicGuide(TensorDictModule):
-    """A function of this file as a guide.
+    """Guide that acts by one of the functions above.
 
     Args:
         controller: lander, energy_pump, swing_up or linear_feedback.
@@ -90,6 +87,7 @@ class Oscillator(TensorDictModuleBase):
         kd: torque per rad/s.
     """
 
+    in_keys, out_keys = ["observation", "swum_steps"], ["action", ("next", "swum_steps")]
     time_step = 0.04  # s, of the env
 
     def __init__(
@@ -100,7 +98,6 @@ class Oscillator(TensorDictModuleBase):
         kp: float = 10.0,
         kd: float = 0.5,
     ) -> None:
-        self.in_keys, self.out_keys = ["observation", "swum_steps"], ["action", ("next", "swum_steps")]
         super().__init__()
         self.frequency, self.phases, self.amplitude, self.kp, self.kd = frequency, list(phases), amplitude, kp, kd
 
@@ -118,7 +115,7 @@ class Oscillator(TensorDictModuleBase):
 
 
 class Walker:
-    """`BipedalWalkerHeuristics` of Gymnasium for BipedalWalker-v3, a state machine."""
+    """`BipedalWalkerHeuristics` of Gymnasium for BipedalWalker-v3, a state machine; `PerRow` makes it a guide."""
 
     memory = ("state", "moving_leg", "supporting_leg", "supporting_knee_angle")
 
@@ -146,13 +143,6 @@ class Walker:
             setattr(self.machine, name, value if name == "supporting_knee_angle" else int(value))
 
 
-class WalkerGuide(PerRow):
-    """A `Walker` for each row."""
-
-    def __init__(self) -> None:
-        super().__init__(Walker)
-
-
 class LastAction(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Wrapper of a BabyAI env that remembers its `last_action` for `Bot`, and makes levels without printing."""
 
@@ -169,10 +159,10 @@ class LastAction(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Bot:
-    """`BabyAIBot` of MiniGrid beside its env, which needs the wrapper `LastAction`; it knows the whole level.
+    """Controller that solves BabyAI levels by the planner of MiniGrid, `BabyAIBot`; it knows the whole level.
 
-    It plans again after actions of others. When one opens a box it can no longer help, and in a few levels of Unlock it
-    plans without end: from then on it advises `done`.
+    Its env needs the wrapper `LastAction`. It plans again after actions of others. When one opens a box it can no
+    longer help, and in a few levels of Unlock it plans without end: from then on it advises `done`.
     """
 
     searches = 100  # in one step; usually there are at most 5

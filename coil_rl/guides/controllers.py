@@ -1,7 +1,5 @@
 """Controllers of other people as guides: Python objects, functions, networks, entries of the env, recordings."""
 
-from __future__ import annotations
-
 import importlib
 import inspect
 import io
@@ -14,9 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
@@ -59,9 +56,7 @@ class PerRow(TensorDictModuleBase):
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
         super().__init__()
         self.make, self.objects = make, dict[int, Any]()
-        self.continues = (
-            True  # whether the last restored state holds those of the objects; else new episodes must begin
-        )
+        self.continues = True  # whether the last restored state held those of the objects; else new episodes begin
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -84,21 +79,20 @@ class PerRow(TensorDictModuleBase):
 
     def get_extra_state(self) -> dict[int, Any] | None:
         """Return the states by row, None if an object has none; raises a `ValueError` for one that cannot be saved."""
-        things = self.objects.values()
-        if not all(hasattr(thing, "state_dict") and hasattr(thing, "load_state_dict") for thing in things):
+        names = ("state_dict", "load_state_dict")
+        if not all(hasattr(thing, name) for thing in self.objects.values() for name in names):
             return None
         file = io.BytesIO()
         torch.save({row: thing.state_dict() for row, thing in self.objects.items()}, file)
         file.seek(0)
         try:
-            states: dict[int, Any] = torch.load(file, weights_only=True)
+            return dict(torch.load(file, weights_only=True))
         except pickle.UnpicklingError as error:
             name = type(next(iter(self.objects.values()))).__name__
             raise ValueError(
                 f"state_dict() of the controller {name} may hold numbers, texts, lists, dictionaries and tensors only; "
                 "convert NumPy arrays by tolist()"
             ) from error
-        return states
 
     def set_extra_state(self, state: Mapping[int, Any] | None) -> None:
         """Make objects with these states."""
@@ -162,8 +156,7 @@ class ControllerGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        result: TensorDictBase = self.guide(tensordict)
-        return result
+        return self.guide(tensordict)
 
 
 class EntryGuide(TensorDictModule):
@@ -185,8 +178,9 @@ class RecordedGuide(TensorDictModuleBase):
         ValueError: for a file that cannot be read, or without finite numbers.
     """
 
+    in_keys, out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
+
     def __init__(self, file: str | os.PathLike[str]) -> None:
-        self.in_keys, self.out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
         super().__init__()
         self.actions: torch.Tensor = nn.Buffer(_read_actions(file), persistent=False)
 
@@ -239,19 +233,14 @@ def _check_call(function: Callable[..., Any], title: str, entries: Sequence[Any]
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
     try:
         with open(file, encoding="utf-8") as text:
-            lines = [line.strip() for line in text if line.strip()]
-        lines = lines[not _numbers(lines[0]) :] if lines else []
-        actions = np.array([_numbers(line) or line.split(",") for line in lines], dtype=np.float32)
+            rows = [line.strip().split(",") for line in text if line.strip()]
+        try:
+            np.array(rows[:1], dtype=np.float32)
+        except ValueError:
+            del rows[0]
+        actions = np.array(rows, dtype=np.float32)
     except (OSError, ValueError) as error:
         raise ValueError(f"file={os.fspath(file)} cannot be read as numbers with commas ({error})") from error
     if not actions.size or not np.isfinite(actions).all():
         raise ValueError(f"file={os.fspath(file)} must hold at least one line of finite numbers")
     return torch.from_numpy(actions)
-
-
-def _numbers(line: str) -> list[float]:
-    """Return the numbers of a line, none if it holds anything else."""
-    try:
-        return [float(field) for field in line.split(",")]
-    except ValueError:
-        return []

@@ -1,7 +1,5 @@
 """The policy of a finished run as a guide."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,8 +8,7 @@ from typing import Literal
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_exploration_type
 
 from coil_rl.errors import UserError
 from coil_rl.train.build import build_bare_env, build_transforms
@@ -28,7 +25,7 @@ class LearnedGuide(TensorDictModuleBase):
     Args:
         run: folder of a run of `coil-train`.
         which: the last policy, or the best of the kept ones.
-        device: device of the networks.
+        device: of the networks.
 
     Raises:
         UserError: if the folder holds no finished run, or one that is its own guide.
@@ -65,7 +62,7 @@ class LearnedGuide(TensorDictModuleBase):
         self.eval()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write `action` as executed by the env, and what the policy remembers."""
+        """Write `action` as executed by the env, and the next state of a policy with a memory."""
         data = tensordict.select(*self.in_keys)
         if self.transforms is not None:
             data = self.transforms(data)

@@ -1,13 +1,9 @@
 """Racing line: pursuit of the farthest target with a clear path to it, which cuts corners."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
-from typing import Literal
+from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.limits import check_range
@@ -30,11 +26,10 @@ class RacingLineGuide(SplineGuide):
         spacing: distance between targets along the path, m.
         max_steering: steering angle of action 1, degrees, at most 90.
         car_length: m.
-        spline, smoothing, cones, midpoints, targets, in_keys, out_key: as for `SplineGuide`.
-
-    Raises:
-        ValueError: for a value out of range.
+        options: as for `SplineGuide`, but `gain` and `sharpness`.
     """
+
+    targets = 20
 
     def __init__(
         self,
@@ -42,20 +37,12 @@ class RacingLineGuide(SplineGuide):
         turn: float = 1.4,
         lookahead: float = 7.0,
         spacing: float = 0.5,
-        spline: Literal["cubic", "quadratic"] = "cubic",
-        smoothing: float = 1.0,
         max_steering: float = 80.0,
         car_length: float = 2.0,
-        cones: int = 8,
-        midpoints: int = 24,
-        targets: int = 20,
-        in_keys: Sequence[NestedKey] = ("cones", "cone_count", "steering"),
-        out_key: NestedKey = "action",
+        **options: Any,
     ) -> None:
-        super().__init__(
-            spline, smoothing, max_steering=max_steering, cones=cones, midpoints=midpoints, targets=targets,
-            in_keys=in_keys, out_key=out_key,
-        )  # fmt: skip
+        # Equation 103 is replaced: naming its options here rejects them in `options`.
+        super().__init__(gain=1.0, sharpness=1.8, max_steering=max_steering, **options)
         check_range(0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length)
         check_range(0, 90, above=True, max_steering=max_steering)
         if not 0 <= margin < car_length:  # the smallest turning radius

@@ -1,28 +1,16 @@
 """Constant and random guides as baselines, and a policy that follows the advice."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
 from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.transforms.guide_transform import SeededGenerator
-
-
-class _Constant(nn.Module):
-    def __init__(self, value: Tensor) -> None:
-        super().__init__()
-        self.value: Tensor = nn.Buffer(value)
-
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.value.expand(*observation.shape[:-1], -1)
 
 
 class _Uniform(SeededGenerator):
@@ -35,7 +23,7 @@ class _Uniform(SeededGenerator):
         return (self.low + (self.high - self.low) * draw).to(observation)
 
 
-class ConstantGuide(TensorDictModule):
+class ConstantGuide(TensorDictModuleBase):
     """Guide with a constant action.
 
     Args:
@@ -49,7 +37,14 @@ class ConstantGuide(TensorDictModule):
     def __init__(
         self, value: float | Sequence[float], in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:
-        super().__init__(_Constant(torch.atleast_1d(torch.as_tensor(value))), in_keys=[in_key], out_keys=[out_key])
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        super().__init__()
+        self.value: Tensor = nn.Buffer(torch.atleast_1d(torch.as_tensor(value)))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        batch = tensordict[self.in_keys[0]].shape[:-1]
+        return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
 
 
 class ZeroGuide(ConstantGuide):
@@ -61,14 +56,9 @@ class ZeroGuide(ConstantGuide):
 
 
 class RandomGuide(TensorDictModule):
-    """Guide with uniform random actions; the state of its generator is in `state_dict()`.
+    """Guide with uniform random actions [*batch, size] from `low` to `high`; keys as for `ConstantGuide`.
 
-    Args:
-        low: lower bound.
-        high: upper bound.
-        size: A, size of an action.
-        seed: seed of the generator.
-        in_key, out_key: as for `ConstantGuide`.
+    The state of its generator is in `state_dict()`.
     """
 
     def __init__(

@@ -1,16 +1,13 @@
 """Safety policy of the paper (appendix A.1): pursuit of a spline through the middle of the visible cones."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
@@ -50,14 +47,8 @@ class SplineGuide(TensorDictModuleBase):
         gain: factor of the advice of equation 103.
         sharpness: power of the distance in equation 103.
         max_steering: steering angle of action 1, degrees.
-        cones: number of nearest cones of each side used for pairs.
-        midpoints: maximum number of midpoints.
-        targets: maximum number of targets along the path.
         in_keys: entries of cones, cone count and steering.
         out_key: entry for the advice.
-
-    Raises:
-        ValueError: for a value out of range.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -68,6 +59,8 @@ class SplineGuide(TensorDictModuleBase):
 
     pure = True
     spacing = 1.0  # m between targets
+    cones = 8  # nearest ones of each side that make pairs
+    midpoints, targets = 24, 12  # at most
 
     def __init__(
         self,
@@ -76,23 +69,17 @@ class SplineGuide(TensorDictModuleBase):
         gain: float = 1.0,
         sharpness: float = 1.8,
         max_steering: float = 80.0,
-        cones: int = 8,
-        midpoints: int = 24,
-        targets: int = 12,
         in_keys: Sequence[NestedKey] = ("cones", "cone_count", "steering"),
         out_key: NestedKey = "action",
     ) -> None:
         self.in_keys, self.out_keys = list(in_keys), [out_key]
         super().__init__()
         check_choice(("cubic", "quadratic"), spline=spline)
-        check_range(1, cones=cones)
-        check_range(2, midpoints=midpoints, targets=targets)
         check_range(0, smoothing=smoothing, sharpness=sharpness)
         check_range(0, above=True, max_steering=max_steering)
         check_range(-1e6, 1e6, gain=gain)
         self.fit = least_squares_parabola if spline == "quadratic" else partial(smoothing_spline, smoothing=smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
-        self.cones, self.midpoints, self.targets = cones, midpoints, targets
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice."""

@@ -1,6 +1,6 @@
 """Imitation of guides (paper algorithms 6 and 7)."""
 
-from coil_rl.imitation.imitation import Imitation
-from coil_rl.imitation.regressors import NetworkRegressor, Regressor, SklearnRegressor
-
-__all__ = ["Imitation", "NetworkRegressor", "Regressor", "SklearnRegressor"]
+from coil_rl.imitation.imitation import Imitation as Imitation
+from coil_rl.imitation.regressors import NetworkRegressor as NetworkRegressor
+from coil_rl.imitation.regressors import Regressor as Regressor
+from coil_rl.imitation.regressors import SklearnRegressor as SklearnRegressor

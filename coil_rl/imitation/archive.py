@@ -4,8 +4,6 @@ skops constructs trusted types only. That is not enough: the compiled code of sc
 and support vector machines without a check, so that forged ones read foreign memory or never end.
 """
 
-from __future__ import annotations
-
 import types
 from collections.abc import Iterator, Mapping
 from functools import partial

@@ -5,8 +5,6 @@ One batch in which the guide acted gives behavioural cloning, offline imitation 
 guide acts less and less give DAgger: later batches hold the states that the policy itself reaches.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,7 +23,7 @@ from coil_rl.imitation.validation import cross_validate, scores
 from coil_rl.learners.encoders import ConcatObservations
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.train import checkpoint
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 
 class Imitation:
@@ -99,8 +97,8 @@ class Imitation:
         action = _Action(self.concat, self.regressor, ActionSpace(env.action_spec, batch_dims))
         self.policy = FastTensorDictModule(action, in_keys, ["action"])
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
-        group = group_key if group_key is None or isinstance(group_key, str) else tuple(group_key)
-        self.group_key: NestedKey | None = group if group in available else None
+        group: NestedKey | None = nested_key(group_key)
+        self.group_key = group if group in available else None
         self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
         self.validate, self.seed, self.device = validate, seed, env.device
         self.dataset: TensorDictBase | None = None

@@ -1,7 +1,5 @@
 """Validation of a regressor on samples that it was not fitted to."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

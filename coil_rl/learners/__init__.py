@@ -1,30 +1,21 @@
 """Learning algorithms: each updates a policy from batches of experience."""
 
-from coil_rl.learners.a2c import A2C
-from coil_rl.learners.dqn import DQN
-from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule
-from coil_rl.learners.encoders import Cnn, Gru, Mlp
-from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.noise import NoiseDecay
-from coil_rl.learners.ppo import PPO
-from coil_rl.learners.reinforce import Reinforce
-from coil_rl.learners.sac import SAC
-from coil_rl.learners.trpo import TRPO
-
-__all__ = [
-    "A2C",
-    "DQN",
-    "PPO",
-    "SAC",
-    "TRPO",
-    "AfterFrames",
-    "AtConvergence",
-    "Cnn",
-    "DynamicCoil",
-    "Gru",
-    "KickstartLoss",
-    "Mlp",
-    "NoiseDecay",
-    "PhaseSchedule",
-    "Reinforce",
-]
+from coil_rl.learners.a2c import A2C as A2C
+from coil_rl.learners.advisor import Advisor as Advisor
+from coil_rl.learners.anchor import Anchor as Anchor
+from coil_rl.learners.dqn import DQN as DQN
+from coil_rl.learners.dynamic_coil import AfterFrames as AfterFrames
+from coil_rl.learners.dynamic_coil import AtConvergence as AtConvergence
+from coil_rl.learners.dynamic_coil import DynamicCoil as DynamicCoil
+from coil_rl.learners.dynamic_coil import PhaseSchedule as PhaseSchedule
+from coil_rl.learners.encoders import Cnn as Cnn
+from coil_rl.learners.encoders import Gru as Gru
+from coil_rl.learners.encoders import Mlp as Mlp
+from coil_rl.learners.ibrl import IBRL as IBRL
+from coil_rl.learners.kickstart import FilteredKickstartLoss as FilteredKickstartLoss
+from coil_rl.learners.kickstart import KickstartLoss as KickstartLoss
+from coil_rl.learners.noise import NoiseDecay as NoiseDecay
+from coil_rl.learners.ppo import PPO as PPO
+from coil_rl.learners.reinforce import Reinforce as Reinforce
+from coil_rl.learners.sac import SAC as SAC
+from coil_rl.learners.trpo import TRPO as TRPO

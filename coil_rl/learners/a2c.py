@@ -6,13 +6,10 @@ one pass only, because the gradient holds for the policy that collected the batc
     loss = -mean(log pi(a | s) A(s, a))
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase
 from torchrl.objectives import A2CLoss
 
@@ -24,12 +21,9 @@ class A2C(PPO):
     """The A2C learner: PPO with the loss above and one pass over each batch.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and critic observe.
-        learning_rate: of Adam, a number or a schedule.
+        env, in_keys, learning_rate, options: as for `PPO`.
         standardise: whether to standardise the advantages of a minibatch. The coefficients of other losses then do not
             depend on the scale of the reward.
-        options: as for `PPO`.
     """
 
     def __init__(

@@ -5,8 +5,6 @@ towards y = r + gamma * Q'(s', argmax_b Q(s', b)), or y = r where the episode te
 follows Q slowly. The policy is epsilon-greedy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,9 +19,11 @@ from torchrl.objectives import DQNLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.encoders import Mlp, ObservationNetwork, entry_keys, without_memory
+from coil_rl.learners.anchor import AnchoredValues
+from coil_rl.learners.encoders import Mlp, ObservationNetwork, entry_specs, without_memory
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.transforms.action_space import nested_key
 
 
 class DQN(OffPolicy):
@@ -84,7 +84,7 @@ class DQN(OffPolicy):
             )
         if not isinstance(spec, (Categorical, OneHot)) or len(networks.action_shape(env)) != isinstance(spec, OneHot):
             raise ValueError("DQN needs one discrete action, but this env has several at once; use PPO")
-        in_keys, network = entry_keys(in_keys), without_memory(network or Mlp(hidden, "relu"), "DQN")
+        in_keys, network = list(map(nested_key, in_keys)), without_memory(network or Mlp(hidden, "relu"), "DQN")
         super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(env, in_keys, network, spec.space.n, action_gain, dtype=env.reward_spec.dtype)
@@ -93,7 +93,13 @@ class DQN(OffPolicy):
         self.network = TensorDictSequential(values, QValueModule(spec=single))
         self.explorer = EGreedyModule(single, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device)
         before = [] if self.normaliser is None else [self.normaliser]
-        self.policy = TensorDictSequential(*before, *self.network.module, self.explorer)
+        valued, chosen = self.network.module
+        if self.anchor is not None:
+            (advice,) = entry_specs(env, [self.anchor.advice_key])
+            bonus = self.anchor.attach(AnchoredValues(advice.shape[-2], env.device))
+            before.append(valued)
+            valued = networks.FastTensorDictModule(bonus, [self.anchor.advice_key, "action_value"], ["action_value"])
+        self.policy = TensorDictSequential(*before, valued, chosen, self.explorer)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless rewards are tiny.
         self.set_loss(
             DQNLoss(self.network, action_space=single, double_dqn=double, delay_value=True, loss_function="l2")
@@ -107,8 +113,9 @@ class DQN(OffPolicy):
             learning starts; and `epsilon`.
         """
         metrics = super().update(batch, progress)
-        self.explorer.eps.fill_(self.epsilon(progress))
-        return metrics | {"epsilon": self.epsilon(progress)}
+        epsilon = self.anchor.noise if self.anchor is not None and self.anchor.holds else self.epsilon
+        self.explorer.eps.fill_(epsilon(progress))
+        return metrics | {"epsilon": epsilon(progress)}
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:

@@ -5,16 +5,13 @@ guides are frozen, which is COIL. In a guide phase the agent is frozen and one g
 PPO loss and a smaller learning rate. The learning rate shrinks from each phase to the next of its kind.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import nn
 from torch.func import functional_call
 from torchrl.envs import EnvBase
@@ -59,16 +56,11 @@ class AtConvergence:
     """Stop rule: a phase ends when consecutive evaluations have not improved on the best one before them.
 
     An evaluation is the mean reward per step in the batch of one update.
-
-    Args:
-        evaluations: number of consecutive evaluations without improvement.
-        improvement: minimum increase of the mean reward.
-        frames: maximum length of the phase; None: unlimited.
     """
 
-    evaluations: int = 5
-    improvement: float = 0.0
-    frames: int | None = None
+    evaluations: int = 5  # without improvement
+    improvement: float = 0.0  # minimum increase of the mean reward
+    frames: int | None = None  # maximum length of the phase; None: unlimited
 
     def __post_init__(self) -> None:
         check_range(1, evaluations=self.evaluations, frames=1 if self.frames is None else self.frames)
@@ -99,9 +91,6 @@ class PhaseSchedule:
     Attributes:
         phase: the current phase.
         number: of the current phase, from 0.
-
-    Raises:
-        ValueError: for an unknown order or choice, or without a guide.
     """
 
     def __init__(
@@ -148,19 +137,13 @@ class PhaseSchedule:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule."""
-        return {
-            "number": self.number,
-            "frames": self.frames,
-            "rewards": list(self.rewards),
-            "phase": (self.phase.agent, list(self.phase.guides), self.phase.earlier),
-            "generator": self.generator.get_state(),
-        }
+        position = {"number": self.number, "frames": self.frames, "rewards": list(self.rewards)}
+        return position | {"phase": astuple(self.phase), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-        agent, guides, earlier = state["phase"]
-        self.phase = Phase(agent, tuple(guides), earlier)
         self.number, self.frames, self.rewards = state["number"], state["frames"], list(state["rewards"])
+        self.phase = Phase(*state["phase"])
         self.generator.set_state(state["generator"])
 
 
@@ -168,14 +151,13 @@ class DynamicCoil(PPO):
     """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
 
     Args:
-        env: the env, with continuous actions.
+        env, ppo: as for `PPO`; actions must be continuous.
         in_keys: entries that agent and critic observe; the agent also observes the advice.
         guides: guide networks by name; each writes `action`.
         phases: makes the phase schedule for a number of guides.
         guide_learning_rate: of the guides, a number or a schedule.
         shrink: factor on the learning rate from each phase to the next of its kind.
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
-        ppo: as for `PPO`.
 
     Raises:
         ValueError: for a value out of range, a guide without parameters, or guides that share parameters.
@@ -216,9 +198,8 @@ class DynamicCoil(PPO):
         self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
     ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
         """Return the guides followed by the agent, and the critic."""
-        shape = torch.Size([len(self.guides), *env.action_spec.shape[len(env.batch_size) :]])
+        shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
         agent_keys = [*in_keys, *self.advice.out_keys]
-        shapes = {"guide_action": shape}
         agent = networks.actor(env, agent_keys, network, shapes=shapes, normaliser=self.normaliser, **options)
         self.agent_parameters = list(agent.parameters())
         policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
@@ -263,16 +244,12 @@ class DynamicCoil(PPO):
             "learning_rate": rates[0],
             "guide_learning_rate": max(rates[2:]),
         }
-        return metrics | self._moved(batch)
-
-    @torch.no_grad()
-    def _moved(self, batch: TensorDictBase) -> dict[str, float]:
-        moved = {}
-        for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
-            observed = batch.select(*guide.in_keys)
-            before = functional_call(guide, initial, (observed.copy(),))["action"]
-            moved[f"moved_{name}"] = float((guide(observed)["action"] - before).abs().mean())
-        return moved
+        with torch.no_grad():
+            for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
+                observed = batch.select(*guide.in_keys)
+                before = functional_call(guide, initial, (observed.copy(),))["action"]
+                metrics[f"moved_{name}"] = float((guide(observed)["action"] - before).abs().mean())
+        return metrics
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""

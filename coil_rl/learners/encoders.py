@@ -1,12 +1,10 @@
 """What a network is made of: how it reads the entries of an env, and its layers. Named in YAML by `learner.network`."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import torch
-from tensordict import unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -21,16 +19,10 @@ Shapes = Mapping[NestedKey, torch.Size]
 STATE, IS_INIT = "policy_state", "is_init"  # what an env carries for a network with a memory
 
 
-def entry_keys(keys: Iterable[NestedKey | Sequence[str]]) -> list[NestedKey]:
-    """Return keys of entries as TorchRL writes them; a nested key may be a list, as in YAML."""
-    return [key if isinstance(key, str) else unravel_key(tuple(key)) for key in keys]
-
-
 def entry_specs(env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None) -> list[TensorSpec]:
     """Return the specs of entries of an env; those in `shapes`, which the env does not write, are numbers.
 
-    Raises:
-        KeyError: if the env has no such entry.
+    An entry that it does not have is a `KeyError`.
     """
     spec, extra = env.observation_spec, shapes or {}
     available = [*spec.keys(True, True), *extra]
@@ -39,133 +31,113 @@ def entry_specs(env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | Non
         names = [", ".join(key if isinstance(key, str) else "/".join(key) for key in keys)
                  for keys in (missing, available)]  # fmt: skip
         raise KeyError(f"the env has no entry {names[0]} to observe; it has {names[1]}")
-    return [Unbounded((*env.batch_size, *extra[key])) if key in extra else spec[key] for key in in_keys]
+    shape = env.batch_size
+    return [Unbounded((*shape, *extra[key]), device=env.device) if key in extra else spec[key] for key in in_keys]
 
 
 class ReadEntry(nn.Module):
-    """One entry of an env as numbers of the network's dtype: an index is one-hot, a byte is divided by 255.
+    """One entry of an env as a vector of the network's dtype: an index is one-hot, a byte is divided by 255.
 
-    Args:
-        spec: of the entry.
-        batch_dims: number of batch dimensions.
-
-    Attributes:
-        shape: of what is read, without the batch dimensions; at least one dimension.
+    `width` is the length of the vector.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
         super().__init__()
-        shape: torch.Size = spec.shape[batch_dims:]
-        self.dims = len(shape)
+        self.shape: torch.Size = spec.shape[batch_dims:]
         self.dtype = torch.get_default_dtype()
         self.choices: list[int] = []
         if isinstance(spec, MultiCategorical):
-            self.choices = spec.nvec.reshape(-1, shape[-1])[0].tolist() * shape[:-1].numel()
+            self.choices = spec.nvec.reshape(-1, self.shape[-1])[0].tolist() * self.shape[:-1].numel()
         elif isinstance(spec, Categorical) and not isinstance(spec, Binary) and spec.dtype != torch.bool:
-            self.choices = [spec.n] * shape.numel()
-        self.shape: torch.Size = torch.Size([sum(self.choices)]) if self.choices else shape or torch.Size([1])
+            self.choices = [spec.n] * self.shape.numel()
+        self.width = sum(self.choices) or self.shape.numel()
 
     def forward(self, entry: Tensor) -> Tensor:
-        """Map [*batch, *shape of the entry] to [*batch, *shape]."""
-        if self.dims == 0:
-            entry = entry.unsqueeze(-1)
+        """Map [*batch, *shape of the entry] to [*batch, width]."""
+        flat = entry.flatten(-len(self.shape)) if self.shape else entry.unsqueeze(-1)
         if self.choices:
-            columns = entry.flatten(-max(self.dims, 1)).long().unbind(-1)
-            each = [F.one_hot(column, n) for column, n in zip(columns, self.choices, strict=True)]
-            entry = torch.cat(each, -1)
+            columns = zip(flat.long().unbind(-1), self.choices, strict=True)
+            flat = torch.cat([F.one_hot(column, n) for column, n in columns], -1)
+        return self.numbers(flat)
+
+    def numbers(self, entry: Tensor) -> Tensor:
+        """Convert the dtype."""
         return entry.to(self.dtype) / 255 if entry.dtype == torch.uint8 else entry.to(self.dtype)
 
 
+class ReadImage(ReadEntry):
+    """An image, [C, H, W], or [H, W, C] if its last dimension is the smallest, as a vector by convolutions."""
+
+    def __init__(self, spec: TensorSpec, batch_dims: int, network: "Cnn") -> None:
+        super().__init__(spec, batch_dims)
+        self.channels_last = self.shape[2] < min(self.shape[:2])
+        self.layers = ConvNet(
+            self.shape[2 if self.channels_last else 0], num_cells=list(network.channels),
+            kernel_sizes=list(network.kernels), strides=list(network.strides),
+            activation_class=ACTIVATIONS[network.activation], device=spec.device,
+        )  # fmt: skip
+        self.width = self(torch.zeros(self.shape, device=spec.device)).numel()
+
+    def forward(self, entry: Tensor) -> Tensor:
+        """Map [*batch, *shape of the entry] to [*batch, width]."""
+        image = self.numbers(entry.movedim(-1, -3) if self.channels_last else entry)
+        # One batch dimension: ConvNet can do without the others, but not without any.
+        vectors: Tensor = self.layers(image.reshape(-1, *image.shape[-3:]))
+        return vectors.reshape(*image.shape[:-3], -1)
+
+
 class ConcatObservations(nn.Module):
-    """Concatenation of entries of an env, each flattened beyond the batch dimensions.
+    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions.
 
     Args:
-        env: the env.
-        in_keys: the entries.
+        env, in_keys: as for `entry_specs`.
         shapes: shapes of entries that the env does not write, without the batch dimensions.
+        images: reads entries of three dimensions; None: they are flattened like others.
 
     Attributes:
         width: D, length of the concatenated vector.
-
-    Raises:
-        KeyError: if the env has no such entry.
     """
 
-    def __init__(self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None) -> None:
+    def __init__(
+        self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None, images: "Cnn | None" = None
+    ) -> None:
         super().__init__()
-        entries = [ReadEntry(spec, len(env.batch_size)) for spec in entry_specs(env, in_keys, shapes)]
+        entries, dims = list[ReadEntry](), len(env.batch_size)
+        for key, spec in zip(in_keys, entry_specs(env, in_keys, shapes), strict=True):
+            entry = ReadEntry(spec, dims)
+            if images and len(entry.shape) == 3 and not entry.choices:
+                try:
+                    entry = ReadImage(spec, dims, images)
+                except RuntimeError as error:
+                    raise ValueError(
+                        f"the image {key} of shape {list(entry.shape)} is too small for kernels="
+                        f"{list(images.kernels)} with strides={list(images.strides)}; take smaller or fewer ones"
+                    ) from error
+            entries.append(entry)
         self.entries = nn.ModuleList(entries)
-        self.event_shapes = [entry.shape for entry in entries]
-        self.width = sum(shape.numel() for shape in self.event_shapes)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Concatenate inputs [*batch, ...] to [*batch, D]."""
-        flat = [self.encode(index, entry(x)) for index, (entry, x) in enumerate(zip(self.entries, inputs, strict=True))]
-        return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
-
-    def encode(self, index: int, numbers: Tensor) -> Tensor:
-        """Flatten what was read from the entry at an index."""
-        return numbers.flatten(-len(self.event_shapes[index]))
-
-
-class ConvolvedObservations(ConcatObservations):
-    """As `ConcatObservations`, but entries of three dimensions are images, which convolutions turn into vectors.
-
-    An image is [C, H, W], or [H, W, C] if its last dimension is the smallest.
-    """
-
-    def __init__(self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None, network: Cnn) -> None:
-        super().__init__(env, in_keys, shapes)
-        self.convolutions, self.channels_last = nn.ModuleDict(), {}
-        for index, shape in enumerate(self.event_shapes):
-            if len(shape) != 3:
-                continue
-            self.channels_last[index] = last = shape[2] < min(shape[:2])
-            image = torch.zeros(1, *shape, device=env.device)
-            image = image.movedim(-1, -3) if last else image
-            layers = ConvNet(
-                image.shape[1], num_cells=list(network.channels), kernel_sizes=list(network.kernels),
-                strides=list(network.strides), activation_class=ACTIVATIONS[network.activation], device=env.device,
-            )  # fmt: skip
-            try:
-                outputs = layers(image).shape[-1]
-            except RuntimeError as error:
-                raise ValueError(
-                    f"the image {in_keys[index]} of shape {list(shape)} is too small for kernels="
-                    f"{list(network.kernels)} with strides={list(network.strides)}; take smaller or fewer ones"
-                ) from error
-            self.convolutions[str(index)] = layers
-            self.width += outputs - shape.numel()
-        if not self.channels_last:
+        self.width = sum(entry.width for entry in entries)
+        if images and not any(isinstance(entry, ReadImage) for entry in entries):
             raise ValueError(
                 f"a convolutional network needs an image among {', '.join(map(str, in_keys))}, an entry of three "
                 "dimensions, but there is none; use network=mlp"
             )
 
-    def encode(self, index: int, numbers: Tensor) -> Tensor:
-        """Turn the image at an index into a vector, or flatten another entry."""
-        if index not in self.channels_last:
-            return super().encode(index, numbers)
-        image = numbers.movedim(-1, -3) if self.channels_last[index] else numbers
-        # One batch dimension: ConvNet can do without the others, but not without any.
-        vectors: Tensor = self.convolutions[str(index)](image.reshape(-1, *image.shape[-3:]))
-        return vectors.reshape(*image.shape[:-3], -1)
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """Concatenate inputs [*batch, ...] to [*batch, D]."""
+        flat = [entry(x) for entry, x in zip(self.entries, inputs, strict=True)]
+        return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 
 
 @dataclass(frozen=True)
 class Mlp:
     """A network that reads concatenated entries. With tanh its weights are orthogonal, else PyTorch's initial ones.
 
-    Args:
-        hidden: widths of the hidden layers.
-        activation: tanh, relu, elu or silu.
-
-    Raises:
-        ValueError: for hidden layers that are empty, or too large for the memory of a typical machine.
+    Layers that are empty, or too large for the memory of a typical machine, are a `ValueError`.
     """
 
-    hidden: Sequence[int] = (64, 64)
-    activation: str = "tanh"
+    hidden: Sequence[int] = (64, 64)  # widths of the hidden layers
+    activation: str = "tanh"  # or relu, elu, silu
+    layer_norm: bool = field(default=False, kw_only=True)  # of the numbers of a hidden layer, before its activation
 
     def __post_init__(self) -> None:
         check_choice(tuple(ACTIVATIONS), activation=self.activation)
@@ -180,7 +152,10 @@ class Mlp:
     def layers(self, inputs: int, outputs: int, gain: float, device: torch.device | None = None) -> MLP:
         """Return the layers after it; `gain` scales the initial weights of the last one."""
         activation = ACTIVATIONS[self.activation]
-        layers = MLP(inputs, outputs, num_cells=list(self.hidden), activation_class=activation, device=device)
+        norm: dict[str, Any] = {}
+        if self.layer_norm:
+            norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in self.hidden]}
+        layers = MLP(inputs, outputs, num_cells=list(self.hidden), activation_class=activation, device=device, **norm)
         if activation is nn.Tanh:
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
             for layer in linear:
@@ -197,22 +172,14 @@ class Mlp:
 class Cnn(Mlp):
     """A network that reads images by convolutions, and other entries beside what these give.
 
-    Args:
-        hidden: widths of the hidden layers after the convolutions.
-        activation: of all layers: tanh, relu, elu or silu.
-        channels: of each convolution.
-        kernels: widths of each convolution.
-        strides: of each convolution.
-
-    Raises:
-        ValueError: as `Mlp`, or if the lists for the convolutions are empty or differ in length; when it is built, if
-            no entry is an image, or an image is too small.
+    The lists for the convolutions must be as long as each other. When it is built, an entry must be an image, and none
+    may be too small; else it raises a `ValueError`.
     """
 
-    hidden: Sequence[int] = (512,)
-    activation: str = "relu"
+    hidden: Sequence[int] = (512,)  # widths of the hidden layers after the convolutions
+    activation: str = "relu"  # of all layers
     channels: Sequence[int] = (32, 64, 64)
-    kernels: Sequence[int] = (8, 4, 3)
+    kernels: Sequence[int] = (8, 4, 3)  # widths of each convolution
     strides: Sequence[int] = (4, 2, 1)
 
     def __post_init__(self) -> None:
@@ -226,24 +193,16 @@ class Cnn(Mlp):
 
     def observations(self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None) -> ConcatObservations:
         """Return the part that turns entries into one vector."""
-        return ConvolvedObservations(env, in_keys, shapes, self)
+        return ConcatObservations(env, in_keys, shapes, self)
 
 
 @dataclass(frozen=True)
 class Gru(Mlp):
-    """A network with a memory: a gated recurrent unit (GRU) reads concatenated entries, and hidden layers its state.
+    """A network with a memory: a gated recurrent unit (GRU), and hidden layers that read its state.
 
-    The state is zero at the start of an episode, and the data of the env carry it from step to step as `policy_state`;
-    `env_transforms` makes an env do so. Critics have no memory of their own: their hidden layers read the entries and
-    the state that the policy had before the step.
-
-    Args:
-        hidden: widths of the hidden layers after the GRU.
-        activation: of the hidden layers: tanh, relu, elu or silu.
-        state: width of the state of the GRU.
-
-    Raises:
-        ValueError: as `Mlp`.
+    The GRU reads concatenated entries. Its state is zero at the start of an episode, and the data of the env carry it
+    from step to step as `policy_state`; `env_transforms` makes an env do so. Critics have no memory of their own: their
+    hidden layers read the entries and the state that the policy had before the step.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -255,8 +214,8 @@ class Gru(Mlp):
         torch.Size([64, 1, 32])
     """
 
-    hidden: Sequence[int] = (64,)
-    state: int = 64
+    hidden: Sequence[int] = (64,)  # widths of the hidden layers after the GRU
+    state: int = 64  # width of the state of the GRU
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -265,7 +224,7 @@ class Gru(Mlp):
     @property
     def after(self) -> Mlp:
         """The hidden layers after the GRU."""
-        return Mlp(self.hidden, self.activation)
+        return Mlp(self.hidden, self.activation, layer_norm=self.layer_norm)
 
     def env_transforms(self) -> list[Transform]:
         """Return transforms by which an env marks the starts of episodes and carries the state, as TorchRL expects."""
@@ -282,11 +241,9 @@ def without_memory(network: Mlp, learner: str) -> Mlp:
 
 
 class ObservationNetwork(nn.Module):
-    """A network that reads entries of an env.
+    """A network that reads entries `in_keys` of an env.
 
     Args:
-        env: the env.
-        in_keys: the entries.
         network: its architecture.
         outputs: number of its outputs.
         gain: scale of the initial weights of the last layer.

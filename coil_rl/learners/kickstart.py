@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
 from tensordict.utils import NestedKey
@@ -14,6 +15,9 @@ from torchrl.modules import TanhNormal
 from coil_rl.envs.limits import check_choice, check_range
 from coil_rl.learners.networks import Choices
 from coil_rl.schedules import Linear, Schedule, schedule
+
+if TYPE_CHECKING:
+    from coil_rl.learners.sac import Critics
 
 EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fraction of half the range
 
@@ -31,13 +35,13 @@ class KickstartLoss:
 
     Attributes:
         name: the metric is `loss_NAME`.
-        keys: entries that it reads, besides those that the policy observes.
 
     Raises:
         ValueError: for an unknown kind, or a scale that is not positive.
     """
 
     name = "guide"
+    critics: Critics | None = None  # of the learner's policy, if the learner has such
 
     def __init__(
         self,
@@ -50,17 +54,26 @@ class KickstartLoss:
         check_choice(("likelihood", "divergence"), kind=kind)
         check_range(0, above=True, scale=scale)
         self.coefficient, self.kind, self.scale, self.guide = schedule(coefficient), kind, scale, guide
-        self.advice_key, self.keys = advice_key, [advice_key]
+        self.advice_key = advice_key
+
+    @property
+    def keys(self) -> list[NestedKey]:
+        """Entries that it reads, besides those that the policy observes."""
+        return [self.advice_key]
 
     def __call__(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
-        """Return the loss of a minibatch [N], a scalar. For discrete actions both kinds are the cross-entropy."""
-        advice = minibatch[self.advice_key][:, self.guide]
+        """Return the loss of a minibatch [N], a scalar."""
+        return self.each(policy, minibatch).mean()
+
+    def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
+        """Return the loss of each row of a minibatch, [N]. For discrete actions both kinds are the cross-entropy."""
+        advice = minibatch[self.advice_key][..., self.guide, :]
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(distribution, Categorical):
-            return -(advice * distribution.logits).sum(-1).mean()
+            return -(advice * distribution.logits).sum(-1)
         if isinstance(distribution, Choices):  # the advice is one-hot for each choice, one beside the other
             logits = distribution.base_dist.logits
-            return -(advice * logits[:, logits[0].isfinite()]).sum(-1).mean()
+            return -(advice * logits[:, logits[0].isfinite()]).sum(-1)
         bounded = isinstance(distribution, TanhNormal)
         if bounded:
             low, high = distribution.low, distribution.high
@@ -68,7 +81,43 @@ class KickstartLoss:
             unit = ((advice - middle) / half).clamp(EDGE - 1, 1 - EDGE)
             advice = middle + half * unit
         if self.kind == "likelihood":
-            return -distribution.log_prob(advice).mean()
+            return -distribution.log_prob(advice)
         # The divergence between squashed distributions is that of the normal distributions before squashing.
         mean, base = (unit.atanh(), distribution) if bounded else (advice, distribution.base_dist)
-        return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1).mean()
+        return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1)
+
+
+class FilteredKickstartLoss(KickstartLoss):
+    """As `KickstartLoss`, weighted by the critics' opinion of g, for learners with action values, such as SAC.
+
+    The weight of a state is 1 where the critics' mean value of g is larger than that of the policy's action, else 0
+    (Q-filter, Nair et al. 2018); or `soft`, the probability of this by the spread of the critics (SPReD, 2025):
+    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)).
+
+    Args:
+        soft: see above.
+        options: as for `KickstartLoss`.
+    """
+
+    def __init__(self, *, soft: bool = False, **options: Any) -> None:
+        super().__init__(**options)
+        self.soft = soft
+
+    @property
+    def keys(self) -> list[NestedKey]:
+        """Entries that it reads; raises a `ValueError` for a learner without action values."""
+        if self.critics is None:
+            raise ValueError("FilteredKickstartLoss compares values of actions; take learner=sac, or KickstartLoss")
+        return super().keys
+
+    def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
+        """Return the weighted loss of each row of a minibatch, [N]."""
+        with torch.no_grad():
+            own = policy.get_dist(minibatch.select(*policy.in_keys)).deterministic_sample
+            advice = minibatch[self.advice_key][..., self.guide, :]
+            actions = (minibatch.copy().set("action", action) for action in (advice, own))
+            values = torch.stack([self.critics.values(data) for data in actions])  # type: ignore[union-attr]
+            gain = values[0].mean(0) - values[1].mean(0)
+            spread = values.var(1).sum(0).sqrt().clamp_min(1e-8)
+            weight = torch.special.ndtr(gain / spread) if self.soft else (gain > 0).to(gain.dtype)
+        return weight * super().each(policy, minibatch)

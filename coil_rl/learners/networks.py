@@ -1,9 +1,8 @@
 """Policy and value networks, built from the specs of an env."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import torch
@@ -29,7 +28,8 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from coil_rl.learners.encoders import IS_INIT, STATE, Gru, Mlp, ObservationNetwork, Shapes
+from coil_rl.learners.anchor import Anchor, AnchoredHead, pull_to_choice, pull_to_number
+from coil_rl.learners.encoders import IS_INIT, STATE, Gru, Mlp, ObservationNetwork, Shapes, entry_specs
 from coil_rl.learners.normaliser import Normaliser
 
 UNCLIPPED, REMEMBERED = "unclipped_action", "remembered"
@@ -186,6 +186,7 @@ def actor(
     state_dependent_scale: bool = False,
     squash: bool = True,
     normaliser: Normaliser | None = None,
+    anchor: Anchor | None = None,
 ) -> ProbabilisticTensorDictSequential:
     """Return a stochastic policy for the actions of an env.
 
@@ -196,11 +197,12 @@ def actor(
 
     The initial standard deviation before squashing is `scale`; with `state_dependent_scale` it is an output of the
     network, for continuous actions only. `gain` scales the initial weights of the last layer. `shapes` are as for
-    `ConcatObservations`. A network with a memory also writes its next state, see `Gru`.
+    `ConcatObservations`. A network with a memory also writes its next state, see `Gru`. With an `anchor` the policy
+    starts as its guide.
 
     Raises:
         ValueError: for an action of another kind, or a network with a memory that the env does not carry.
-        KeyError: if the env has no such entry.
+        KeyError: if the env has no such entry, or no advice for an anchor.
     """
     spec, key, event = action_spec(env), env.action_key, action_shape(env)
     keys = in_keys if normaliser is None else normaliser.reads(in_keys)
@@ -214,6 +216,13 @@ def actor(
         dtype = spec.dtype if spec.dtype.is_floating_point else None
         return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
 
+    if anchor is not None:
+        (advice,) = entry_specs(env, [anchor.advice_key])
+        keys = [anchor.advice_key, *keys]
+
+    def anchored(head: nn.Module, pull: Callable[[Tensor], Tensor]) -> nn.Module:
+        return head if anchor is None else anchor.attach(AnchoredHead(head, pull, advice.shape[-2], env.device))
+
     def policy(head: nn.Module, parameters: list[str], distribution: type, **options: Any) -> Any:
         actions = ProbabilisticActor(
             FastTensorDictModule(head, keys, parameters), parameters, [key], spec=spec, distribution_class=distribution,
@@ -223,19 +232,23 @@ def actor(
 
     if isinstance(spec, OneHot) or (isinstance(spec, Categorical) and not event):
         distribution = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
-        return policy(network_of(spec.space.n), ["logits"], distribution)
+        valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
+        return policy(anchored(network_of(spec.space.n), pull_to_choice(valid)), ["logits"], distribution)
     if not spec.dtype.is_floating_point:
         options = option_counts(spec, event)
         choices = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
-        return policy(choices, ["logits"], Choices, event_dims=len(event))
+        return policy(anchored(choices, pull_to_choice(choices.valid)), ["logits"], Choices, event_dims=len(event))
     size = event.numel()
     gaussian = GaussianHead if state_dependent_scale else GlobalScaleHead
-    head = gaussian(network_of(2 * size if state_dependent_scale else size), event, scale)
+    head: nn.Module = gaussian(network_of(2 * size if state_dependent_scale else size), event, scale)
     if not isinstance(spec, Bounded):
+        head = anchored(head, pull_to_number)
         return policy(head, ["loc", "scale"], IndependentNormal, event_dim=len(event))
     first = (0,) * len(env.batch_size)
     low, high = spec.space.low[first], spec.space.high[first]
-    if squash and (high - low).isfinite().all():
+    squash = squash and bool((high - low).isfinite().all())
+    head = anchored(head, partial(pull_to_number, bounds=(low, high)) if squash else pull_to_number)
+    if squash:
         return policy(head, ["loc", "scale"], TanhNormal, low=low, high=high, event_dims=len(event), tanh_loc=False)
     module = FastTensorDictModule(head, keys, ["loc", "scale"])
     return ProbabilisticTensorDictSequential(*before, module, ClippedNormal(low, high, key))
@@ -244,7 +257,9 @@ def actor(
 def memory(
     env: EnvBase, in_keys: Sequence[NestedKey], read: Sequence[NestedKey], network: Gru, shapes: Shapes | None
 ) -> list[TensorDictModuleBase]:
-    """Return the modules of a policy that concatenate entries, read as `read`, and remember them: `remembered` [*B, H].
+    """Return the modules of a policy that remember the entries of an episode; they write `remembered` [*batch, H].
+
+    `read` are the keys under which the modules read the entries `in_keys` of the env.
 
     Raises:
         ValueError: if the env does not carry the state.

@@ -1,7 +1,5 @@
 """A schedule of the exploration noise that begins when the failures of training have stopped."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Sequence

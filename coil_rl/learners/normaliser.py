@@ -4,15 +4,12 @@ It is a part of the policy and not a transform of the env: the statistics are in
 loads the policy has them, guides see the observations as they are, and an evaluation never changes them.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -25,15 +22,8 @@ LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
 class Normaliser(TensorDictModuleBase):
     """Entries of an env minus their mean, divided by their standard deviation, over everything that `learn` has seen.
 
-    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the entries.
-
-    Args:
-        env: the env.
-        keys: the entries, all of floating point numbers.
-
-    Raises:
-        KeyError: if the env has no such entry.
-        ValueError: for advice, which shares the unit of the action, or an entry that does not hold such numbers.
+    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the entries. Advice, which
+    shares the unit of the action, and entries of other than floating point numbers are a `ValueError`.
     """
 
     def __init__(self, env: EnvBase, keys: Sequence[NestedKey]) -> None:
@@ -67,23 +57,14 @@ class Normaliser(TensorDictModuleBase):
 
 
 class Moments(nn.Module):
-    """Count, mean and variance of each element of all vectors seen so far, by the method of Chan et al. (1979).
-
-    Args:
-        shape: of a vector.
-        device: of the statistics.
-    """
-
-    count: Tensor
-    mean: Tensor
-    variance: Tensor
+    """Count, mean and variance of each element of all arrays of a shape seen so far (Chan et al. 1979)."""
 
     def __init__(self, shape: torch.Size, device: torch.device | None = None) -> None:
         super().__init__()
         options: dict[str, Any] = {"dtype": torch.float64, "device": device}
-        self.register_buffer("count", torch.zeros((), **options))
-        self.register_buffer("mean", torch.zeros(shape, **options))
-        self.register_buffer("variance", torch.ones(shape, **options))
+        self.count: Tensor = nn.Buffer(torch.zeros((), **options))
+        self.mean: Tensor = nn.Buffer(torch.zeros(shape, **options))
+        self.variance: Tensor = nn.Buffer(torch.ones(shape, **options))
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise values [*batch, *shape]."""
@@ -95,12 +76,11 @@ class Moments(nn.Module):
         """Add values [*batch, *shape]."""
         rows = values.reshape(-1, *self.mean.shape).double()
         mean, variance = rows.mean(0), rows.var(0, correction=0)
-        total = self.count + len(rows)
-        share, change = len(rows) / total, mean - self.mean
+        self.count += len(rows)
+        share, change = len(rows) / self.count, mean - self.mean
         spread = self.variance * (1 - share) + variance * share + change.square() * share * (1 - share)
         self.mean += change * share
         self.variance.copy_(spread)
-        self.count.copy_(total)
 
 
 def advice_keys(env: EnvBase) -> set[NestedKey]:
@@ -109,10 +89,10 @@ def advice_keys(env: EnvBase) -> set[NestedKey]:
 
 
 def normaliser(env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Sequence[NestedKey]) -> Normaliser | None:
-    """Return the normaliser of a learner.
+    """Return the normaliser of a learner, None without entries.
 
-    `normalise` names the entries; True: all of `in_keys` that hold vectors of measurements, that is not advice, choices
-    or images. None if there are none.
+    `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not advice, choices or
+    images.
     """
     if not isinstance(normalise, bool):
         chosen = list(normalise)
@@ -120,14 +100,12 @@ def normaliser(env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Seq
             raise ValueError(
                 f"normalise: {', '.join(unread)} is not observed; observed are {', '.join(map(str, in_keys))}"
             )
-    elif normalise:
+    else:
         advice, batch_dims = advice_keys(env), len(env.batch_size)
         chosen = [
             key
             for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True)
-            if key not in advice and spec.dtype.is_floating_point and len(spec.shape) - batch_dims < 3
+            if normalise and key not in advice and spec.dtype.is_floating_point and len(spec.shape) - batch_dims < 3
             and not hasattr(spec, "nvec") and getattr(spec, "domain", "continuous") == "continuous"
         ]  # fmt: skip
-    else:
-        chosen = []
     return Normaliser(env, chosen) if chosen else None

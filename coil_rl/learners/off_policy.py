@@ -1,20 +1,20 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
-from tensordict.utils import NestedKey
+from tensordict.utils import NestedKey, expand_as_right
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
+from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
 
@@ -22,7 +22,10 @@ class OffPolicy:
     """Replay buffer, optimiser, target networks and update.
 
     A step is stored with the observations before and after it, advice included, because a guide with memory or
-    randomness cannot be evaluated again. A step in which a guide acted is left out: its `action` was not executed.
+    randomness cannot be evaluated again. Where a guide acted in place of the agent, the action that was executed is
+    stored, or 0 if the agent's action is a residual. Such steps are left out if no action of the agent has the same
+    effect: its actions are choices, or combined in several ways. An action that is added to the guide's is stored as
+    the agent's own, since the sum is a part of the env.
 
     A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of (`minimised`) and
     the values to report (`reported`).
@@ -40,6 +43,9 @@ class OffPolicy:
         capacity: maximum number of stored steps; the newest replace the oldest.
         batch_size: N, steps in a minibatch.
         starts: number of stored steps before learning starts.
+        prior: share of each minibatch that is sampled from the steps of guides, which are then stored apart: the
+            symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all steps are sampled alike.
+        anchor: makes the policy start as its guide.
         seed: of the samples.
 
     Attributes:
@@ -68,10 +74,13 @@ class OffPolicy:
         capacity: int = 100_000,
         batch_size: int = 256,
         starts: int = 5_000,
+        prior: float = 0.0,
+        anchor: Anchor | None = None,
         seed: int = 0,
     ) -> None:
+        self.anchor = anchor
         self.learning_rate = schedule(learning_rate)
-        check_range(0, 1, gamma=gamma, tau=tau)
+        check_range(0, 1, gamma=gamma, tau=tau, prior=prior)
         check_range(0, learning_rate=self.learning_rate(0), starts=starts)
         check_range(0, 10_000, ratio=ratio)
         check_range(0, above=True, max_grad_norm=max_grad_norm)
@@ -94,15 +103,31 @@ class OffPolicy:
         self.normaliser = normaliser(env, in_keys, normalise)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = "agent_acts" in env.observation_spec
+        self.of_guide = stored_of_guide(env)
+        if prior and self.of_guide == "nothing":
+            raise ValueError(
+                f"prior={prior} needs steps in which a guide acts in place of the agent, as with the transform "
+                "Takeover, by an action that the agent could choose; or take prior=0"
+            )
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [*in_keys, "action", *(unravel_key(("next", key)) for key in after)]
-        self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else self.stored_keys
+        self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else [*self.stored_keys]
+        self.keys += [("next", EXECUTED)] if self.of_guide == "executed" else []
         self.capacity, self.batch_size, self.ratio, self.starts = capacity, batch_size, ratio, starts
         self.pending_updates = 0.0
         self.device = env.device or torch.device("cpu")
         self.generator = torch.Generator(self.device).manual_seed(seed)
-        storage = LazyTensorStorage(capacity, device=self.device)
-        self.buffer = ReplayBuffer(storage=storage, batch_size=batch_size, generator=self.generator)
+        # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw other samples.
+        self.buffer, self.guide_buffer = (
+            ReplayBuffer(storage=LazyTensorStorage(capacity, device=self.device), generator=self.generator)
+            for _ in range(2)
+        )
+        self.prior = round(prior * batch_size)
+
+    def also_store(self, *keys: NestedKey) -> None:
+        """Store further entries of the env, before and after each step."""
+        for known in (self.stored_keys, self.keys):
+            known += [each for key in keys for each in (key, unravel_key(("next", key))) if each not in known]
 
     def set_loss(self, loss: LossModule) -> None:
         """Set TorchRL's loss, and make its target networks and the optimiser."""
@@ -125,6 +150,7 @@ class OffPolicy:
         """
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(progress)
+        self.progress = progress
         self.store(batch)
         reports, minibatch = [], None
         for minibatch in self.samples():
@@ -136,34 +162,53 @@ class OffPolicy:
         return means | {
             **self.describe(minibatch),
             "minibatches": float(len(reports)),
-            "kept": float(len(self.buffer)),
+            "kept": float(self.kept),
             "learning_rate": self.learning_rate(progress),
+            **(self.anchor.set_noise(progress) if self.anchor else {}),
         }
+
+    @property
+    def kept(self) -> int:
+        """Number of stored steps."""
+        return len(self.buffer) + len(self.guide_buffer)
 
     def store(self, batch: TensorDictBase) -> None:
         """Store the steps of a batch [*B, T]."""
-        steps = batch.select(*self.stored_keys).reshape(-1)
+        steps, guide = batch.select(*self.stored_keys).reshape(-1), None
         if self.guide_may_act:
-            steps = steps[batch["agent_acts"].reshape(-1)]
-        if len(steps):
-            if self.normaliser is not None:
-                self.normaliser.learn(steps)
-            self.buffer.extend(steps[-self.capacity :])
-        self.pending_updates += len(steps) * self.ratio / self.batch_size
+            agent = batch["agent_acts"].reshape(-1)
+            if self.of_guide == "nothing":
+                steps = steps[agent]
+            elif self.of_guide == "executed":
+                # Where the agent acts it is its own action.
+                steps["action"] = batch["next", EXECUTED].reshape(steps["action"].shape)
+            else:
+                steps["action"] = torch.where(expand_as_right(agent, steps["action"]), steps["action"], 0)
+            if self.prior:
+                steps, guide = steps[agent], steps[~agent]
+        for buffer, new in ((self.buffer, steps), (self.guide_buffer, guide)):
+            if new is not None and len(new):
+                if self.normaliser is not None:
+                    self.normaliser.learn(new)
+                buffer.extend(new[-self.capacity :])
+                self.pending_updates += len(new) * self.ratio / self.batch_size
 
     def samples(self) -> Iterator[TensorDictBase]:
         """Yield as many minibatches [N] as are due for the steps stored so far, with replacement."""
-        while self.pending_updates >= 1 and len(self.buffer) >= self.starts:
+        while self.pending_updates >= 1 and self.kept >= self.starts:
             self.pending_updates -= 1
-            minibatch = self.buffer.sample()
+            prior = self.prior if len(self.buffer) else self.batch_size
+            prior = prior if len(self.guide_buffer) else 0
+            sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
+            minibatch: TensorDictBase = torch.cat([buffer.sample(size) for buffer, size in sizes.items() if size])
             if self.normaliser is not None:
                 minibatch["next"] = self.normaliser(minibatch["next"])
                 minibatch = self.normaliser(minibatch)
             yield minibatch
 
     def step(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Take one step of the optimiser; returns the values of TorchRL's loss."""
-        losses = self.loss(minibatch)
+        """Take one step of the optimiser; returns the values of `losses`."""
+        losses = self.losses(minibatch)
         for parameter in self.parameters:  # as `zero_grad`, in less time
             parameter.grad = None
         sum(losses[name] for name in self.minimised).backward()
@@ -172,6 +217,11 @@ class OffPolicy:
         self.target.step()
         detached: TensorDictBase = losses.detach()
         return detached
+
+    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch [N] and other values, scalars."""
+        losses: TensorDictBase = self.loss(minibatch)
+        return losses
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return further metrics of the last minibatch of an update, which is None before learning starts."""
@@ -182,23 +232,40 @@ class OffPolicy:
         return {
             "loss": self.loss.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "steps": self.buffer[:].clone().to_dict() if len(self.buffer) else {},
-            "writer": self.buffer.writer.state_dict(),
+            "buffers": [
+                {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
+                for buffer in (self.buffer, self.guide_buffer)
+            ],
             "generator": self.generator.get_state(),
             "pending_updates": self.pending_updates,
             "normaliser": {} if self.normaliser is None else self.normaliser.state_dict(),
+            "anchor": self.anchor.state_dict() if self.anchor else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
         self.loss.load_state_dict(state["loss"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.buffer.empty()
-        if state["steps"]:
-            steps = TensorDict.from_dict(state["steps"], batch_size=state["steps"]["action"].shape[:1])
-            self.buffer.extend(steps.to(self.device))
-        self.buffer.writer.load_state_dict(state["writer"])
+        for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
+            buffer.empty()
+            if stored["steps"]:
+                steps = TensorDict.from_dict(stored["steps"], batch_size=stored["steps"]["action"].shape[:1])
+                buffer.extend(steps.to(self.device))
+            buffer.writer.load_state_dict(stored["writer"])
         self.generator.set_state(state["generator"].cpu())
         self.pending_updates = state["pending_updates"]
         if self.normaliser is not None:
             self.normaliser.load_state_dict(state["normaliser"])
+        if self.anchor:
+            self.anchor.load_state_dict(state["anchor"])
+
+
+def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:
+    """Return which action of the agent had the same effect as that of a guide which acted in its place."""
+    combined = [transform for transform in env.modules() if isinstance(transform, CombinedAction)]
+    if "agent_acts" not in env.observation_spec or (len(combined) > 1 and any(each.adds for each in combined)):
+        return "nothing"
+    executed, own = env.observation_spec.get(EXECUTED, None), env.action_spec
+    if executed is None or (executed.shape, executed.dtype) != (own.shape, own.dtype):
+        return "nothing"
+    return "zero" if any(each.adds for each in combined) else "executed"

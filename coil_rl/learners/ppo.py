@@ -6,8 +6,6 @@ passes over the batch in minibatches. Clipping the probability ratio keeps it ne
     loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar
 
@@ -25,11 +23,13 @@ from torchrl.objectives.value import GAE
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.errors import UserError
 from coil_rl.learners import networks
-from coil_rl.learners.encoders import Mlp, entry_keys, without_memory
+from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.transforms.action_space import nested_key
 
 
 class PPO:
@@ -62,6 +62,7 @@ class PPO:
         max_grad_norm: gradients are scaled down to this norm.
         compile: whether to use `torch.compile` for the loss, which changes the last digits of the numbers.
         noise: schedule of the standard deviation of the policy.
+        anchor: makes the policy start as its guide.
         auxiliary: additional losses of the policy.
         seed: of the order of minibatches.
 
@@ -111,6 +112,7 @@ class PPO:
         max_grad_norm: float = 0.5,
         compile: bool = False,
         noise: NoiseDecay | None = None,
+        anchor: Anchor | None = None,
         auxiliary: Sequence[KickstartLoss] = (),
         seed: int = 0,
     ) -> None:
@@ -120,15 +122,17 @@ class PPO:
         check_range(0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm)
         check_range(1, epochs=epochs, minibatches=minibatches)
         check_range(0, LARGEST_SEED, seed=seed)
+        if noise and anchor:
+            raise ValueError("an anchor has its own schedule of the noise; leave out noise, or the anchor")
         self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
-        self.critic_coefficient, self.auxiliary, self.noise = critic, list(auxiliary), noise
-        in_keys = entry_keys(in_keys)
+        self.critic_coefficient, self.auxiliary, self.noise, self.anchor = critic, list(auxiliary), noise, anchor
+        in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
         if not self.with_memory:
             without_memory(network, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
         self.policy, self.critic = self.build_networks(
-            env, in_keys, network, scale=action_scale, gain=action_gain, squash=squash
+            env, in_keys, network, scale=action_scale, gain=action_gain, squash=squash, anchor=anchor
         )
         self.memory, self.head = networks.split_memory(self.policy)
         if noise:
@@ -194,17 +198,28 @@ class PPO:
         reports = []
         for minibatch in self.draw_minibatches(rows):
             losses = self.masked_losses(minibatch)
-            total = losses["loss_objective"] + losses["loss_critic"]
-            if "loss_entropy" in losses:
-                total = total + losses["loss_entropy"]
             for auxiliary in self.auxiliary:
                 losses[f"loss_{auxiliary.name}"] = auxiliary(self.head, minibatch)
-                total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
-            self.step(total)
+            self.step(self.total_loss(losses, progress))
             reports.append(losses.detach())
         names = list(reports[0].keys())
         means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
         return means | {"learning_rate": self.learning_rate(progress)} | self.finish(batch, progress)
+
+    def total_loss(self, losses: TensorDictBase, progress: float) -> Tensor:
+        """Return the sum of losses by name that an update minimises."""
+        if self.policy_waits(progress):
+            return losses["loss_critic"] + 0 * losses["loss_objective"]
+        total = losses["loss_objective"] + losses["loss_critic"]
+        if "loss_entropy" in losses:
+            total = total + losses["loss_entropy"]
+        for auxiliary in self.auxiliary:
+            total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
+        return total
+
+    def policy_waits(self, progress: float) -> bool:
+        """Return whether only the critic learns."""
+        return self.anchor is not None and self.anchor.waits(progress)
 
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Do what follows an update: learn the statistics of the observations, and apply the noise schedule, if any.
@@ -216,6 +231,8 @@ class PPO:
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)
+        if self.anchor is not None:
+            return self.anchor.set_noise(progress)
         return {"noise": self.noise.apply(batch, progress)} if self.noise else {}
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
@@ -296,6 +313,7 @@ class PPO:
             "optimiser": self.optimiser.state_dict(),
             "generator": self.generator.get_state(),
             "noise": self.noise.state_dict() if self.noise else {},
+            "anchor": self.anchor.state_dict() if self.anchor else {},
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -306,6 +324,8 @@ class PPO:
         self.generator.set_state(state["generator"])
         if self.noise:
             self.noise.load_state_dict(state["noise"])
+        if self.anchor:
+            self.anchor.load_state_dict(state["anchor"])
 
 
 class ClippedLoss(ClipPPOLoss):

@@ -10,33 +10,27 @@ a baseline its return ends with the batch, so batches should be long. Complete e
 their length depends on the actions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
-from torchrl.objectives import ReinforceLoss
 
 from coil_rl.envs.limits import check_choice
 from coil_rl.learners import networks
+from coil_rl.learners.a2c import A2C
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.ppo import PPO, standardise
+from coil_rl.schedules import Linear, Schedule
 
 
-class Reinforce(PPO):
-    """The REINFORCE learner: PPO with the loss above and one pass over each batch.
+class Reinforce(A2C):
+    """The REINFORCE learner: A2C with the whole return, lambda = 1; `standardise` then concerns G - b.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and baseline observe.
+        env, in_keys, learning_rate, options: as for `A2C`.
         baseline: "critic", a network trained on the returns, or "none".
-        standardise: whether to standardise G - b in a minibatch.
-        options: as for `PPO`.
     """
 
     def __init__(
@@ -45,16 +39,14 @@ class Reinforce(PPO):
         in_keys: Sequence[NestedKey] = ("observation",),
         *,
         baseline: Literal["critic", "none"] = "critic",
-        standardise: bool = True,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
         **options: Any,
     ) -> None:
         check_choice(("critic", "none"), baseline=baseline)
-        self.baseline, self.standardise = baseline, standardise
-        # With lambda = 1 the advantage is the return minus the value of the state. The clipped loss is replaced.
+        self.baseline, critic = baseline, float(baseline == "critic")
         super().__init__(
-            env, in_keys, gae_lambda=1.0, epochs=1, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options
+            env, in_keys, learning_rate=learning_rate, gae_lambda=1.0, entropy=0.0, critic=critic, **options
         )
-        self.loss = ReinforceLoss(self.head, self.critic, loss_critic_type="l2", functional=False)
 
     def build_networks(
         self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
@@ -63,15 +55,6 @@ class Reinforce(PPO):
         if self.baseline == "critic":
             return super().build_networks(env, in_keys, network, **options)
         return networks.actor(env, in_keys, network, normaliser=self.normaliser, **options), ZeroCritic(in_keys)
-
-    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return TorchRL's losses of a minibatch [N], with the names of its other losses."""
-        if self.standardise:
-            minibatch = minibatch.copy().set("advantage", standardise(minibatch["advantage"]))
-        losses = super().losses(minibatch)
-        losses.rename_key_("loss_actor", "loss_objective")
-        losses.rename_key_("loss_value", "loss_critic")
-        return losses if self.baseline == "critic" else losses.set("loss_critic", losses["loss_critic"] * 0)
 
 
 class ZeroCritic(TensorDictModuleBase):

@@ -6,18 +6,15 @@ scaled to the bound. F is never formed: conjugate gradients need its product wit
 the divergence. A line search then makes sure that the objective improved and that the bound holds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal, kl_divergence
 from torch.nn import functional as F
-from torch.nn.utils import parameters_to_vector
+from torch.nn.utils import parameters_to_vector, vector_to_parameters
 from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
@@ -30,14 +27,12 @@ class TRPO(PPO):
     """The TRPO learner. The optimiser, its passes and its minibatches are for the critic only.
 
     Args:
-        env: the env, for its specs.
-        in_keys: entries that policy and critic observe.
+        env, in_keys, options: as for `PPO`; auxiliary losses are part of the objective.
         max_kl: bound on a step, mean KL(before || after) over the batch.
         damping: added to the diagonal of the Fisher matrix, which may be singular.
         iterations: of the conjugate gradients.
         backtracks: how often the line search may shorten a step.
         shrink: factor by which it shortens a step.
-        options: as for `PPO`; auxiliary losses are part of the objective.
     """
 
     with_memory = False
@@ -70,9 +65,8 @@ class TRPO(PPO):
         """Learn from a batch of rollouts; arguments as for `PPO.update`.
 
         Returns:
-            The losses of the policy after its step; `kl`, the divergence of the step; `step`, the length of the step as
-            a fraction of the longest one that the bound allows, 0 if none was taken; the mean loss of the critic; and
-            its learning rate.
+            The losses of the policy after its step; `kl`, the divergence of the step; `step`, its length as a fraction
+            of the longest one within the bound, 0 if none was taken; the critic's mean loss and its learning rate.
         """
         rows = self.prepare(batch, progress)
         report = self.improve(rows, progress)
@@ -88,12 +82,10 @@ class TRPO(PPO):
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.
 
-        Args:
-            rows: [N] with `minibatch_keys`. Steps in which a guide acted count for auxiliary losses only.
-            progress: as for `update`.
+        Of the rows [N] with `minibatch_keys` those in which a guide acted count for auxiliary losses only.
         """
         agent_rows = rows[rows["agent_acts"].squeeze(-1)] if self.guide_may_act else rows
-        if len(agent_rows) < 2:  # one advantage cannot be standardised
+        if self.policy_waits(progress) or len(agent_rows) < 2:  # one advantage cannot be standardised
             names = ("objective", *(auxiliary.name for auxiliary in self.auxiliary))
             return {f"loss_{name}": 0.0 for name in names} | {"kl": 0.0, "step": 0.0}
         weights = list(self.policy.parameters())
@@ -126,12 +118,12 @@ class TRPO(PPO):
         start, fraction = parameters_to_vector(weights).detach().clone(), 1.0
         with torch.no_grad():
             for _ in range(self.backtracks + 1):
-                assign(weights, start + fraction * step)
+                vector_to_parameters(start + fraction * step, weights)
                 new_loss, divergence, new_losses = evaluate()
                 if (new_loss < loss) & (divergence <= self.max_kl):
                     return new_losses | {"kl": divergence, "step": fraction}
                 fraction *= self.shrink
-            assign(weights, start)
+            vector_to_parameters(start, weights)
         return losses | {"kl": 0.0, "step": 0.0}
 
 
@@ -165,9 +157,3 @@ def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, ite
 def derivative(value: Tensor, weights: Sequence[Tensor], differentiable: bool = False) -> Tensor:
     """Return the derivative of a scalar with respect to all weights, as one vector; the graph is kept."""
     return parameters_to_vector(torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable))
-
-
-def assign(weights: Sequence[Tensor], vector: Tensor) -> None:
-    """Set all weights from one vector."""
-    for weight, values in zip(weights, vector.split([weight.numel() for weight in weights]), strict=True):
-        weight.copy_(values.view_as(weight))

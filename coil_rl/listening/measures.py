@@ -4,11 +4,11 @@ Agreement alone cannot separate use of advice from coincidence: an agent and a g
 both observe the same cones. `intervention` and `gradient` therefore change the advice. All actions are deterministic.
 """
 
-from __future__ import annotations
+from collections.abc import Callable, Iterator, Mapping
 
-from collections.abc import Callable
-
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
@@ -25,6 +25,13 @@ PICTURES = {
 
 Act = Callable[[TensorDictBase], Tensor]
 """Maps states [N] with `guide_action` to actions [N, A]; it may write to the states, which are copies."""
+
+
+def drawn(measures: Mapping[str, NDArray[np.float64]]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield each measure that has a picture and a number, with title, axis label and file name of its picture."""
+    for measure, (title, label) in PICTURES.items():
+        if not np.isnan(measures[measure]).all():
+            yield measure, title, label, f"listening{'' if measure == 'intervention' else f'_{measure}'}.png"
 
 
 @torch.no_grad()

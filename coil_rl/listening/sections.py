@@ -13,10 +13,11 @@ from scipy.ndimage import gaussian_filter1d
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.track import AS_COMPLEX, Track, resample
-from coil_rl.listening.measures import PICTURES
+from coil_rl.listening.measures import drawn
 from coil_rl.report import draw_listening_map, write_csv
 
 if TYPE_CHECKING:
@@ -88,11 +89,9 @@ class TrackSections:
         self.tracks, self.bin = list(tracks), bin
         self.lines = [smooth_line(track) for track in tracks]  # [P, 2] m each
         self.sections = [classify(line, turn_radius, approach) for line in self.lines]  # [P] each, indices in SECTIONS
-        points = np.full((len(self.lines), max(map(len, self.lines)), 2), 1e6)  # padded with points far away
-        section = np.zeros(points.shape[:2], dtype=np.int64)
-        for index, (line, of_points) in enumerate(zip(self.lines, self.sections, strict=True)):
-            points[index, : len(line)], section[index, : len(line)] = line, of_points
-        self._points, self._section = torch.as_tensor(points, dtype=torch.float32), torch.as_tensor(section)
+        points = [torch.as_tensor(line, dtype=torch.float32) for line in self.lines]
+        self._points = pad_sequence(points, batch_first=True, padding_value=1e6)  # padded with points far away
+        self._section = pad_sequence([torch.as_tensor(of_line) for of_line in self.sections], batch_first=True)
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
         """Return the index of the `track` and of the nearest `point` of its middle line, [B] each, of a state [B]."""
@@ -107,12 +106,9 @@ class TrackSections:
     def draw(self, data: Survey, folder: Path) -> None:
         """Draw a map of the tracks for each measure, and write the table along the tracks as `listening.csv`."""
         table = self.table(data)
-        for measure, (title, label) in PICTURES.items():
-            if not np.isnan(data.measures[measure]).all():
-                lines, values = self.measure_on_lines(data, table, measure)
-                suffix = "" if measure == "intervention" else f"_{measure}"
-                path = folder / f"listening{suffix}.png"
-                draw_listening_map(self.tracks, lines, values, path, label=label, title=title)
+        for measure, title, label, name in drawn(data.measures):
+            lines, values = self.measure_on_lines(data, table, measure)
+            draw_listening_map(self.tracks, lines, values, folder / name, label=label, title=title)
         write_csv(table, folder / "listening.csv")
 
     def table(self, data: Survey) -> list[dict[str, Any]]:

@@ -14,7 +14,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from coil_rl.listening.measures import PICTURES
+from coil_rl.listening.measures import drawn
 from coil_rl.report import style, write_csv
 
 if TYPE_CHECKING:
@@ -50,16 +50,12 @@ class WholeEpisode:
                 | {name: float(values[k]) for name, values in means.items()}
                 for k in range(len(states))
             ]
-        for measure, (title, label) in PICTURES.items():
-            if np.isnan(data.measures[measure]).all():
-                continue
-            suffix = "" if measure == "intervention" else f"_{measure}"
-            strokes = style.strong_strokes(data.guides)
-            handles: list[Artist] = [
-                Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide)
-                for guide, stroke in strokes.items()
-            ]
-            with style.picture(folder / f"listening{suffix}.png", title, handles, 3.6) as figure:
+        strokes = style.strong_strokes(data.guides)
+        handles: list[Artist] = [
+            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide) for guide, stroke in strokes.items()
+        ]
+        for measure, title, label, name in drawn(data.measures):
+            with style.picture(folder / name, title, handles, 3.6) as figure:
                 axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
                 style.lighten(axes)
                 for guide, stroke in strokes.items():

@@ -1,7 +1,5 @@
 """The console programs. Modules here import torch and all that depends on it only inside their functions."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -9,8 +9,6 @@ second:
         return run(config)
 """
 
-from __future__ import annotations
-
 import functools
 import logging
 import os
@@ -73,10 +71,9 @@ def _record(config: DictConfig, key: str) -> None:
 
 
 def overrides() -> list[tuple[str, str]]:
-    """Return the top-level key and the text of each override on the command line."""
+    """Return the full key and the text of each override on the command line."""
     texts = HydraConfig.get().overrides.task
-    keys = (text.lstrip("+~").partition("=")[0].rpartition("@")[2] for text in texts)
-    return [(re.split(r"[./]", key)[0], text) for key, text in zip(keys, texts, strict=True)]
+    return [(text.lstrip("+~").partition("=")[0].rpartition("@")[2], text) for text in texts]
 
 
 def check_used(used: Iterable[str], reason: str) -> None:
@@ -87,7 +84,7 @@ def check_used(used: Iterable[str], reason: str) -> None:
     """
     known = (*used, *COMMON_KEYS)
     for key, text in overrides():
-        if key not in known:
+        if re.split(r"[./]", key)[0] not in known:
             raise UserError(f"{text} has no effect: {reason}; what can be changed is {', '.join(known)}")
 
 

@@ -1,7 +1,5 @@
 """`coil-distill`: train a network that imitates each guide, and print how well it does."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -13,7 +13,13 @@ from coil_rl.programs import app
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
 OF_A_RUN = ("run", "track", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
-OWN = ("repeats", "policy", "gif", "advice")  # keys of `evaluation` that belong to the command, not to the run
+OWN = (
+    "repeats",
+    "policy",
+    "gif",
+    "advice",
+    "fallback",
+)  # keys of `evaluation` that belong to the command, not to the run
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 if TYPE_CHECKING:
@@ -25,14 +31,15 @@ def evaluate(config: DictConfig) -> float:
     import torch
 
     from coil_rl.train.evaluate_run import evaluate_run, report_outcome
+    from coil_rl.train.fallback import build_fallback
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    seed, agent = config.seed, None
-    if config.run is not None:
-        config, agent = restore(Path(config.run), config)
-    evaluate_run(config, agent, folder, seed)
+    seed, agent, run = config.seed, None, config.run
+    if run is not None:
+        config, agent = restore(Path(run), config)
+    evaluate_run(config, agent, folder, seed, build_fallback(config, Path(run or ""), agent))
     return report_outcome(folder)
 
 
@@ -52,8 +59,9 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
 
     config = read_config(run, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
+    own: Any = OmegaConf.to_container(config.evaluation.advice, resolve=True)
     # The advice of the training is evaluated too.
-    resolved["evaluation"]["advice"] |= resolved["degrade"]
+    resolved["evaluation"]["advice"] = own | resolved["evaluation"]["advice"] | resolved["degrade"]
     changed = list(OWN)
     for key, text in app.overrides() if HydraConfig.initialized() else ():
         if key == "track":
@@ -61,10 +69,10 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
                 raise UserError(f"{text} has no effect: run={run} has no tracks; leave it out")
             config.track = resolved["track"]
             changed += OF_A_TRACK
-        elif key == "evaluation":
-            changed.append(text.lstrip("+~").partition("=")[0].partition(".")[2])
+        elif key.startswith("evaluation."):
+            changed.append(key.removeprefix("evaluation."))
     values = OmegaConf.create(resolved["evaluation"])
-    for key in filter(None, changed):
+    for key in changed:
         OmegaConf.update(config.evaluation, key, OmegaConf.select(values, key), merge=False, force_add=True)
     if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
         config.evaluation.env["cases"] = config.evaluation.cases

@@ -1,7 +1,5 @@
 """`coil-info`: print the versions that a bug report needs."""
 
-from __future__ import annotations
-
 from coil_rl.train.run_folder import versions
 
 

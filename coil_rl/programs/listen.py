@@ -1,7 +1,5 @@
 """`coil-listen`: how much a trained agent uses the advice of each guide, and where."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +33,7 @@ def listen(config: DictConfig) -> None:
     from tqdm import tqdm
 
     from coil_rl.files import write_text
+    from coil_rl.learners.anchor import AnchoredHead
     from coil_rl.listening import WholeEpisode
     from coil_rl.listening import survey as surveys
     from coil_rl.listening.measures import split_policy
@@ -73,6 +72,9 @@ def listen(config: DictConfig) -> None:
     if np.isnan(data.measures["gradient"]).all():
         del columns["gradient"]
         notes = NOTES + DISCRETE_NOTE
+    for head in (part for part in agent.modules() if isinstance(part, AnchoredHead)):
+        weights = zip(data.guides, head.weight.tolist(), strict=True)
+        notes += "\nWeight of the anchor: " + ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights) + "."
     page = f"{markdown_table(table, columns)}\n{notes}"
     write_text(folder / "listening.md", page)
     write_csv(table, folder / "listening_sections.csv")

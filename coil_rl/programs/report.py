@@ -13,7 +13,6 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
 
 if TYPE_CHECKING:
-    from coil_rl.report import Interval
     from coil_rl.report.comparison import Comparison
     from coil_rl.report.runs import Run
 
@@ -25,7 +24,7 @@ MAX_CURVES = 8  # in one plot
 def report(config: DictConfig) -> None:
     """Compare the finished runs; print the page, and write it, all numbers and the figures to the first folder."""
     from coil_rl.files import write_text
-    from coil_rl.report import draw_intervals, page, write_csv
+    from coil_rl.report import draw_intervals, driver_intervals, page, write_csv
     from coil_rl.report.comparison import compare
     from coil_rl.report.runs import read_runs
 
@@ -52,24 +51,10 @@ def report(config: DictConfig) -> None:
     for name, by_actions in {"report.csv": tables, "report_cases.csv": cases}.items():
         rows = [{"actions": actions} | row for actions, table in by_actions.items() for row in table]
         write_csv(rows, folder / name)
-    panels = {f"{kind} actions": _intervals(comparison) for kind, comparison in compared.items()}
+    panels = {f"{kind} actions": driver_intervals(each.agents or each.guides) for kind, each in compared.items()}
     draw_intervals(panels, folder / "report.png", measure="reward / guide's (mean)" if normalised else "reward (mean)")
     _draw_curves(finished, next(iter(compared.values())), folder / "report_curves.png")
     print(f"{text}\nreport: see {folder}")
-
-
-def _intervals(comparison: Comparison) -> list[Interval]:
-    """Return the agents, each with its guide as a line; the guides if there is no agent."""
-    from coil_rl.report import Interval
-
-    return [
-        Interval(
-            group.title, group.score.mean, group.score.low, group.score.high,
-            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
-            guide=group.guide.score.mean if group.guide else None, hollow=bool(group.advice),
-        )
-        for group in comparison.agents or comparison.guides
-    ]  # fmt: skip
 
 
 def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> None:

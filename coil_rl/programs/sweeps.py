@@ -4,8 +4,6 @@ The folder of a run contains its fingerprint (`hydra.sweep.subdir` of the file),
 The experiment files set `existing=resume`: in a repeated sweep a finished run returns at once.
 """
 
-from __future__ import annotations
-
 import shlex
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`coil-train`: train a method, evaluate the policy beside its guides and draw the results."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

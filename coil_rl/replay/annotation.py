@@ -1,7 +1,5 @@
 """Annotated recordings: a copy with the policies' steering and the perceived cones, and a Foxglove layout for it."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Open-loop evaluation of policies on recordings: their actions at every scan of a drive that they did not control."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any

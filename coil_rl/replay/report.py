@@ -1,7 +1,5 @@
 """Report of an open-loop evaluation: a Markdown table, a row per scan, and a figure of the steering over time."""
 
-from __future__ import annotations
-
 import os
 from typing import Any
 
@@ -100,7 +98,7 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
     seconds, invalid = result.recording.seconds, ~result.both_valid
     strokes = style.strong_strokes(result.policies)
     if RECORDED in result.steering:
-        strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHES)
+        strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHED)
     handles: list[Artist] = [
         Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=1.6, label=name) for name, stroke in strokes.items()
     ]

@@ -111,9 +111,19 @@ class Comparison:
     agents: tuple[Group, ...]
 
     @property
+    def groups(self) -> tuple[Group, ...]:
+        """Guides and agents."""
+        return (*self.guides, *self.agents)
+
+    @property
     def normalised(self) -> bool:
         """Whether scores are fractions of a guide's reward; otherwise they are rewards."""
-        return any(group.reference is not None for group in (*self.guides, *self.agents))
+        return any(group.reference is not None for group in self.groups)
+
+    @property
+    def score(self) -> tuple[str, str]:
+        """Name and number format of the scores."""
+        return ("reward / guide's", ".3f") if self.normalised else ("reward", ".1f")
 
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
         """Return one row per driver, guides first.
@@ -122,7 +132,7 @@ class Comparison:
         `against` is "guide", with the same seed; `p` is corrected for all rows.
         """
         rows: list[dict[str, Any]] = []
-        for group in (*self.guides, *self.agents):
+        for group in self.groups:
             means, pairs = group.means(), self._pairs(group, against)
             difference = pairs.difference if pairs else Estimate(np.nan)
             rows.append({
@@ -140,7 +150,7 @@ class Comparison:
         """Return one row per driver and case."""
         return [
             {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "case": case} | group.means(index)
-            for group in (*self.guides, *self.agents)
+            for group in self.groups
             for index, case in enumerate(group.cases)
         ]
 

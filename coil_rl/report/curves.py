@@ -1,7 +1,5 @@
 """Evaluation curves: in one plot or in a grid, in numbers, and with the training phases of one run."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Mapping, Sequence
@@ -14,6 +12,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import EngFormatter
 from numpy.typing import NDArray
 
 from coil_rl.report import style
@@ -23,8 +22,8 @@ from coil_rl.report.statistics import mean_interval
 Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, object]]
 
-UNITS = {1e6: "frames (millions)", 1e3: "frames (thousands)"}
 RETURNS = "return from the cases of the evaluation"
+ANCHOR = "learner/anchor"  # column of metrics.csv
 GRID_COLUMNS = 3
 GRID_ROW_HEIGHT = 1.55  # inches
 AGENT = "#1a1a1a"  # the agent in `draw_phases`
@@ -44,15 +43,13 @@ def draw_learning_curves(
 
     Args:
         runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with "frames" (env frames
-            so far) and "evaluation/return", which may be missing, None or NaN.
+            so far) and "evaluation/return", which may be missing, None or NaN; of an anchored policy also with the
+            weight of its guide, drawn as thin steps.
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
     """
-    if not any(len(seeds) for seeds in runs.values()):
-        raise ValueError(f"A learning curve needs at least one run; got none for: {', '.join(runs) or 'no label'}.")
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    unit, unit_name = _frame_unit(curves)
     strokes = style.strong_strokes(runs)
     handles: list[Artist] = []
     for label, stroke in strokes.items():
@@ -61,20 +58,40 @@ def draw_learning_curves(
     if any(len(seeds) > 1 for seeds in runs.values()):
         handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
     with style.picture(path, title, handles, 4.2) as figure:
-        axes = figure.add_subplot(xlabel=unit_name, ylabel=RETURNS)
+        axes = figure.add_subplot(xlabel="frames", ylabel=RETURNS)
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         style.lighten(axes)
         for label, stroke in strokes.items():
             frames, mean, low, high = curves[label]
-            axes.plot(frames / unit, mean, color=stroke.colour, ls=stroke.linestyle, lw=1.6)
-            axes.fill_between(frames / unit, low, high, color=stroke.colour, alpha=0.16, lw=0)
+            axes.plot(frames, mean, color=stroke.colour, ls=stroke.linestyle, lw=1.6)
+            axes.fill_between(frames, low, high, color=stroke.colour, alpha=0.16, lw=0)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
+        _draw_anchors(axes, runs, strokes)
         for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
-            axes.axhline(value, color=colour, ls=(0, style.DASHES), lw=1.3, zorder=1.5)
+            axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
             axes.annotate(
                 f"{name}\n{value:.1f}", (1, value), (4, 0), xycoords=("axes fraction", "data"),
                 textcoords="offset points", va="center", color=colour,
             )  # fmt: skip
+
+
+def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]) -> None:
+    """Draw the weights of the guides of anchored policies, on an axis inside the plot."""
+    anchors = {label: [points(rows, ANCHOR) for rows in seeds] for label, seeds in runs.items()}
+    if not any(len(curve) for curves in anchors.values() for curve in curves):
+        return
+    weights = axes.twinx()
+    for label, curves in anchors.items():
+        for curve in curves:
+            weights.step(*curve.T, where="pre", color=strokes[label].colour, lw=0.7, alpha=0.6)
+    weights.set_ylim(0, 4)  # at the foot of the plot
+    weights.set_yticks([0, 1])
+    weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
+    weights.spines[:].set_visible(False)
+    weights.annotate(
+        "weight of the guide", (0.01, 0.01), xycoords="axes fraction", size=7, color=style.QUIET, va="bottom"
+    )
 
 
 def draw_curve_grid(
@@ -87,10 +104,7 @@ def draw_curve_grid(
 
     `runs` are as in `draw_learning_curves`; `guides` are the mean returns of the guides by label.
     """
-    if not runs:
-        raise ValueError("A grid of learning curves needs at least one label; got none.")
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    unit, unit_name = _frame_unit(curves)
     columns = min(GRID_COLUMNS, len(runs))
     rows = -(-len(runs) // columns)
     handles: list[Artist] = [
@@ -99,27 +113,28 @@ def draw_curve_grid(
         Line2D([], [], color=style.KERB, lw=0.6, label="the others"),
     ]
     if guides:
-        handles.append(Line2D([], [], color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.0, label="its guide"))
+        handles.append(Line2D([], [], color=style.GUIDES[0], ls=style.DASHED, lw=1.0, label="its guide"))
     height = 0.35 + GRID_ROW_HEIGHT * rows
     with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
             for other, (other_frames, other_mean, _, _) in curves.items():
                 if other != label:
-                    axes.plot(other_frames / unit, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
-            axes.fill_between(frames / unit, low, high, color=style.AGENTS[0], alpha=0.25, lw=0, zorder=2.1)
-            axes.plot(frames / unit, mean, color=style.AGENTS[0], lw=1.5, zorder=2.2)
+                    axes.plot(other_frames, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
+            axes.fill_between(frames, low, high, color=style.AGENTS[0], alpha=0.25, lw=0, zorder=2.1)
+            axes.plot(frames, mean, color=style.AGENTS[0], lw=1.5, zorder=2.2)
             if guides and label in guides:
-                axes.axhline(guides[label], color=style.GUIDES[0], ls=(0, style.DASHES), lw=1.0)
+                axes.axhline(guides[label], color=style.GUIDES[0], ls=style.DASHED, lw=1.0)
             axes.set_title(f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label, size=9, loc="left")
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(left=0)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
             axes.tick_params(labelbottom=True)
         for axes in figure.axes[len(runs) :]:
             axes.remove()
         for axes in figure.axes[:-columns]:
             axes.tick_params(labelbottom=False)
-        figure.supxlabel(unit_name, size=9)
+        figure.supxlabel("frames", size=9)
         figure.supylabel(RETURNS, size=9)
 
 
@@ -135,21 +150,18 @@ def draw_phases(
     The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`, at least one, and
     `guides` the names in the order of the run.
     """
-    if not rows:
-        raise ValueError("A plot of phases needs at least one row; got none.")
     colours = {name: style.AGENTS[index % len(style.AGENTS)] for index, name in enumerate(guides)}
     updates = [row for row in rows if not math.isnan(row["learner/guide"])]  # without the state before the first one
-    unit, unit_name = _unit(float(rows[-1]["frames"]))
-    frames = _column(updates, "frames") / unit
+    frames = _column(updates, "frames")
     handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent")]
-    alone: dict[str, Any] = {"ls": (0, style.DASHES), "lw": 1.1, "marker": "o", "ms": 4}
+    alone: dict[str, Any] = {"ls": style.DASHED, "lw": 1.1, "marker": "o", "ms": 4}
     handles += [Line2D([], [], color=colour, label=f"{name} alone", **alone) for name, colour in colours.items()]
     handles.append(Patch(color=style.QUIET, alpha=0.25, lw=0, label="a guide learns (its colour)"))
     with style.picture(path, title, handles, 6.8, h_pad=0.08) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1, 1))
-        top.plot(*(points(rows, RETURN) / (unit, 1)).T, color=AGENT, lw=1.6, marker="o", ms=3)
+        top.plot(*points(rows, RETURN).T, color=AGENT, lw=1.6, marker="o", ms=3)
         for name, colour in colours.items():
-            top.plot(*(points(rows, f"guide/{name}") / (unit, 1)).T, color=colour, **alone)
+            top.plot(*points(rows, f"guide/{name}").T, color=colour, **alone)
             middle.plot(frames, _column(updates, f"learner/moved_{name}"), color=colour, lw=1.4)
         _draw_rates(bottom, frames, updates, list(colours.values()))
         for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
@@ -159,7 +171,8 @@ def draw_phases(
             axes.set_xlim(left=0)
             _shade_phases(axes, frames, updates, list(colours.values()))
         middle.set_ylim(bottom=0)
-        bottom.set_xlabel(unit_name)
+        bottom.set_xlabel("frames")
+        bottom.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
 def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
@@ -213,21 +226,9 @@ def frames_until(frames: Sequence[float] | Array, returns: Sequence[float] | Arr
 
 def points(run: Rows, key: str) -> Array:
     """Return frames and values [P, 2] of the rows with a finite value, sorted by frames."""
-    for row in run:
-        if "frames" not in row:
-            raise ValueError(f"A row of a learning curve has no 'frames'; it has: {', '.join(row) or 'nothing'}.")
     table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
     curve: Array = table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
     return curve
-
-
-def _frame_unit(curves: Mapping[str, tuple[Array, Array, Array, Array]]) -> tuple[float, str]:
-    return _unit(max((frames[-1] for frames, *_ in curves.values() if len(frames)), default=0.0))
-
-
-def _unit(last: float) -> tuple[float, str]:
-    """Return the unit of an axis of frames that ends at `last`, and its name."""
-    return next(((unit, name) for unit, name in UNITS.items() if last >= unit), (1.0, "frames"))
 
 
 def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:

@@ -5,21 +5,24 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from coil_rl.report import style
 
+if TYPE_CHECKING:
+    from coil_rl.report.comparison import Group
+
 COLOUR = style.AGENTS[0]
 BAR: dict[str, Any] = {"color": COLOUR, "alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
 SEED: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3.6, "mfc": style.QUIET, "mec": "none", "alpha": 0.5}
 DOT: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5.5, "mfc": COLOUR, "mec": style.BACKGROUND, "mew": 0.6}
 HOLLOW: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5.0, "mfc": style.BACKGROUND, "mec": COLOUR, "mew": 1.1}
-GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": (0, style.DASHES), "lw": 1.3, "zorder": 1.5}
+GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.3, "zorder": 1.5}
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,18 @@ class Interval:
     hollow: bool = False  # hollow dot, for a variant of the driver above
 
 
+def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
+    """Return a row for the score of each driver, with its single seeds and its guide."""
+    return [
+        Interval(
+            group.title, group.score.mean, group.score.low, group.score.high,
+            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
+            guide=group.guide.score.mean if group.guide else None, hollow=bool(group.advice),
+        )
+        for group in groups
+    ]  # fmt: skip
+
+
 def draw_intervals(
     panels: Mapping[str, Sequence[Interval]],
     path: str | os.PathLike[str],
@@ -45,8 +60,6 @@ def draw_intervals(
     """Draw one panel, or several side by side that share their rows; `panels` are at least one row by heading."""
     rows = [row for panel in panels.values() for row in panel]
     labels = list(dict.fromkeys(row.label for row in rows))
-    if not labels:
-        raise ValueError("An interval plot needs at least one driver; got none.")
     legend = {
         "all seeds": (DOT, True),
         "all seeds, advice altered": (HOLLOW, any(row.hollow for row in rows)),

@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import ListedColormap, Normalize, to_rgb
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal
@@ -58,7 +58,7 @@ def draw_lines(
         path: output file, 8 inches wide.
         crashed: per driver, whether each of the N lines ended in a crash; a cross marks it.
     """
-    driven, ended = _check_lines(tracks, lines, crashed)
+    driven, ended = _finite(lines), crashed or {}
     strokes = style.strokes(driven)
     handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label) for label, s in strokes.items()]
     plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)])
@@ -68,7 +68,7 @@ def draw_lines(
             for lap in _split_laps(line, track):
                 xy = (lap + offset).T
                 plot.axes.plot(*xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
-            if ended[label][index] and len(line):
+            if label in ended and ended[label][index] and len(line):
                 plot.axes.plot(*(line[-1] + offset), mfc=stroke.colour, zorder=5 + z / 100, **CRASH)
     style.save(plot.figure, path)
 
@@ -87,7 +87,7 @@ def animate_lines(
     The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the maximum duration in
     `seconds`; lines are never shown slower than they were driven.
     """
-    driven, ended = _check_lines(tracks, lines, crashed)
+    driven, ended = _finite(lines), crashed or {}
     colours = {label: stroke.colour for label, stroke in style.strokes(driven).items()}
     handles = [Line2D([], [], mfc=colour, label=label, **CAR) for label, colour in colours.items()]
     plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
@@ -100,11 +100,11 @@ def animate_lines(
         for label, index in itertools.product(driven, range(len(tracks))):
             (tail,) = axes.plot([], [], color=colours[label], lw=2.4, alpha=0.6)
             (head,) = axes.plot([], [], mfc=colours[label], **CAR)
-            cars.append((driven[label][index] + plot.offsets[index], ended[label][index], tail, head))
+            crashes = label in ended and ended[label][index]
+            cars.append((driven[label][index] + plot.offsets[index], crashes, tail, head))
         canvas.draw()
     # Drawing the tracks in every frame would take three times as long.
     background = canvas.copy_from_bbox(figure.bbox)
-    palette = _palette(list(colours.values()))
     duration = (max([1, *(len(line) for line, *_ in cars)]) - 1) / rate
     speed = max(1.0, duration / seconds)
     times = np.linspace(0, duration, 1 + math.ceil(duration / speed * FPS)).tolist()
@@ -122,25 +122,14 @@ def animate_lines(
                 axes.draw_artist(head)
             clock.set_text(f"{time:.1f} s ({speed:.0f}× speed)" if speed >= 1.5 else f"{time:.1f} s")
             figure.draw_artist(clock)
-            image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-            yield image.quantize(palette=palette, dither=Image.Dither.NONE)
+            yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
     images = frames()
+    first = next(images).quantize(method=Image.Quantize.FASTOCTREE)  # its legend has the colours of all drivers
+    others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
     durations = [round(1000 / FPS)] * (len(times) - 1) + [round(1000 * PAUSE)]
     with whole_file(path) as unfinished:
-        next(images).save(unfinished, format="GIF", save_all=True, append_images=images, duration=durations, loop=0)
-
-
-def _palette(drivers: Sequence[str]) -> Image.Image:
-    """Return one palette for all frames: shades of all colours on the background and on the track."""
-    grounds = np.array([to_rgb(style.BACKGROUND), to_rgb(style.ASPHALT)])
-    fixed = (style.INK, style.LEFT_CONE, style.RIGHT_CONE)
-    colours = np.array([to_rgb(colour) for colour in (*fixed, *dict.fromkeys(drivers))])
-    weights = np.linspace(0, 1, 255 // (2 * len(colours)))[:, None, None, None]
-    shades = (1 - weights) * grounds[:, None] + weights * colours
-    image = Image.new("P", (1, 1))
-    image.putpalette((255 * shades).round().astype(int).flatten().tolist())
-    return image
+        first.save(unfinished, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
 
 
 def draw_listening_map(
@@ -164,12 +153,6 @@ def draw_listening_map(
     """
     driven = [np.asarray(line, dtype=np.float64) for line in lines]
     measured = {guide: [np.asarray(row, dtype=np.float64) for row in rows] for guide, rows in values.items()}
-    for guide, rows in measured.items():
-        if [row.shape for row in rows] != [line.shape[:1] for line in driven] or len(driven) != len(tracks):
-            shapes = f"{[row.shape for row in rows]} for lines of {[line.shape for line in driven]}"
-            raise ValueError(
-                f"the values of {guide!r} have the shapes {shapes}; give one per point, one line per track"
-            )
     highest = float(np.nanmax([0.0, *np.concatenate([row for rows in measured.values() for row in rows])])) or 1.0
     colours = ScalarMappable(Normalize(0, highest), MEASURE_COLOURS)
     panels = [(guide, index) for guide in measured for index in range(len(tracks))]
@@ -220,21 +203,10 @@ def _split_laps(line: Array, track: Track) -> list[Array]:
     return [line[start : stop + 1] for start, stop in itertools.pairwise(cuts)]
 
 
-def _check_lines(
-    tracks: Sequence[Track],
-    lines: Mapping[str, Sequence[ArrayLike]],
-    crashed: Mapping[str, Sequence[bool]] | None,
-) -> tuple[dict[str, list[Array]], dict[str, list[bool]]]:
-    """Return the finite rows [T, 2] of all lines, and whether each ended in a crash."""
-    ended = {label: list((crashed or {}).get(label, [False] * len(tracks))) for label in lines}
-    driven: dict[str, list[Array]] = {}
-    for label, driver_lines in lines.items():
-        if not len(driver_lines) == len(ended[label]) == len(tracks):
-            given = f"{len(driver_lines)} lines and {len(ended[label])} crash marks"
-            raise ValueError(f"{label!r} has {given} for {len(tracks)} tracks; give one for each")
-        arrays = [np.asarray(line, dtype=np.float64) for line in driver_lines]
-        arrays = [array if array.size else array.reshape(0, 2) for array in arrays]
-        if wrong := [list(array.shape) for array in arrays if array.ndim != 2 or array.shape[1] != 2]:
-            raise ValueError(f"a line of {label!r} has the shape {wrong[0]}; it takes [T, 2]")
+def _finite(lines: Mapping[str, Sequence[ArrayLike]]) -> dict[str, list[Array]]:
+    """Return the lines [T, 2] without the rows that are not finite."""
+    driven = {}
+    for label, of_driver in lines.items():
+        arrays = [np.asarray(line, dtype=np.float64).reshape(-1, 2) for line in of_driver]
         driven[label] = [array[np.isfinite(array).all(axis=1)] for array in arrays]
-    return driven, ended
+    return driven

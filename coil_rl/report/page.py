@@ -1,7 +1,5 @@
 """Markdown page of `coil-report`: tables of drivers, cases, parts of the reward and training, and how to read them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from statistics import mean
@@ -46,15 +44,13 @@ LEARNING_COLUMNS = {
 
 def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
     """Return the section for one kind of actions; `rows` are `comparison.table(against)`."""
-    score, spec = ("reward / guide's", ".3f") if comparison.normalised else ("reward", ".1f")
+    score, spec = comparison.score
     names = {"other": _other(against), "score": score}
     hidden = {"advice"} if not any(row["advice"] for row in rows) else set()
     hidden |= {"difference cell", "p", "better"} if against is None else set()
     hidden |= set() if comparison.normalised else {"reward"}
     hidden |= {key for key in ("completed", "crashes") if all(row[key] is None for row in rows)}
-    measures = {
-        name: each for group in (*comparison.guides, *comparison.agents) for name, each in group.measures.items()
-    }
+    measures = {name: each for group in comparison.groups for name, each in group.measures.items()}
     columns = {key: (text.format(**names), spec) for key, (text, spec) in COLUMNS.items() if key not in hidden}
     columns |= {
         name: (measure.title, measure.format)
@@ -62,19 +58,24 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
         if measure.title and name not in ("completed", "crashed") and not name.startswith(PER_STEP)
     }
     columns |= NEEDS_GUIDE
-    cells = [
-        {
-            "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
-            "difference cell": Estimate(*(row[f"difference{end}"] for end in ("", "_low", "_high"))).cell(f"+{spec}"),
-        }
-        for row in rows
-    ]
-    table = markdown_table([{**row, **cell} for row, cell in zip(rows, cells, strict=True)], columns)
+    table = markdown_table(with_cells(rows, spec), columns)
     parts = [
         *_parts(comparison, TERM, "term of the reward", ".1f"),
         *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
     ]
     return "\n\n".join([f"## {heading}", table, *parts, _cases(comparison)])
+
+
+def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
+    """Return rows of `Comparison.table` with `score cell` and `difference cell`, which show the intervals too."""
+    return [
+        {
+            **row,
+            "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
+            "difference cell": Estimate(*(row[f"difference{end}"] for end in ("", "_low", "_high"))).cell(f"+{spec}"),
+        }
+        for row in rows
+    ]
 
 
 def guide_training(runs: Sequence[Run]) -> list[str]:
@@ -148,7 +149,7 @@ def _other(against: str | None) -> str:
 
 def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[str]:
     """Return the table of the columns with a prefix, PER_STEP or TERM; no table without such columns."""
-    groups = {group.title: group.parts(prefix) for group in (*comparison.guides, *comparison.agents)}
+    groups = {group.title: group.parts(prefix) for group in comparison.groups}
     rows = [{"driver": title} | parts for title, parts in groups.items() if parts]
     names = dict.fromkeys(key for row in rows for key in list(row)[1:])
     columns = {"driver": (heading, "")} | {name: (name.removeprefix(prefix), spec) for name in names}
@@ -156,9 +157,8 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
 
 
 def _cases(comparison: Comparison) -> str:
-    groups = (*comparison.guides, *comparison.agents)
-    names = list(dict.fromkeys(case for group in groups for case in group.cases))
+    names = list(dict.fromkeys(case for group in comparison.groups for case in group.cases))
     if len(names) > MAX_CASES:
         return f"The rewards in each of the {len(names)} cases are in report_cases.csv."
-    rows = [{"driver": group.title} | group.by_seed("reward").mean().to_dict() for group in groups]
+    rows = [{"driver": group.title} | group.by_seed("reward").mean().to_dict() for group in comparison.groups]
     return markdown_table(rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names})

@@ -1,7 +1,5 @@
 """Configuration, evaluation and learning curve of finished runs, read from their folders."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace

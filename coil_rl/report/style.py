@@ -1,13 +1,10 @@
 """Shared style of all figures: colours safe for colour-blind readers, fonts, title, legend and output file."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -32,8 +29,8 @@ RIGHT_CONE = "#1f6fd6"
 # After Okabe and Ito and after Tol, without the colours of the cones, the strongest first.
 AGENTS = ("#d55e00", "#009e73", "#aa3377", "#56b4e9", "#332288")
 GUIDES = ("#4d4d4d", "#8a8a8a")
-DASHES = (3.2, 1.6)
-SECOND_ROUND = (6.0, 1.2)  # dashes of a colour that is used again
+DASHED = (0.0, (3.2, 1.6))
+SECOND_ROUND = (0.0, (6.0, 1.2))  # of a colour that is used again
 
 LETTERS: Any = {
     "font.family": "DejaVu Sans",
@@ -47,24 +44,18 @@ LETTERS: Any = {
 LETTERS |= {f"{axis}tick.{key}": colour for axis in "xy" for key, colour in (("color", KERB), ("labelcolor", INK))}
 
 
-@dataclass(frozen=True)
-class Stroke:
-    """Line style of one driver or method: colour, and lengths of dash and gap in line widths; None for solid."""
+class Stroke(NamedTuple):
+    """Colour and line style of one driver or method."""
 
     colour: str
-    dash: tuple[float, float] | None = None
-
-    @property
-    def linestyle(self) -> str | tuple[float, tuple[float, float]]:
-        """The line style as Matplotlib takes it."""
-        return "-" if self.dash is None else (0.0, self.dash)
+    linestyle: Any = "-"
 
 
 def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke for each driver: grey dashes if its name starts with "guide", the next strong colour if not."""
     labels = list(labels)
     guides = [label for label in labels if label.lower().startswith("guide")]
-    greys = {label: Stroke(GUIDES[index % len(GUIDES)], DASHES) for index, label in enumerate(guides)}
+    greys = {label: Stroke(GUIDES[index % len(GUIDES)], DASHED) for index, label in enumerate(guides)}
     strong = strong_strokes(label for label in labels if label not in greys)
     return {label: greys.get(label) or strong[label] for label in labels}
 
@@ -72,7 +63,7 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke in a strong colour for each label, dashed once the colours are used again."""
     return {
-        label: Stroke(AGENTS[index % len(AGENTS)], SECOND_ROUND if index >= len(AGENTS) else None)
+        label: Stroke(AGENTS[index % len(AGENTS)], SECOND_ROUND if index >= len(AGENTS) else "-")
         for index, label in enumerate(labels)
     }
 

@@ -1,7 +1,5 @@
 """Tables of results as Markdown, aligned for terminals, and as CSV."""
 
-from __future__ import annotations
-
 import csv
 import os
 from collections.abc import Mapping, Sequence

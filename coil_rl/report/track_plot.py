@@ -49,8 +49,6 @@ class TrackPlot:
         dpi: int = style.RESOLUTION,
         groups: int = 1,
     ) -> None:
-        if not tracks:
-            raise ValueError("A map of tracks needs at least one track; got none.")
         with mpl.rc_context(style.LETTERS):
             self.figure = Figure(dpi=dpi)
             self.canvas = FigureCanvasAgg(self.figure)

@@ -1,7 +1,5 @@
 """Figure 25 of the paper: features of thin and thick cones, and the accuracy of their classifier."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

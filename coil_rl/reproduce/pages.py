@@ -1,7 +1,5 @@
 """Markdown pages of reproduced results: verdicts on the paper's claims, pages, and RESULTS.md with all pages."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Measures of a robot's recorded drives: smoothness, laps, crashes and the driven line."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

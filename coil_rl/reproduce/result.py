@@ -1,7 +1,5 @@
 """Base classes of reproduced results."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Tables 6 and 7 of the paper: drives of a robot, measured from recordings."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass

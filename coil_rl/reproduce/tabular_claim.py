@@ -5,8 +5,6 @@ every case is a yes or a no; next to it Q-learning without advice. The agent obs
 of a few; the guide always observes the state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -42,7 +40,7 @@ NEARLY = 0.01  # of a score
 ROUNDING = 1e-9  # scores of equal policies differ by less
 LOWEST_SCORE = -0.2  # in the picture
 LINE_OFFSET = 1.6  # points between coinciding lines
-PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": (0, style.SECOND_ROUND)}
+PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": style.SECOND_ROUND}
 
 NOTES = """
 Scores: 0 for the random policy, 1 for the optimal policy of each world; means over {worlds} random worlds, one seed
@@ -165,7 +163,7 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
     }
     handles: list[Artist] = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
     handles.append(Line2D([], [], label="plain Q-learning", **PLAIN))
-    handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=(0, style.DASHES), label="guide alone (its colour)"))
+    handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=style.DASHED, label="guide alone (its colour)"))
     with picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
         grid = figure.subplots(2, len(views), sharex=True, sharey="row", squeeze=False)
         for (share, score), view in zip(grid.T, views, strict=True):
@@ -175,7 +173,7 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
                 shift = ScaledTranslation(0, (index - 1.5) * LINE_OFFSET / 72, figure.dpi_scale_trans)
                 share.plot(steps, group["shares"], transform=share.transData + shift, clip_on=False, **line)
                 score.plot(steps, group["coil_scores"], **line)
-                score.axhline(group["guide_score"], color=line["color"], lw=1.2, ls=(0, style.DASHES), zorder=1.5)
+                score.axhline(group["guide_score"], color=line["color"], lw=1.2, ls=style.DASHED, zorder=1.5)
                 if group["guide_score"] < LOWEST_SCORE:
                     text = f"↓ guide {group['guide']} at {group['guide_score']:.2f}"
                     where = {"xycoords": "axes fraction", "textcoords": "offset points"}

@@ -1,7 +1,5 @@
 """Table 1 and figure 6 of the paper: values of the toymaker, and the convergence of value iteration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -123,7 +121,7 @@ def _draw_differences(labels: list[str], differences: Array, path: Path) -> None
 
 
 def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, path: Path) -> None:
-    dashes: Any = {"color": style.QUIET, "ls": (0, style.DASHES), "lw": 1.3}
+    dashes: Any = {"color": style.QUIET, "ls": style.DASHED, "lw": 1.3}
     colours = dict(zip(states, style.AGENTS, strict=False))
     handles: list[Artist] = [Line2D([], [], color=c, lw=2, label=f"V of {state}") for state, c in colours.items()]
     handles.append(Line2D([], [], label="limit", **dashes))

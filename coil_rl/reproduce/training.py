@@ -1,7 +1,5 @@
 """Table 4 and figure 22 of the paper: the return of the policies of a training run."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,14 +1,13 @@
 """Table 5 of the paper: every driver on unseen tracks."""
 
-from __future__ import annotations
-
-import dataclasses
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from coil_rl.report import Interval, draw_intervals, markdown_table, write_csv
-from coil_rl.report.comparison import Group, compare, paired
+from coil_rl.report import draw_intervals, driver_intervals, markdown_table, write_csv
+from coil_rl.report.comparison import Comparison, Group, compare, paired
+from coil_rl.report.page import with_cells
 from coil_rl.report.runs import GUIDE, TERM, Run
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
@@ -24,7 +23,6 @@ PAPER_UNSEEN = {
     "coil": {"lap_time": 48.48, "smoothness": 0.606, "reward": 632.9},
 }
 MEASURE_COLUMNS = {"lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"), "reward": ("reward", ".1f")}
-SCORE = "reward / guide's"
 MAX_TRACK_COLUMNS = 8
 
 # The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
@@ -39,13 +37,13 @@ CLAIMS = (
 )
 
 NOTES = """
-Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. {score}:
-each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean over
-the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks of
-different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
-seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track:
-they also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions,
-as imitations and the guide, are in both tables."""
+Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. Reward /
+guide's: each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean
+over the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks
+of different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
+seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track: they
+also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions, as
+imitations and the guide, are in both tables."""
 
 
 class Table5(WorldsResult):
@@ -57,78 +55,70 @@ class Table5(WorldsResult):
         for world, experiments in self.worlds.items():
             of_world = [run for experiment in experiments for run in runs[experiment]]
             episodes += [{"world": world} | row for run in of_world for row in _episodes(run)]
-            groups = worlds[world] = {actions: self._drivers(of_world, actions) for actions in ACTIONS}
-            rows = {actions: [self._row(group, groups[actions]) for group in groups[actions]] for actions in ACTIONS}
+            compared = worlds[world] = {actions: self._compare(of_world, actions) for actions in ACTIONS}
+            rows = {actions: self._rows(compared[actions]) for actions in ACTIONS}
             parts += pages.world_heading(world)
             if not world:
                 parts.append(_paper_table(rows))
-                panels = {f"{actions} actions": _intervals(groups[actions]) for actions in ACTIONS}
-                title, measure = "Table 5: unseen tracks", f"{_score(groups[ACTIONS[0]])[0]} (mean)"
+                panels = {f"{actions} actions": driver_intervals(compared[actions].agents) for actions in ACTIONS}
+                title, measure = "Table 5: unseen tracks", f"{compared[ACTIONS[0]].score[0]} (mean)"
                 draw_intervals(panels, stem.with_suffix(".png"), measure=measure, title=title)
             for actions in ACTIONS:
-                parts += [f"**{actions.capitalize()} actions**", self._driver_table(rows[actions], groups[actions])]
-                parts += [] if world else [_track_table(groups[actions], stem.name)]
+                table = self._driver_table(rows[actions], compared[actions].score[0])
+                parts += [f"**{actions.capitalize()} actions**", table]
+                parts += [] if world else [_track_table(compared[actions].groups, stem.name)]
         write_csv(episodes, stem.with_suffix(".csv"))
-        notes = NOTES.strip().format(against=self.against, score=SCORE.capitalize())
+        notes = NOTES.strip().format(against=self.against)
         return "\n\n".join([*parts, notes, self._claims(worlds)])
 
-    def _drivers(self, runs: Sequence[Run], actions: str) -> list[Group]:
-        """Return the guide, then the agents by rank; agents with only deterministic actions are always included."""
+    def _compare(self, runs: Sequence[Run], actions: str) -> Comparison:
+        """Return the guide, and the agents by rank; agents with only deterministic actions are always included."""
         agents: dict[str, Group] = {}
-        comparison, deterministic = compare(runs, actions), compare(runs, "deterministic")
-        for group in (*comparison.agents, *deterministic.agents):
+        compared, deterministic = compare(runs, actions), compare(runs, "deterministic")
+        for group in (*compared.agents, *deterministic.agents):
             if not group.advice:
                 agents.setdefault(group.name, group)
-        guide = (agents[self.against].guide if self.against in agents else None) or comparison.guides[0]
+        guide = (agents[self.against].guide if self.against in agents else None) or compared.guides[0]
+        guide = replace(guide, name=GUIDE)
         ranked = sorted(agents.values(), key=lambda group: group.rank)
-        return [dataclasses.replace(guide, name=GUIDE), *ranked]
+        return Comparison((guide,), tuple(replace(agent, guide=guide) for agent in ranked))
 
-    def _row(self, group: Group, groups: Sequence[Group]) -> dict[str, Any]:
-        """Return the measures of a driver, and its comparison with the guide and with `against`."""
-        _, spec = _score(groups)
-        row: dict[str, Any] = {"driver": group.name, "seeds": group.seeds, **group.means()}
-        row |= {"crashes": group.crashes, "score cell": group.score.cell(spec)}
-        others = {other.name: other for other in groups if other.name != group.name}
-        row |= {"difference": None, "better": None, "over_guide": None}
-        if group.is_guide:
-            return row
-        if self.against in others and (pairs := paired(group, others[self.against])):
-            row |= {"difference": pairs.difference.cell(f"+{spec}"), "better": pairs.better}
-        if pairs := paired(group, others[GUIDE]):
-            row["over_guide"] = pairs.better
-        return row
+    def _rows(self, comparison: Comparison) -> list[dict[str, Any]]:
+        """Return the measures of each driver, and its comparison with `against` and with the guide."""
+        rows = with_cells(comparison.table(self.against), comparison.score[1])
+        over_guide = [row["better"] for row in comparison.table(GUIDE)]
+        return [row | {"over_guide": better} for row, better in zip(rows, over_guide, strict=True)]
 
-    def _driver_table(self, rows: Sequence[Row], groups: Sequence[Group]) -> str:
+    def _driver_table(self, rows: Sequence[Row], score: str) -> str:
         terms = dict.fromkeys(key for row in rows for key in row if key.startswith(TERM))
         return markdown_table(rows, {
             "driver": ("driver", ""), "seeds": ("seeds", ""), "completed": ("completed", ".0%"),
-            "crashes": ("seeds with a crash (95 %)", ""), "score cell": (f"{_score(groups)[0]} (95 %)", ""),
-            "difference": (f"difference to {self.against} (95 %)", ""),
+            "crashes": ("seeds with a crash (95 %)", ""), "score cell": (f"{score} (95 %)", ""),
+            "difference cell": (f"difference to {self.against} (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
             "over_guide": ("better than the guide", ".0%"), **MEASURE_COLUMNS,
             **{key: (key.removeprefix(TERM), ".1f") for key in terms},
         })  # fmt: skip
 
-    def _claims(self, worlds: Mapping[str, Mapping[str, Sequence[Group]]]) -> str:
+    def _claims(self, worlds: Mapping[str, Mapping[str, Comparison]]) -> str:
         """Return the verdicts in all worlds; in variants of the main world only those on the reward."""
         rows: list[dict[str, Any]] = []
         for world, by_actions in worlds.items():
             for claim, measure, driver, other, sign in CLAIMS:
                 cells = {}
-                for actions, groups in by_actions.items():
-                    by_name = {group.name: group for group in groups}
+                for actions, comparison in by_actions.items():
+                    by_name = {group.name: group for group in comparison.groups}
                     if driver in by_name and other in by_name and (measure == "reward" or not world):
                         in_score = measure == "reward"
                         pairs = paired(by_name[driver], by_name[other], "score" if in_score else measure)
-                        spec = f"+{_score(groups)[1] if in_score else MEASURE_COLUMNS[measure][1]}"
+                        spec = f"+{comparison.score[1] if in_score else MEASURE_COLUMNS[measure][1]}"
                         cells[actions] = pages.Claim(pairs.difference, spec, sign) if pairs else None
                 if cells:
-                    relative = _score(by_actions[ACTIONS[0]])[0] == SCORE
-                    paper = _paper_difference(measure, driver, other, relative)
+                    paper = _paper_difference(measure, driver, other, by_actions[ACTIONS[0]].normalised)
                     rows.append({"claim": f"{claim}, {world}" if world else claim, "paper": paper} | cells)
         crashes: dict[str, str] = {"claim": "Nobody crashes", "paper": "0%"}
-        for actions, groups in worlds[""].items():
-            drivers = [group for group in groups if group.name in PAPER_UNSEEN]
+        for actions, comparison in worlds[""].items():
+            drivers = [group for group in comparison.groups if group.name in PAPER_UNSEEN]
             details = ", ".join(f"{group.name} {group.crashes}" for group in drivers)
             crashes[actions] = pages.certain_verdict(not any(group.means()["crashed"] for group in drivers), details)
         headings = {"paper": "paper"} | {actions: f"ours, {actions} actions (95 %)" for actions in ACTIONS}
@@ -172,11 +162,6 @@ def _track_table(groups: Sequence[Group], name: str) -> str:
     return markdown_table(rows, {"driver": ("mean reward", "")} | {track: (track, "") for track in tracks})
 
 
-def _score(groups: Sequence[Group]) -> tuple[str, str]:
-    """Return name and format of the score of drivers, which begin with the guide."""
-    return (SCORE, ".3f") if groups[0].reference is not None else MEASURE_COLUMNS["reward"]
-
-
 def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> str | None:
     if driver not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
@@ -190,14 +175,3 @@ def _episodes(run: Run) -> list[dict[str, Any]]:
     """Return the CSV rows of a run, one per driver and track."""
     rows = run.evaluation.to_dict("records")
     return [{"label": run.label, "seed": run.seed} | row for row in rows]
-
-
-def _intervals(groups: Sequence[Group]) -> list[Interval]:
-    return [
-        Interval(
-            group.name, group.score.mean, group.score.low, group.score.high, guide=groups[0].score.mean,
-            points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
-        )
-        for group in groups
-        if not group.is_guide
-    ]  # fmt: skip

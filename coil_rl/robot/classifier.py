@@ -1,7 +1,5 @@
 """Training and evaluation of the cone classifier: support vector machines on the features of LiDAR clusters."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Sequence

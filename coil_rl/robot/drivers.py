@@ -1,7 +1,5 @@
 """Recorded drives of guides and trained agents on the simulated robot; existing recordings are reused."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -4,33 +4,19 @@ In the paper's order: `mdp`, Markov decision processes as arrays; `planning`, dy
 `learning`, control from sampled transitions; `coil`, the same methods with a guide's advice.
 """
 
-from coil_rl.tabular.coil import observations_with_advice, with_advice
-from coil_rl.tabular.learning import (
-    ModelEstimate,
-    QLearningResult,
-    Simulator,
-    Transitions,
-    q_learning,
-    sample_transitions,
-)
-from coil_rl.tabular.mdp import MDP, garnet, toymaker
-from coil_rl.tabular.planning import PlanningResult, policy_evaluation, policy_iteration, solve, value_iteration
-
-__all__ = [
-    "MDP",
-    "ModelEstimate",
-    "PlanningResult",
-    "QLearningResult",
-    "Simulator",
-    "Transitions",
-    "garnet",
-    "observations_with_advice",
-    "policy_evaluation",
-    "policy_iteration",
-    "q_learning",
-    "sample_transitions",
-    "solve",
-    "toymaker",
-    "value_iteration",
-    "with_advice",
-]
+from coil_rl.tabular.coil import observations_with_advice as observations_with_advice
+from coil_rl.tabular.coil import with_advice as with_advice
+from coil_rl.tabular.learning import ModelEstimate as ModelEstimate
+from coil_rl.tabular.learning import QLearningResult as QLearningResult
+from coil_rl.tabular.learning import Simulator as Simulator
+from coil_rl.tabular.learning import Transitions as Transitions
+from coil_rl.tabular.learning import q_learning as q_learning
+from coil_rl.tabular.learning import sample_transitions as sample_transitions
+from coil_rl.tabular.mdp import MDP as MDP
+from coil_rl.tabular.mdp import garnet as garnet
+from coil_rl.tabular.mdp import toymaker as toymaker
+from coil_rl.tabular.planning import PlanningResult as PlanningResult
+from coil_rl.tabular.planning import policy_evaluation as policy_evaluation
+from coil_rl.tabular.planning import policy_iteration as policy_iteration
+from coil_rl.tabular.planning import solve as solve
+from coil_rl.tabular.planning import value_iteration as value_iteration

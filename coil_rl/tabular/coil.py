@@ -9,8 +9,6 @@ guide: following the guide becomes one of its policies, so the best COIL policy 
 is no guarantee that Q-learning finds it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -21,13 +19,8 @@ from coil_rl.tabular.planning import value_iteration
 def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
     """Return the world with the guide's advice in the state.
 
-    Args:
-        mdp: the world.
-        guide: the guide's policy, actions [S] or their probabilities [S, A]; then one is drawn whenever a state is
-            entered.
-
-    Returns:
-        A world with S * A states: s * A + g is state s with the advice g.
+    The guide's policy is actions [S], or their probabilities [S, A]; then one is drawn whenever a state is entered. Of
+    the S * A states of the result, s * A + g is state s with the advice g.
 
     Example:
         >>> from coil_rl.tabular import toymaker, with_advice
@@ -51,8 +44,7 @@ def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
 
 def observations_with_advice(observations: ArrayLike, actions: int) -> Integers:
     """Return the observation of each state of `with_advice` [S * A], given that of each state without advice [S]."""
-    pairs: Integers = (np.asarray(observations)[:, None] * actions + np.arange(actions)).ravel()
-    return pairs
+    return (np.asarray(observations)[:, None] * actions + np.arange(actions)).ravel()
 
 
 def optimal_guide(mdp: MDP) -> Array:

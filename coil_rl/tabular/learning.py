@@ -5,8 +5,6 @@ optimal Q if every action is taken infinitely often in every state, and the step
 infinite sum and their squares a finite one (theorem 2.3). `epsilon` provides the first, `power` the second.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +19,7 @@ from coil_rl.tabular.mdp import MDP, Array, Integers
 class Simulator:
     """Step-by-step simulation of a Markov decision process.
 
-    Args:
-        mdp: the world.
-        rng: random generator.
-        episode_steps: maximum length of an episode; None for no limit. A terminal state also ends an episode.
+    An episode ends in a terminal state, or after `episode_steps`, None for no limit.
     """
 
     def __init__(self, mdp: MDP, rng: Generator, episode_steps: int | None = None) -> None:
@@ -141,16 +136,13 @@ def q_learning(
     Args:
         mdp: the world; the learner uses its `Simulator` only.
         steps: number of transitions.
-        rng: random generator.
+        rng: of the world and of the actions.
         epsilon: probability of a random action, more than 0.
         power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem 2.3).
         episode_steps: steps after which an episode is truncated; the last state's value is still bootstrapped.
         observations: [S] integers from 0, the observation of each state. States with the same observation share their
             row of Q, and the theorem no longer applies.
         snapshots: numbers of steps after which Q is added to `history`.
-
-    Raises:
-        ValueError: for a value outside its range.
 
     Example:
         >>> import numpy as np
@@ -189,10 +181,6 @@ def q_learning(
 
 
 def _cumulative(probabilities: Array) -> Array:
-    """Return the cumulative distribution along the last axis.
-
-    It ends at exactly 1, so that a draw below 1 never selects an outcome of probability 0.
-    """
-    total = probabilities.cumsum(axis=-1)
-    normalised: Array = total / total[..., -1:]
-    return normalised
+    """Return the cumulative distribution along the last axis; it ends at exactly 1."""
+    total = probabilities.cumsum(axis=-1)  # a draw below 1 must never select an outcome of probability 0
+    return total / total[..., -1:]

@@ -1,7 +1,5 @@
 """Finite Markov decision processes as arrays, and two examples: the toymaker and random worlds."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -22,8 +20,7 @@ class MDP:
         R: [S, A, S], R[s, a, s'] the reward of that transition.
         gamma: discount factor, from 0 to less than 1.
         start: [S], start-state probabilities; uniform by default.
-        states: their names, for tables and messages; numbers by default.
-        actions: their names.
+        states, actions: their names, for tables and messages; numbers by default.
 
     Raises:
         ValueError: if the arrays are no Markov decision process, naming the entry.
@@ -68,19 +65,16 @@ class MDP:
     def terminal(self) -> NDArray[np.bool_]:
         """[S], whether each state is terminal."""
         stays = np.einsum("sas->sa", self.P) == 1
-        terminal: NDArray[np.bool_] = (stays & (self.r == 0)).all(axis=1)
-        return terminal
+        return (stays & (self.r == 0)).all(axis=1)
 
     def q(self, V: Array) -> Array:
         """Return r + gamma P V, [S, A], given state values V [S]."""
-        values: Array = self.r + self.gamma * self.P @ V
-        return values
+        return self.r + self.gamma * self.P @ V
 
     def probabilities(self, policy: ArrayLike) -> Array:
         """Return a policy, which is actions [S] or their probabilities [S, A], as probabilities [S, A].
 
-        Raises:
-            ValueError: if it is neither, naming the state.
+        If it is neither, a `ValueError` names the state.
         """
         array = np.asarray(policy)
         count, choices = self.P.shape[:2]
@@ -135,11 +129,8 @@ def toymaker(gamma: float = 0.95) -> MDP:
 def garnet(states: int, actions: int, rng: Generator, *, branches: int = 3, gamma: float = 0.9) -> MDP:
     """Return a random world (a Garnet, Archibald et al. 1995).
 
-    Each action leads to a few randomly drawn states, with probabilities from a flat Dirichlet distribution and a
-    normally distributed reward that does not depend on the next state.
-
-    Raises:
-        ValueError: unless `branches`, the number of possible next states of an action, is from 1 to `states`.
+    Each action leads to `branches` randomly drawn states, from 1 to `states`, with probabilities from a flat Dirichlet
+    distribution and a normally distributed reward that does not depend on the next state.
     """
     if not 1 <= branches <= states:
         raise ValueError(f"branches={branches} must be between 1 and states={states}")

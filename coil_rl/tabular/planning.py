@@ -3,8 +3,6 @@
 All three iterate the Bellman equation as an assignment, V <- r + gamma P V, a contraction with factor gamma.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Validation of YAML nodes against the signatures of the classes and functions that they call."""
 
-from __future__ import annotations
-
 import inspect
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
@@ -119,15 +117,14 @@ def _path(location: Iterable[int | str], value: Any) -> tuple[int | str, ...]:
 
 def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     """Return the parameters of a target, including those that a class of this project passes on to its base class."""
+    has_init = inspect.isclass(target) and target.__init__ is not object.__init__
     try:
-        if not inspect.isclass(target) or target.__init__ is object.__init__:
-            return list(_signature(target).parameters.values())
         # The signature of a class with a metaclass, such as an env of TorchRL, is that of the metaclass.
-        own = list(_signature(target.__init__).parameters.values())[1:]
+        own = list(_signature(target.__init__ if has_init else target).parameters.values())[has_init:]
     except ValueError:  # builtins without a signature
         return None
-    passes_on = "__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own)
-    if not passes_on or not target.__module__.startswith("coil_rl."):
+    passes_on = has_init and ("__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own))
+    if not inspect.isclass(target) or not passes_on or not target.__module__.startswith("coil_rl."):
         return own
     base = _parameters(target.__bases__[0])
     if base is None:

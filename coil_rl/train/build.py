@@ -1,7 +1,6 @@
 """Construction of the env, the guides and the learner of a configuration; the only caller of `instantiate`."""
 
-from __future__ import annotations
-
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,6 +14,7 @@ from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.train.arguments import check_arguments, yaml_text
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import nested_key
 
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
@@ -36,7 +36,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         cause = error.__cause__
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
-            raise UserError(f"{name}: {message}") from error
+            raise UserError(f"{name}: {textwrap.shorten(str(message), 500, placeholder=' ...')}") from error
         if isinstance(cause, ImportError):
             extra = "python -m pip install 'coil-rl[gym]' installs Gymnasium"
             raise UserError(f"{name}: {node['_target_']} needs a package that is missing ({cause}); {extra}") from error
@@ -187,8 +187,7 @@ def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorD
 
 def observed_keys(config: DictConfig) -> list[NestedKey]:
     """Return the keys of the entries that the agent of a configuration observes."""
-    keys = [*config.observes, *(config.method.observes or ())]
-    return [key if isinstance(key, str) else tuple(key) for key in keys]
+    return [nested_key(key) for key in (*config.observes, *(config.method.observes or ()))]
 
 
 def learner_kind(config: DictConfig) -> str:

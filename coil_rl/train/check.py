@@ -3,8 +3,6 @@
 A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from collections.abc import Callable, Iterable
@@ -14,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import TypeAdapter, ValidationError
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -23,26 +21,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.train import build
 from coil_rl.train.arguments import validation_message
-from coil_rl.train.build import (
-    build,
-    build_all,
-    build_bare_env,
-    build_env,
-    build_guided_env,
-    build_guides,
-    build_learner,
-    cases_node,
-    check_node,
-    learner_kind,
-    observed_keys,
-    trains_guides,
-)
 from coil_rl.train.config import TrainConfig
 from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
 from coil_rl.train.evaluate_run import build_evaluation, build_pictures, recorded
 from coil_rl.train.measures import measures_of
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_actions import UnfitActionError
 
 # Kind of a learner: description and example.
 KINDS = {
@@ -70,14 +56,14 @@ def check_parts(config: DictConfig) -> None:
     cases, record = len(build_evaluation(config).cases), recorded(build_pictures(config))
     if trains or OmegaConf.select(config, "run") is None:
         _check_drivers(config, cases, record.values())
-    build_all(config.evaluation.advice, "evaluation.advice")
+    build.build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
             raise UserError(f"label={config.label} cannot be used: it must not be empty, begin with guide or contain /")
         _check_training(config)
         if config.method.transforms:
             for advice in config.evaluation.advice:
-                _check_cases(config, cases, partial(build_env, advice=advice))
+                _check_cases(config, cases, partial(build.build_env, advice=advice))
 
 
 def check_values(config: DictConfig) -> None:
@@ -96,8 +82,15 @@ def check_values(config: DictConfig) -> None:
         if isinstance(budget, DictConfig) and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH:
             raise UserError(f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}")
     for name in ("device", "env.device"):
-        if isinstance(device := OmegaConf.select(config, name), str):
-            _check_device(name, device)
+        if not isinstance(device := OmegaConf.select(config, name), str):
+            continue
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+            raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
+        try:
+            torch.empty(0, device=device)
+        except (AssertionError, RuntimeError) as error:
+            problem = str(error).splitlines()[0]
+            raise UserError(f"{name}={device} cannot be used ({problem}); take {name}=cpu") from error
 
 
 def _unknown_key(config: DictConfig, *path: str) -> str:
@@ -108,17 +101,8 @@ def _unknown_key(config: DictConfig, *path: str) -> str:
     return f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}{did_you_mean(key, known)}"
 
 
-def _check_device(key: str, device: str) -> None:
-    if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
-        raise UserError(f"{key}={device} must be cpu, cuda, or one GPU such as cuda:0")
-    try:
-        torch.empty(0, device=device)
-    except (AssertionError, RuntimeError) as error:
-        raise UserError(f"{key}={device} cannot be used ({str(error).splitlines()[0]}); take {key}=cpu") from error
-
-
 def _check_learner_kind(config: DictConfig) -> None:
-    kind, (purpose, example) = learner_kind(config), KINDS[config.method.learner]
+    kind, (purpose, example) = build.learner_kind(config), KINDS[config.method.learner]
     if kind != config.method.learner:
         learner = config.learner["_target_"].rpartition(".")[2]
         raise UserError(
@@ -128,31 +112,25 @@ def _check_learner_kind(config: DictConfig) -> None:
 
 
 def _check_drivers(config: DictConfig, cases: int, recorded: Iterable[NestedKey]) -> None:
-    env = _evaluation_env(config, recorded)
-    if not config.guide and not config.method.needs_guide and "advice" not in config.method.transforms:
-        return
-    guides = build_guides(config)
-    for name, guide in guides.items():
-        check_guide_in_env(guide, env, f"guide.{name}")
-    build_all(config.degrade, "degrade")
-    if config.degrade:
-        _check_cases(config, cases, partial(build_guided_env, guides=guides))
-
-
-def _evaluation_env(config: DictConfig, recorded: Iterable[NestedKey]) -> EnvBase:
-    """Return the env with one row, or raise a `UserError` if policies cannot be evaluated in it."""
     name = config.env.get("_target_", "it")
     if "num_envs" not in config.env:
         raise UserError(
             f"env: {name} has no key num_envs, so no policy can act in it; choose another env "
             "(for the actions of policies on a recording: coil-replay recording=FILE)"
         )
-    check_node(config.env, "env")
-    env = build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
+    build.check_node(config.env, "env")
+    env = build.build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
     check_measures(config, env)
     for key in recorded:
         _check_entry(env, key, "evaluation.pictures")
-    return env
+    if not config.guide and not config.method.needs_guide and "advice" not in config.method.transforms:
+        return
+    guides = build.build_guides(config)
+    for name, guide in guides.items():
+        check_guide_in_env(guide, env, f"guide.{name}")
+    build.build_all(config.degrade, "degrade")
+    if config.degrade:
+        _check_cases(config, cases, partial(build.build_guided_env, guides=guides))
 
 
 def check_measures(config: DictConfig, env: EnvBase) -> None:
@@ -187,9 +165,10 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
         advised.state_dict()  # a state that no checkpoint can hold is refused before the training
+    except UnfitActionError as error:
+        raise UserError(f"{name}: its action {error.problem}") from error
     except (KeyError, TypeError, ValueError) as error:
-        problem = str(error.args[0] if error.args else error).replace("the action of guide 'guide'", "its action")
-        raise UserError(f"{name}: {problem}") from error
+        raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
     except RuntimeError as error:
         problem = str(error).partition("\n")[0]
         raise UserError(f"{name}: it cannot act on the observations of this env ({problem})") from error
@@ -204,14 +183,14 @@ def _check_cases(config: DictConfig, cases: int, build_drive: Callable[..., Any]
 
 
 def _check_training(config: DictConfig) -> None:
-    if not observed_keys(config):
+    if not build.observed_keys(config):
         raise UserError("observes=[]: the agent has no observations; give the entries of the env that it observes")
-    env = build_env(config, config.training.env)
-    if trains_guides(config) and config.degrade:
+    env = build.build_env(config, config.training.env)
+    if build.trains_guides(config) and config.degrade:
         raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
-    guides = build_guides(config) if trains_guides(config) else {}
+    guides = build.build_guides(config) if build.trains_guides(config) else {}
     check_proxies(config, guides_without_parameters(guides))
-    learner = build_learner(config, env, guides_with_untrained_proxies(config) if guides else None)
+    learner = build.build_learner(config, env, guides_with_untrained_proxies(config) if guides else None)
     frames = config.budget.num_envs * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)
     if 2 * minibatches > frames:
@@ -220,7 +199,7 @@ def _check_training(config: DictConfig) -> None:
             f"advantages; a batch has budget.num_envs x budget.steps = {frames} frames"
         )
     grouped = config.track and getattr(learner, "validate", False) and learner.group_key is not None
-    if grouped and len(build(config.track.train, "track.train")) == 1:
+    if grouped and len(build.build(config.track.train, "track.train")) == 1:
         raise UserError(
             "track.train gives one track, which cannot be left out to validate; set learner.group_key=null, "
             "or learner.validate=false"
@@ -230,9 +209,9 @@ def _check_training(config: DictConfig) -> None:
             given = ", ".join(cases)
             raise UserError(f"evaluation.curve.cases has {given}; give {EVALUATION} and {SELECTION}, or none")
         for name in cases:
-            build_env(config, cases_node(config, name))
+            build.build_env(config, build.cases_node(config, name))
     if config.logger:
-        check_node(config.logger, "logger")
+        build.check_node(config.logger, "logger")
     _check_watch(config, env)
 
 
@@ -251,6 +230,8 @@ def _check_watch(config: DictConfig, env: EnvBase) -> None:
         if group not in groups:
             raise UserError(f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}")
         for name, key in keys.items():
+            if not isinstance(key, ListConfig):
+                raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
             _check_entry(env, key, f"watch.{group}.{name}")
 
 

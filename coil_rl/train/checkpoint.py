@@ -1,7 +1,5 @@
 """Checkpoint files: complete, unaltered and free of code, or refused."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import sys

@@ -3,18 +3,17 @@
 The types of the fields are checked by OmegaConf, their ranges by pydantic (`coil_rl.train.check.check_values`).
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
+import re
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from hydra.core.config_store import ConfigStore
 from omegaconf import MISSING, DictConfig, OmegaConf
-from pydantic import ConfigDict, Field, GetPydanticSchema
-from pydantic_core import core_schema
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema
+from pydantic_core import PydanticCustomError, core_schema
 
 from coil_rl.train.measures import REDUCTIONS
 
@@ -26,6 +25,13 @@ IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust", "proxy.fol
 def one_of(*choices: str) -> GetPydanticSchema:
     """Return the schema of a string with a few possible values; OmegaConf supports no `Literal`."""
     return GetPydanticSchema(lambda *_: core_schema.literal_schema(list(choices)))
+
+
+def format_of_numbers(spec: str) -> str:
+    """Return a format for numbers, as Python's `format` takes it, with a width of at most two digits."""
+    if not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
+        raise PydanticCustomError("format", "a format of numbers, such as .1f")
+    return spec
 
 
 # Most upper limits only prevent that a typing error fills the memory.
@@ -55,16 +61,13 @@ class BudgetConfig(NodeConfig):
 
 @dataclass
 class CurveConfig(NodeConfig):
-    """Evaluation of the policies that a run keeps, see `coil_rl.train.curve`.
-
-    `num_envs` is the number of cases in a set; `env` and, by the name of a set, `cases` are overrides of the env.
-    """
+    """Evaluation of the policies that a run keeps, see `coil_rl.train.curve`; `env` and `cases` are overrides."""
 
     points: Annotated[int, Field(ge=1, le=1000)] = 16
     batches: Annotated[int, Field(ge=1, le=1000)] = 1
-    num_envs: Envs = 1
+    num_envs: Envs = 1  # number of cases in a set
     env: dict[str, Any] = field(default_factory=dict)
-    cases: dict[str, dict[str, Any]] = field(default_factory=dict)
+    cases: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the name of a set
 
 
 @dataclass
@@ -85,20 +88,17 @@ class MeasureConfig(NodeConfig):
     at_least: float | None = None
     at_most: float | None = None
     title: str = ""
-    format: str = ".1f"
+    format: Annotated[str, AfterValidator(format_of_numbers)] = ".1f"
 
 
 @dataclass
 class EvaluationConfig(NodeConfig):
-    """Evaluation of a policy.
-
-    `cases` is their number, or a node that gives their names; `sections` are those of coil-listen.
-    """
+    """Evaluation of a policy; `cases` is their number, or a node that gives their names."""
 
     cases: Any = 1
     measures: dict[str, MeasureConfig] = field(default_factory=dict)
     pictures: dict[str, Any] = field(default_factory=dict)
-    sections: dict[str, Any] | None = None
+    sections: dict[str, Any] | None = None  # of coil-listen
     env: dict[str, Any] = field(default_factory=dict)
     curve: CurveConfig = field(default_factory=CurveConfig)
     advice: dict[str, Any] = field(default_factory=dict)
@@ -106,17 +106,15 @@ class EvaluationConfig(NodeConfig):
     policy: WhichPolicy = "last"
     guides: Annotated[str, one_of("phases", "ends")] = "phases"
     gif: bool = True
+    fallback: bool = False
 
 
 @dataclass
 class MethodConfig(NodeConfig):
-    """Transforms of the agent, the kind of its learner, and what it observes besides the env's entries.
-
-    `observes: null` means no agent.
-    """
+    """Transforms of the agent, the kind of its learner, and what it observes besides the env's entries."""
 
     name: str = MISSING
-    observes: list[Any] | None = MISSING
+    observes: list[Any] | None = MISSING  # None: no agent
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
     learner: Annotated[str, one_of("agent", "imitation", "guides")] = "agent"
@@ -267,11 +265,7 @@ class ReproduceConfig(ProgramConfig):
 
 
 def fingerprint(config: DictConfig) -> str:
-    """Return ten hexadecimal digits that identify the numbers of a training run.
-
-    Args:
-        config: of a run, also as Hydra composes it, with the node `hydra` and interpolations.
-    """
+    """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
     identity: dict[str, Any] = {
         str(key): OmegaConf.to_container(config[key], resolve=True) if OmegaConf.is_config(config[key]) else config[key]
         for key in sorted(map(str, config))

@@ -4,8 +4,6 @@ The return in training says little about a policy: its actions are sampled, and 
 happen to end. The kept policies act deterministically, all of them in one batch, each from the same starts (cases).
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

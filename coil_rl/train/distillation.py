@@ -5,8 +5,6 @@ A proxy is the policy of an imitation run. The configuration of that run follows
 folder.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
@@ -17,7 +15,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 
 from coil_rl.errors import UserError
-from coil_rl.files import whole_folder
+from coil_rl.files import temporary, whole_file
 from coil_rl.train import load
 from coil_rl.train.build import build_env, build_guides, build_learner
 from coil_rl.train.config import TrainConfig, fingerprint
@@ -33,8 +31,7 @@ def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
 def proxy_config(config: DictConfig, name: str) -> DictConfig:
     """Return the configuration of the run that trains the proxy of one guide of a training run.
 
-    Raises:
-        UserError: if the key `proxy` of the training run describes no network.
+    The key `proxy` of the training run must describe a network.
     """
     if config.proxy is None or config.proxy.method.observes is None:
         raise UserError("proxy.method.observes: a proxy needs observations; give proxy=network")
@@ -56,12 +53,17 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
-    """Copy proxies into the folder of the run that uses them, given their run folders by the name of the guide."""
-    with whole_folder(folder / load.PROXIES) as unfinished:
-        for name, run in runs.items():
-            (unfinished / name).mkdir()
-            for file in FILES:
-                shutil.copyfile(run / file, unfinished / name / file)
+    """Copy proxies into the folder of the run that uses them, all at once.
+
+    `runs` are their run folders by the name of the guide.
+    """
+    unfinished = temporary(folder / load.PROXIES)
+    unfinished.mkdir()
+    for name, run in runs.items():
+        for file in FILES:
+            with whole_file(unfinished / name / file) as copy:
+                shutil.copyfile(run / file, copy)
+    unfinished.rename(folder / load.PROXIES)
 
 
 def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictModuleBase]:

@@ -1,7 +1,5 @@
 """Evaluation of a run: its agent and its guides in all cases, as tables and figures."""
 
-from __future__ import annotations
-
 import csv
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -21,8 +19,10 @@ from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
+from coil_rl.report.statistics import mean_interval
 from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node, what_guides_see
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.train.fallback import Fallback
 from coil_rl.train.measures import Measure, measures_of, summarise
 
 COLUMNS = {"driver": ("driver", ""), "advice": ("advice", ""), "actions": ("actions", ""), "case": ("case", "")}
@@ -71,11 +71,18 @@ def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
     return {name: key for picture in pictures for name, key in picture.record.items()}
 
 
-def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int) -> None:
+def evaluate_run(
+    config: DictConfig,
+    agent: TensorDictModuleBase | None,
+    folder: Path,
+    seed: int,
+    fallback: Fallback | None = None,
+) -> None:
     """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 
     Each guide drives each case once. An agent drives it once with deterministic actions, `evaluation.repeats` times
-    with sampled ones if it samples, and once with each advice of `evaluation.advice` instead of its own.
+    with sampled ones if it samples, once with each advice of `evaluation.advice` instead of its own, and once with a
+    `fallback`.
 
     The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
     """
@@ -108,6 +115,9 @@ def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder:
             add(result[:count], config.label, advice)
             if repeats:
                 add(result[count:], config.label, advice, "sampled")
+        if fallback is not None:
+            result = evaluation.drive(build_env(config, {**config.evaluation.env, "num_envs": count}), fallback)
+            add(result, f"{config.label} or guide")
     write_csv(episodes, folder / "episodes.csv")
     for picture in pictures:
         picture.draw(drives, folder)
@@ -117,9 +127,27 @@ def evaluate_run(config: DictConfig, agent: TensorDictModuleBase | None, folder:
     page = [markdown_table(table if few else [row for row in table if row["case"] == "mean"], columns)]
     page += [] if few else [f"Means of {count} cases; all are in evaluation.csv."]
     sees = what_guides_see(config).items()
+    guides = driver_names(config.guide) if agent is not None and count > 1 else []
+    page += [not_worse(drives[config.label], drives[guide], guide) for guide in guides]
+    page += [f"With fallback the guide acted in {fallback.share(result):.1%} of the steps."] if fallback else []
     page += [f"guide.{name} sees: {what}; it may know more than the agent." for name, what in sees]
     write_text(folder / "evaluation.md", "\n\n".join(page))
     write_csv(table, folder / "evaluation.csv")
+
+
+def not_worse(agent: EvaluationResult, guide: EvaluationResult, name: str) -> str:
+    """Return the sentence whether an agent is not worse than a guide in the same cases, by the t interval of the loss.
+
+    The answer is yes if the whole interval is above minus 1 % of the guide's mean reward, no if it is below.
+    """
+    pairs = zip(agent.episodes, guide.episodes, strict=True)
+    _, low, high = mean_interval([mine["reward"] - other["reward"] for mine, other in pairs])
+    margin = -0.01 * abs(guide.mean_reward)
+    answer = "yes" if low >= margin else "no" if high < margin else "undecided"
+    return (
+        f"Not worse than {name} on these {len(agent.episodes)} cases: {answer} "
+        f"(difference of the rewards {low:+.1f} to {high:+.1f}, 95 % interval; 1 % is allowed)."
+    )
 
 
 def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) -> None:

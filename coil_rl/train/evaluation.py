@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
+from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey, expand_as_right
 from torch import Tensor
@@ -72,7 +72,7 @@ def evaluate_policy(
         cases: names of the cases; row i is case i modulo their number. By default rows are numbered.
         tick: called after every step.
     """
-    measures = {"reward": Measure("reward", "sum"), **(measures or {})}
+    measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, history = Totals(measures), []
     for after, running in episodes(env, policy, sampled=sampled, tick=tick):
         totals.add(after, running)
@@ -126,12 +126,12 @@ class Totals:
         return self.measures[name].reduction
 
     def add(self, after: TensorDictBase, running: Tensor) -> None:
-        """Add the entries after a step of the rows that are `running`, one flag a row."""
+        """Add the entries after a step of the rows that are `running`, one flag a row; several agents' are summed."""
         running = running.reshape(-1)
         self.steps = self.steps.to(running.device) + running.long()
         for reduction, names in self.groups.items():
             group = [self.measures[name] for name in names]
-            values = torch.stack([after[measure.entry].reshape(-1).double() for measure in group])
+            values = torch.stack([after[m.entry].double().reshape(len(running), -1).sum(-1) for m in group])
             mask = running.expand_as(values)
             if any(measure.where for measure in group):
                 mask = mask & torch.stack([running if m.where is None else after[m.where].reshape(-1) for m in group])

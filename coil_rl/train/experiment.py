@@ -1,7 +1,5 @@
 """The training loop: collect a batch, update, log, keep and judge policies, save checkpoints."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -53,12 +51,14 @@ class Learner(Protocol):
 
 
 class Probe(Protocol):
-    """Expensive measurement before the first update and after the last one."""
+    """Expensive measurement before the first update and after some updates."""
 
-    each_phase: bool  # also after each update with the metric `guides_changed`
-    names: list[str]  # of the numbers
+    names: Sequence[str]  # of the numbers
 
-    def __call__(self) -> dict[str, float]:
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether to measure after an update with these metrics; 0 is before the first one."""
+
+    def __call__(self, update: int) -> dict[str, float]:
         """Return the numbers by name."""
 
 
@@ -138,7 +138,7 @@ class Experiment:
         with tqdm(
             total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
         ) as bar:
-            first = self._probe(self.updates == 0)
+            first = self._probe(updates, {}) if self.updates == 0 else {}
             evaluated = self._newest_evaluation()
             while True:
                 if self._evaluate(updates):
@@ -146,8 +146,7 @@ class Experiment:
                 if self.updates == updates:
                     break
                 row = self.update(self.updates / updates)
-                changed = self.probe is not None and self.probe.each_phase and row["learner/guides_changed"]
-                row |= self._probe(self.updates == updates or bool(changed))
+                row |= self._probe(updates, row)
                 if not self.rows:
                     self._log({**dict.fromkeys(row, math.nan), "frames": 0, **first})
                 self._log(row)
@@ -202,11 +201,12 @@ class Experiment:
             check_losses(learned, self.updates)
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
-    def _probe(self, due: bool) -> dict[str, float]:
+    def _probe(self, updates: int, row: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers of the probe, or NaN if they are not due."""
         if self.probe is None:
             return {}
-        return self.probe() if due else dict.fromkeys(self.probe.names, math.nan)
+        due = self.probe.due(self.updates, updates, row)
+        return self.probe(self.updates) if due else dict.fromkeys(self.probe.names, math.nan)
 
     @contextmanager
     def _resume_hint(self) -> Iterator[None]:

@@ -1,7 +1,5 @@
 """Policies and guides of finished runs."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -20,10 +18,7 @@ PROXIES = "proxies"  # subfolder with the networks that replace guides without p
 def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
     """Return the policy of a run, `last` or `best` (of the kept ones, in the cases of selection).
 
-    The env has the transforms of the run.
-
-    Raises:
-        UserError: if there is no such policy, or it does not fit the configuration.
+    The env has the transforms of the run. A policy that is missing or does not fit the configuration is a `UserError`.
     """
     learner = build_learner(config, env, load_guides(folder, config) if trains_guides(config) else None)
     path = weights_file(folder, which)
@@ -57,10 +52,8 @@ def load_policy_in_env(
 ) -> tuple[EnvBase, TensorDictModuleBase]:
     """Return any env with the guides and transforms of a run, and the policy of the run.
 
-    The own env and tracks of the run are not built. Arguments and errors are those of `load_policy`.
-
-    Raises:
-        UserError: also if the run has no agent, or its agent cannot act in this env.
+    The own env and tracks of the run are not built. Arguments and errors are those of `load_policy`; a run without an
+    agent, or with one that cannot act in this env, is a `UserError` too.
     """
     if config.method.observes is None:
         raise UserError(f"{folder} has no agent: its guide drives alone; give that guide instead")

@@ -22,7 +22,7 @@ class Measure:
     the failure that is counted by seed.
 
     Args:
-        entry: key of one number a row, after a step.
+        entry: key of one number a row, after a step; those of several agents are summed.
         reduction: `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`, or
             their mean (`mean_nonzero`). Without a number, a mean is NaN.
         where: key of a flag; only the steps with it count.

@@ -1,7 +1,5 @@
 """Collection of experience: batches of consecutive steps of an env and a policy."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any

@@ -1,12 +1,11 @@
 """A training run from its configuration to its tables: train, draw, evaluate, resume."""
 
-from __future__ import annotations
-
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig
@@ -16,8 +15,9 @@ from torchrl.envs import EnvBase
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, draw_phases
-from coil_rl.report.runs import EVALUATION
+from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.train import checkpoint, distillation
+from coil_rl.train.brake import Brake
 from coil_rl.train.build import (
     build,
     build_env,
@@ -29,8 +29,10 @@ from coil_rl.train.build import (
 )
 from coil_rl.train.curve import EvaluationCurve, measures
 from coil_rl.train.evaluate_run import driver_names, evaluate_run, report_outcome
-from coil_rl.train.experiment import Experiment, watched_keys
+from coil_rl.train.experiment import Experiment, Probe, watched_keys
+from coil_rl.train.fallback import build_fallback
 from coil_rl.train.load import PROXIES, load_guides, weights_file
+from coil_rl.train.measures import measures_of
 from coil_rl.train.rollout import Rollout
 from coil_rl.train.run_folder import begin, flat, holds, is_evaluated, locked, report_changed_versions
 
@@ -60,7 +62,7 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
         if resumed:
             report_changed_versions(folder)
         agent = None if config.method.observes is None else _train(config, folder, resumed)
-        evaluate_run(config, agent, folder, config.seed)
+        evaluate_run(config, agent, folder, config.seed, build_fallback(config, folder, agent))
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"continue with: coil-train resume={folder}") from None
     except OSError as error:
@@ -92,7 +94,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         logger=build(config.logger, "logger") if config.logger else None,
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
-        probe=GuideReturns(config, learner.guides) if improves_guides else None,
+        probe=_probe(config, learner),
         curve=_curve(config, folder, learner.policy),
         identity=flat(config),
     )
@@ -131,9 +133,13 @@ class GuideReturns:
     def __init__(self, config: DictConfig, guides: Mapping[str, TensorDictModuleBase]) -> None:
         self.config, self.guides = config, guides
         self.each_phase = config.evaluation.guides == "phases"
-        self.names = [f"guide/{name}" for name in guides]
+        self.names: Sequence[str] = [f"guide/{name}" for name in guides]
 
-    def __call__(self) -> dict[str, float]:
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether the guides have changed, or the training begins or ends."""
+        return update in (0, updates) or bool(self.each_phase and row["learner/guides_changed"])
+
+    def __call__(self, update: int) -> dict[str, float]:
         """Return the means by their names in the log."""
         return dict(zip(self.names, _guide_returns(self.config, self.guides).values(), strict=True))
 
@@ -157,6 +163,27 @@ def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase
     with torch.random.fork_rng():
         returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
     return dict(zip(driver_names(guides), returns.tolist(), strict=True))
+
+
+def _probe(config: DictConfig, learner: Any) -> Probe | None:
+    """Return what a run measures besides: its guides if it trains them, or an anchored policy."""
+    if trains_guides(config):
+        return GuideReturns(config, learner.guides)
+    if getattr(learner, "anchor", None) is None:
+        return None
+    if SELECTION not in config.evaluation.curve.cases:
+        raise UserError(
+            f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases in which the brake drives; give it"
+        )
+
+    look = config.copy()
+    look.evaluation.curve.num_envs = learner.anchor.cases
+
+    def build_cases(policies: int) -> EnvBase:
+        return build_env(look, cases_node(look, SELECTION, policies))
+
+    failure = measures_of(config.evaluation.measures).get("crashed")
+    return Brake(learner.anchor, learner.policy, build_cases, failure)
 
 
 def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> EvaluationCurve | None:

@@ -1,7 +1,5 @@
 """The folder of a run: its lock, configuration and software versions."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -34,8 +32,7 @@ PACKAGES = (
 def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Make a run folder and lock it until the block or this process ends.
 
-    Raises:
-        UserError: if another process holds the lock, unless `wait` is set.
+    If another process holds the lock, raise a `UserError`, or with `wait` wait for it.
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = folder / ".lock"
@@ -68,12 +65,8 @@ def begin(config: DictConfig, folder: Path) -> None:
 def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
     """Return the configuration of the run in a folder, with `changes`, new values of top-level keys.
 
-    `key` is the key of the calling program that names the folder, for the message.
-
-    The folder may come from anybody; `trust_packages` names packages that it may use.
-
-    Raises:
-        UserError: if the folder holds no run, or its configuration cannot be read or could run code.
+    `key` is the key of the calling program that names the folder, for the message. The folder may come from anybody: a
+    configuration that cannot be read or could run code is a `UserError`; `trust_packages` names packages it may use.
     """
     path = folder / "config.yaml"
     if not path.is_file():

@@ -14,8 +14,6 @@ A constructor on the list may read a file that its arguments name, but must not 
 model.
 """
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -77,12 +75,8 @@ _own: frozenset[str] = frozenset()  # targets in the configuration of the comman
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
     """Let the run folders that this process reads from here on use parts of these packages, and of no others.
 
-    Args:
-        packages: top-level names. The folder may call everything that is defined in them.
-        command: configuration that the user composed; the targets that it names are trusted too.
-
-    Raises:
-        UserError: for what is not the name of a package, or a package that is never trusted.
+    The names are top-level; a folder may call everything that is defined in these packages. The targets that `command`
+    names, the configuration that the user composed, are trusted too. A package that is never trusted is a `UserError`.
     """
     global _packages, _own
     names = list(packages)
@@ -100,8 +94,7 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
 def read_yaml(path: Path) -> DictConfig | ListConfig:
     """Read a YAML file that stays as small in memory as on the disk.
 
-    Raises:
-        UserError: if it is larger or deeper than any configuration of a run, or refers to parts of itself.
+    One that is larger or deeper than any configuration of a run, or refers to parts of itself, is a `UserError`.
     """
     if (size := path.stat().st_size) > LARGEST_FILE:
         raise UserError(f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}")

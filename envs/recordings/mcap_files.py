@@ -1,7 +1,5 @@
 """MCAP files and rosbag2 folders: reading and writing of encoded messages."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import re

@@ -1,7 +1,5 @@
 """ROS 2 messages in CDR, encoded and decoded with the type store of rosbags."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from functools import cache, lru_cache

@@ -1,7 +1,5 @@
 """Robot recordings as arrays: LiDAR scans, odometry and commands."""
 
-from __future__ import annotations
-
 import math
 import os
 import warnings

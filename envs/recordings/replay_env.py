@@ -1,7 +1,5 @@
 """Replay of recorded robot drives as an env: the actions of a policy, scan by scan, without effect on the drive."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

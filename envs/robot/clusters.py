@@ -6,8 +6,6 @@ tested too: points closer than the gap differ by at most arcsin(gap / distance) 
 connected components of the full distance matrix.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks of the simulated robot: the 6 m track, cone positions and radii, distance to a crash, laps of a drive."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES, Track, TrackError, resample
@@ -162,8 +161,4 @@ def _cones(ring: Array) -> Array:
 
 def _stack_padded(tables: Sequence[Tensor], padding: float) -> Tensor:
     """Stack tables [D, any] to [D, T, most]."""
-    most = max(table.shape[1] for table in tables)
-    stacked = torch.full((len(tables[0]), len(tables), most), padding)
-    for index, table in enumerate(tables):
-        stacked[:, index, : table.shape[1]] = table
-    return stacked
+    return pad_sequence([table.T for table in tables], padding_value=padding).permute(2, 1, 0).float().contiguous()

@@ -6,8 +6,6 @@ scan and takes effect during the next one. The odometry has the pose at the star
 metadata record `track` has the cones and the start, in the odometry's frame.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -81,11 +79,6 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
     hit = torch.where(outlier, -1, hit)
     name = f"{sides}_{seed}"
     return SimulatedDrive(name, track, sides, seconds, lidar.angles, ranges, hit, poses, cones, radius, visibility)
-
-
-def labelling_drives(seeds: Sequence[int]) -> list[SimulatedDrive]:
-    """Return, for each seed, a drive past the left cones alone and one past the right cones alone."""
-    return [simulated_drive(side, seed) for seed in seeds for side in ("left", "right")]
 
 
 def labelled_drive(recording: Recording) -> SimulatedDrive:

@@ -5,8 +5,6 @@ another, are misclassified or missed. The entries have the keys and the scale of
 of that world run unchanged. The numbers come from data sheets, not from a real robot.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import reduce

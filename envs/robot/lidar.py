@@ -4,8 +4,6 @@ The defaults are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per se
 the beams. A nearer cone hides a farther one, and the robot moves during a scan.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Perception of the robot (paper 4.2, A.3): from LiDAR scans to thin and thick cones, and to the observation."""
 
-from __future__ import annotations
-
 import json
 import math
 from dataclasses import KW_ONLY, dataclass, fields

@@ -3,26 +3,20 @@ from pathlib import Path
 import pytest
 
 from coil_rl.errors import UserError
-from coil_rl.files import remove_unfinished, whole_file, whole_folder, write_text
+from coil_rl.files import remove_unfinished, whole_file, write_text
 
 
-def test_file_and_folder_appear_complete(tmp_path: Path) -> None:
+def test_file_appears_complete(tmp_path: Path) -> None:
     path = tmp_path / "new folder" / "table.csv"
     with whole_file(path) as unfinished:
         unfinished.write_text("half")
         assert not path.exists()
         assert unfinished.suffix == ".csv"
     assert path.read_text() == "half"
-    folder = tmp_path / "new folder" / "data"
-    with whole_folder(folder) as unfinished:
-        (unfinished / "inner").mkdir()
-        (unfinished / "inner" / "numbers").write_text("1 2")
-        assert not folder.exists()
-    assert (folder / "inner" / "numbers").read_text() == "1 2"
-    assert set(path.parent.iterdir()) == {path, folder}
+    assert set(path.parent.iterdir()) == {path}
 
 
-def test_error_keeps_the_old_file_and_leaves_no_folder(tmp_path: Path) -> None:
+def test_error_keeps_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "table.csv"
     path.write_text("old")
 
@@ -31,36 +25,21 @@ def test_error_keeps_the_old_file_and_leaves_no_folder(tmp_path: Path) -> None:
             unfinished.write_text("half")
             raise RuntimeError("the disk is full")
 
-    def write_folder() -> None:
-        with whole_folder(tmp_path / "data") as unfinished:
-            (unfinished / "half").write_text("1")
-            raise RuntimeError("the disk is full")
-
-    for write in (write_file, write_folder):
-        with pytest.raises(RuntimeError, match="the disk is full"):
-            write()
+    with pytest.raises(RuntimeError, match="the disk is full"):
+        write_file()
     assert path.read_text() == "old"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_folder_with_contents_is_not_replaced(tmp_path: Path) -> None:
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "mine").write_text("1")
-    with pytest.raises(OSError, match="data"), whole_folder(tmp_path / "data"):
-        pass
-    assert [path.name for path in (tmp_path / "data").iterdir()] == ["mine"]
 
 
 def test_what_is_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("1")
     (tmp_path / "folder").mkdir()
-    for context, path, message in (
-        (whole_file, "folder", "folder is a folder, but a file is to be written there; remove it"),
-        (whole_file, "file/below", "file is a file, but a folder is to be made there; remove it"),
-        (whole_folder, "file", "file is a file, but a folder is to be made there; remove it"),
-        (whole_folder, "file/below/it", "file is a file, but a folder is to be made there; remove it"),
+    for path, message in (
+        ("folder", "folder is a folder, but a file is to be written there; remove it"),
+        ("file/below", "file is a file, but a folder is to be made there; remove it"),
+        ("file/below/it", "file is a file, but a folder is to be made there; remove it"),
     ):
-        with pytest.raises(UserError, match=message), context(tmp_path / path) as unfinished:
+        with pytest.raises(UserError, match=message), whole_file(tmp_path / path) as unfinished:
             unfinished.touch()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "folder"]
 

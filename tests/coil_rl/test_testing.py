@@ -68,6 +68,16 @@ class Hidden(TensorDictModuleBase):
         return tensordict.set("action", torch.full_like(tensordict["steering"], self.count))
 
 
+class RowsInside(TensorDictModuleBase):
+    """Remembers a number for each row in an attribute."""
+
+    in_keys, out_keys, total = ["steering"], ["action"], 0.0
+
+    def forward(self, tensordict):
+        self.total = self.total + tensordict["steering"] / 1000
+        return tensordict.set("action", self.total.clone())
+
+
 class NeverReset(OneNumber):
     def reset(self):
         pass
@@ -107,10 +117,11 @@ def test_guides_with_a_memory_pass():
         (lambda: with_action(lambda total: total / total.abs().clamp(max=0)), "holds a number that is not finite"),
         (RandomGuide, "another one for the same history"),
         (Hidden, "another one for the same history; it draws, or remembers earlier episodes"),
+        (RowsInside, "fails after a single row was reset, so it may remember in itself"),
         (lambda: PerRow(NeverReset, ["steering"]), "another one for the same history"),
         (ForgetsAlone, "after the reset of a row depends on what was before it"),
     ],
-    ids=["shape", "dtype", "bounds", "nan", "random", "hidden memory", "no reset", "whole batch"],
+    ids=["shape", "dtype", "bounds", "nan", "random", "hidden memory", "rows inside", "no reset", "whole batch"],
 )
 def test_defect_of_a_guide_is_found(make, message):
     with pytest.raises(ValueError, match=message):

@@ -1,32 +1,15 @@
-import io
 import warnings
 from functools import partial
 
 import pytest
 import torch
 from torchrl.envs import GymEnv, PendulumEnv
+from worlds import drive, reloaded, same
 
 from coil_rl.envs import EnvBatch, GymnasiumEnv
 from coil_rl.testing import check_env
 
 SINGLE = {"pendulum": PendulumEnv, "cartpole": partial(GymEnv, "CartPole-v1")}
-
-
-def drive(env, steps, carrier=None, seed=0):
-    """Return the entries after each step, under actions that a seed determines, and the carrier."""
-    carrier = env.reset() if carrier is None else carrier
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        actions = [env.rand_action()["action"] for _ in range(steps)]
-    after = []
-    for action in actions:
-        step, carrier = env.step_and_maybe_reset(carrier.set("action", action))
-        after.append(step["next"])
-    return after, carrier
-
-
-def same(one, other):
-    return all((a == b).all() for a, b in zip(one, other, strict=True))
 
 
 @pytest.mark.parametrize("of", SINGLE.values(), ids=SINGLE)
@@ -45,14 +28,12 @@ def test_seed_determines_all_episodes(of):
 def test_saved_batch_goes_on_to_the_bit(of):
     env = EnvBatch(of, 3, seed=5)
     _, carrier = drive(env, 25)
-    file, start = io.BytesIO(), carrier.clone()
-    torch.save(env.state_dict(), file)
+    state, start = reloaded(env.state_dict()), carrier.clone()
     later = drive(env, 40, carrier, seed=1)[0]
     other = EnvBatch(of, 3, seed=6)
-    file.seek(0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        other.load_state_dict(torch.load(file, weights_only=True))
+        other.load_state_dict(state)
     assert other.continues
     assert same(later, drive(other, 40, start, seed=1)[0])
 

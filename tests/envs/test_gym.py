@@ -1,5 +1,4 @@
 import importlib
-import sys
 import warnings
 
 import gymnasium
@@ -125,10 +124,3 @@ def test_returned_arrays_are_copies_and_info_is_optional():
     assert not (envs.unwrapped.env.pose == 7).any()
     again, _ = envs.reset(seed=0)
     assert not (again == 7).any()
-
-
-def test_import_without_gymnasium_names_the_extra(monkeypatch):
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    monkeypatch.delitem(sys.modules, "coil_rl.envs.gym")
-    with pytest.raises(ImportError, match=r"coil_rl.envs.gym needs Gymnasium: .* install 'coil-rl\[gym\]'"):
-        importlib.import_module("coil_rl.envs.gym")

@@ -1,4 +1,3 @@
-import io
 import warnings
 from functools import partial
 
@@ -8,6 +7,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
+from worlds import drive, reloaded, same
 
 from coil_rl.envs import GymnasiumEnv
 from coil_rl.testing import check_env
@@ -86,30 +86,6 @@ def act(env, observation):
     return 11 - 10 * (observation["place"] > 12)
 
 
-def drive(env, steps, carrier=None, seed=0):
-    """Return the entries after each step, under actions that a seed determines, and the carrier."""
-    carrier = env.reset() if carrier is None else carrier
-    after = []
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        actions = [env.rand_action()["action"] for _ in range(steps)]
-    for action in actions:
-        step, carrier = env.step_and_maybe_reset(carrier.set("action", action))
-        after.append(step["next"])
-    return after, carrier
-
-
-def same(one, other):
-    return all((a == b).all() for a, b in zip(one, other, strict=True))
-
-
-def saved(env):
-    file = io.BytesIO()
-    torch.save(env.state_dict(), file)
-    file.seek(0)
-    return torch.load(file, weights_only=True)
-
-
 ENVS = {
     "CartPole-v1": {},
     "Pendulum-v1": {},
@@ -142,7 +118,7 @@ def test_seed_determines_all_episodes(id):
 def test_saved_env_goes_on_to_the_bit(id):
     env = build(id, 4, seed=5)
     _, carrier = drive(env, 45)
-    state, start = saved(env), carrier.clone()
+    state, start = reloaded(env.state_dict()), carrier.clone()
     later = drive(env, 60, carrier, seed=1)[0]
     other = build(id, 4, seed=6)
     drive(other, 10)
@@ -157,14 +133,14 @@ def test_saved_env_goes_on_to_the_bit(id):
 def test_env_saved_at_its_first_reset_goes_on_to_the_bit(id):
     env, other = build(id, seed=5), build(id, seed=6)
     carrier = env.reset()
-    other.load_state_dict(saved(env))
+    other.load_state_dict(reloaded(env.state_dict()))
     assert other.continues
     assert same(drive(env, 30, carrier.clone())[0], drive(other, 30, carrier)[0])
 
 
 def test_env_saved_before_its_first_reset_draws_the_same_episodes():
     env, other = build("CartPole-v1", seed=5), build("CartPole-v1", seed=6)
-    other.load_state_dict(saved(env))
+    other.load_state_dict(reloaded(env.state_dict()))
     assert same(drive(env, 30)[0], drive(other, 30)[0])
 
 
@@ -173,13 +149,13 @@ def test_env_that_keeps_something_at_a_reset_is_noticed():
     drive(env, 2 * LIMIT + 2)
     other = build("Echo-v0", options={"leak": 0.5})
     with pytest.warns(UserWarning, match=r"cannot go on with its running episodes to the bit.*fresh=true") as caught:
-        other.load_state_dict(saved(env))
+        other.load_state_dict(reloaded(env.state_dict()))
     assert len(caught) == 1
     assert not other.continues
     drive(other, 5)
     fresh, other = (build("Echo-v0", options={"leak": 0.5}, fresh=True) for _ in range(2))
     drive(fresh, 2 * LIMIT + 2)
-    other.load_state_dict(saved(fresh))
+    other.load_state_dict(reloaded(fresh.state_dict()))
     assert other.continues
 
 
@@ -188,7 +164,7 @@ def test_episode_longer_than_the_memory_is_not_repeated(monkeypatch):
     env = build("Pendulum-v1")
     drive(env, 25)
     with pytest.warns(UserWarning, match="cannot go on"):
-        env.load_state_dict(saved(env))
+        env.load_state_dict(reloaded(env.state_dict()))
 
 
 def test_actions_are_kept_for_running_episodes_only():

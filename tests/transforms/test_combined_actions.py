@@ -6,7 +6,16 @@ from torchrl.envs.utils import step_mdp
 from coil_rl.guides import SplineGuide
 from coil_rl.schedules import Linear
 from coil_rl.testing import check_env
-from coil_rl.transforms import JumpStart, MixedAction, ResidualAction, Takeover
+from coil_rl.transforms import (
+    AdaptiveMixedAction,
+    DiscreteActions,
+    GradualResidual,
+    JumpStart,
+    MixedAction,
+    ResidualAction,
+    Takeover,
+    set_progress,
+)
 
 
 def drive(env, policy, steps=40):
@@ -113,3 +122,85 @@ def test_takeover_of_discrete_actions(categorical):
     leaning = (first["observation"][..., 2] > 0).long()
     assert torch.equal(sent if categorical else sent.long().argmax(-1), leaning)
     assert sent.dtype == first["action"].dtype
+
+
+COMBINED = {
+    "residual": lambda: [ResidualAction(0.5)],
+    "mixed": lambda: [MixedAction(0.5)],
+    "adaptive": lambda: [AdaptiveMixedAction(warm_up=60)],
+    "takeover": lambda: [Takeover(0.5)],
+    "jump start": lambda: [JumpStart(5)],
+    "warm start": lambda: [Takeover(1.0, 60)],
+    "gradual residual": lambda: [GradualResidual(0.5, probability=0.5)],
+    "residual and takeover": lambda: [Takeover(0.5), ResidualAction(0.5)],
+    "choices": lambda: [Takeover(0.5), DiscreteActions(3)],
+}
+
+
+@pytest.mark.parametrize("name", COMBINED)
+@pytest.mark.parametrize("training", [True, False], ids=["training", "evaluation"])
+def test_executed_action_is_the_one_the_env_was_given(name, training):
+    env = worlds.cones(*COMBINED[name]()).train(training)
+    set_progress(env, 0.2)
+    rollout = env.rollout(20, break_when_any_done=False)
+    executed = rollout["next", "executed_action"]
+    assert torch.equal(executed, rollout["next", "steering"])
+    assert (rollout["executed_action"][:, 0] == 0).all()
+    if training:
+        assert not torch.equal(executed, rollout["action"])
+
+
+@pytest.mark.parametrize("categorical", [True, False])
+def test_executed_action_of_choices_is_a_choice(categorical):
+    env = worlds.carts(Takeover(0.5, seed=3), categorical=categorical).train()
+    rollout = env.rollout(8)
+    bare = env.base_env
+    assert rollout["next", "executed_action"].dtype == rollout["action"].dtype
+    assert bare.full_action_spec["action"].shape == rollout["next", "executed_action"][:, 0].shape
+    leaning = (rollout["observation"][..., 2] > 0).long()
+    index = rollout["next", "executed_action"] if categorical else rollout["next", "executed_action"].argmax(-1)
+    guide = ~rollout["agent_acts"].squeeze(-1)
+    assert guide.any()
+    assert torch.equal(index[guide], leaning[guide])
+
+
+def test_guide_acts_in_the_first_steps_of_the_run_with_frames():
+    env = worlds.cones(Takeover(1.0, 6 * 7)).train()
+    first, second = env.rollout(5, break_when_any_done=False), env.rollout(5, break_when_any_done=False)
+    assert not first["agent_acts"].any()
+    assert torch.equal(second["agent_acts"][0].squeeze(-1), torch.tensor([False, False, True, True, True]))
+    assert worlds.cones(Takeover(1.0, 1000)).eval().rollout(5, break_when_any_done=False)["agent_acts"].all()
+
+
+def test_weight_of_the_agent_is_a_clipped_linear_function_of_the_uncertainty_in_the_step_before():
+    env = worlds.cones(AdaptiveMixedAction(low=0.2, high=1.0, certain=0.1, uncertain=0.5, warm_up=0)).train()
+    doubt = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.5, 9.0]).unsqueeze(-1)
+    carrier = env.reset()
+    assert (carrier["agent_weight"] == 0.2).all()
+    carrier = env.step(carrier.set("action", torch.full((6, 1), 0.5)).set(("next", "uncertainty"), doubt))["next"]
+    torch.testing.assert_close(carrier["agent_weight"].squeeze(-1), torch.tensor([1.0, 1.0, 0.8, 0.6, 0.2, 0.2]))
+    after = env.step(carrier.set("action", torch.full((6, 1), 0.5)))
+    weight, advice = carrier["agent_weight"], carrier["guide_action"][:, 0]
+    torch.testing.assert_close(after["next", "steering"], weight * 0.5 + (1 - weight) * advice)
+    assert (after["next", "agent_weight"] == 0.2).all(), "without an uncertainty the guide is trusted"
+
+
+def test_weight_of_the_agent_is_drawn_during_the_warm_up():
+    env = worlds.cones(AdaptiveMixedAction(warm_up=64 * 20), cars=64).train()
+    weights = env.rollout(30, break_when_any_done=False)["next", "agent_weight"]
+    warm, later = weights[:, :20], weights[:, 20:]
+    assert ((warm >= 0.2) & (warm <= 0.3)).all()
+    assert abs(warm.mean() - 0.25) < 0.01
+    assert (later == 0.2).all()
+
+
+def test_residual_is_mixed_in_by_its_probability_and_always_in_evaluation():
+    env = worlds.cones(GradualResidual(0.5, probability=Linear(1.0, 0.0))).train()
+    for progress, share in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
+        set_progress(env, progress)
+        rollout = env.rollout(60, break_when_any_done=False)
+        assert abs(rollout["agent_acts"].float().mean() - share) < 0.1
+        guide = rollout["guide_action"][..., 0, :]
+        expected = (guide + 0.5 * rollout["agent_acts"] * rollout["action"]).clamp(-1, 1)
+        torch.testing.assert_close(rollout["next", "executed_action"], expected)
+    assert env.eval().rollout(5, break_when_any_done=False)["agent_acts"].all()

@@ -12,9 +12,12 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ConstantGuide, RandomGuide, SplineGuide, ZeroGuide
 from coil_rl.testing import check_env, check_transform
 from coil_rl.transforms import (
+    AdaptiveMixedAction,
+    AdviceDropout,
     BiasedAdvice,
     DelayedAdvice,
     DiscreteActions,
+    GradualResidual,
     GuideActions,
     JumpStart,
     NoisyAdvice,
@@ -28,11 +31,14 @@ from coil_rl.transforms import (
     Takeover,
 )
 from coil_rl.transforms.guide_actions import Guides
+from coil_rl.transforms.guide_transform import set_progress
 
 TRANSFORMS = {
     "advice only": Compose,
     "biased": BiasedAdvice,
+    "dropout": AdviceDropout,
     "delayed": lambda: DelayedAdvice(2),
+    "gradual residual": lambda: GradualResidual(0.2, probability=0.5),
     "jump start": lambda: JumpStart(4, random=True),
     "noisy": NoisyAdvice,
     "partial": lambda: PartialAdvice("left"),
@@ -41,6 +47,11 @@ TRANSFORMS = {
     "reward coupling": lambda: RewardCoupling(0.5),
     "scaled": lambda: ScaledAdvice(0.5),
     "takeover": lambda: Takeover(0.5),
+    "warm start": lambda: Takeover(1.0, 3),
+}
+FOR_NUMBERS = {
+    "adaptive mixing": lambda: AdaptiveMixedAction(warm_up=12),
+    "gradual residual": TRANSFORMS.pop("gradual residual"),
 }
 
 
@@ -48,6 +59,14 @@ TRANSFORMS = {
 def test_specs_hold_in_every_env(name):
     for world in (worlds.cones, worlds.pendulum, worlds.carts):
         check_env(world(TRANSFORMS[name]()).train(), steps=4)
+
+
+@pytest.mark.parametrize("name", FOR_NUMBERS)
+def test_specs_hold_in_envs_with_continuous_actions(name):
+    for world in (worlds.cones, worlds.pendulum):
+        check_env(world(FOR_NUMBERS[name]()).train(), steps=4)
+    with pytest.raises(ValueError, match="needs continuous actions, but this env has 2 discrete"):
+        worlds.carts(FOR_NUMBERS[name]()).observation_spec  # noqa: B018
 
 
 def test_specs_hold_with_several_guides_and_another_key():
@@ -75,13 +94,18 @@ def test_specs_hold_with_discrete_actions(transforms):
         ShuffledAdvice,
         lambda seed: Takeover(0.5, seed=seed),
         lambda seed: JumpStart(9, random=True, seed=seed),
+        lambda seed: GradualResidual(0.5, probability=0.5, seed=seed),
+        lambda seed: AdaptiveMixedAction(warm_up=1_000, seed=seed),
+        lambda seed: Takeover(1.0, 6 * 8),
         lambda seed: GuideActions({"random": RandomGuide(seed=seed)}, out_key="other_advice"),
     ],
 )
 def test_draws_continue_from_a_state_dict(transform):
     def env(seed):
         guide = GuideActions({"spline": SplineGuide()})
-        return TransformedEnv(ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))).train()
+        env = TransformedEnv(ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))).train()
+        set_progress(env, 0.0)
+        return env
 
     first, second = env(3), env(4)
     first.rollout(3)
@@ -112,6 +136,8 @@ def degraded(transform):
         ),
         (lambda: worlds.carts(ResidualAction()).rollout(1), "needs continuous actions, but this env has 2 discrete"),
         (lambda: worlds.carts(DiscreteActions(5)).reset(), "bounded number, but this env's action is Categorical"),
+        (lambda: AdaptiveMixedAction(low=0.4), "low=0.4, warm_up_high=0.3 and high=1.0 must be in this order"),
+        (lambda: AdaptiveMixedAction(certain=0.2), "certain=0.2 at least 0 and less than uncertain=0.15"),
         (lambda: DiscreteActions(1), "choices=1 must be at least 2"),
         (lambda: DiscreteActions([0.5, 0.5]), "must be at least two increasing numbers"),
         (lambda: DiscreteActions([0.0, math.inf]), "must be finite"),

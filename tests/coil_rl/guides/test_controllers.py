@@ -1,7 +1,6 @@
 """Controllers of other people: Python objects, functions, networks, entries of the env, recordings."""
 
 import importlib
-import io
 import textwrap
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs import Compose, TransformedEnv
+from worlds import continued
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ControllerGuide, EntryGuide, PerRow, RecordedGuide
@@ -137,14 +137,8 @@ def test_states_of_the_objects_are_in_the_checkpoint():
         policy = TensorDictModule(lambda x: torch.tanh(x[:, :1]), ["observation"], ["action"])
         return Rollout(cones(ControllerGuide("my_control:Counter"), seed=seed), policy, 8)
 
-    first, second = rollout(3), rollout(4)
-    first.collect()
-    file = io.BytesIO()
-    torch.save(first.state_dict(), file)
-    file.seek(0)
-    second.load_state_dict(torch.load(file, weights_only=True))
-    expected = first.collect()
-    assert (expected == second.collect()).all()
+    expected, resumed = continued(rollout)
+    assert (expected == resumed).all()
     assert expected["guide_action"][:, 0].max() > 0.02, "episodes should go on"
 
 

@@ -155,10 +155,10 @@ def test_advice_is_an_action_for_any_cones(
 @pytest.mark.parametrize(
     ("guide", "values"),
     [
-        (SplineGuide, {"spline": "linear", "cones": 0, "midpoints": 1, "targets": 1, "smoothing": -1,
-                       "sharpness": math.nan, "max_steering": 0, "gain": math.inf}),
+        (SplineGuide, {"spline": "linear", "smoothing": -1, "sharpness": math.nan, "max_steering": 0,
+                       "gain": math.inf}),
         (RacingLineGuide, {"margin": -0.1, "turn": 0, "lookahead": math.inf, "spacing": 0, "car_length": math.nan,
-                           "max_steering": 100, "targets": 1}),
+                           "max_steering": 100}),
     ],
 )  # fmt: skip
 def test_values_out_of_range_are_refused(guide: type, values: dict) -> None:

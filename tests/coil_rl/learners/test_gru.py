@@ -8,7 +8,6 @@ import torch
 import worlds
 from any_env import AnyEnv
 from hydra import compose, initialize_config_module
-from omegaconf import OmegaConf
 from run_folders import make_untrained_run
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbounded
@@ -30,7 +29,6 @@ from coil_rl.train.check import check
 from coil_rl.train.curve import PoliciesInTurn, policy_batch
 from coil_rl.train.evaluation import evaluate_policy
 from coil_rl.train.rollout import Rollout
-from coil_rl.train.trust import trust_packages
 from coil_rl.transforms import DiscreteActions, Takeover
 
 DELAY = 5
@@ -206,15 +204,6 @@ def composed(folder, *overrides, name="train"):
         return compose(name, [*overrides, f"run_dir={folder}"])
 
 
-@pytest.fixture
-def named():
-    """The command names the class, as `coil-train network=gru` does, so run folders may name it too."""
-    trust_packages([], OmegaConf.create({"network": {"_target_": "coil_rl.learners.Gru"}}))
-    yield
-    trust_packages([])
-
-
-@pytest.mark.usefixtures("named")
 @pytest.mark.parametrize(
     "method", ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil", "jump_start"))]
 )
@@ -237,7 +226,6 @@ def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     assert float(row[4]) == pytest.approx(mean)
 
 
-@pytest.mark.usefixtures("named")
 def test_policy_with_a_memory_is_a_guide(tmp_path):
     run = make_untrained_run(tmp_path / "run", *TINY, "method=ppo", "network=gru", "learner.action_gain=3")
     guided = composed("unused", *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}")
@@ -249,7 +237,6 @@ def test_policy_with_a_memory_is_a_guide(tmp_path):
     assert not any(parameter.requires_grad for parameter in build_guides(guided)["learned"].parameters())
 
 
-@pytest.mark.usefixtures("named")
 def test_policy_with_a_memory_behind_transforms_is_no_guide(tmp_path):
     run = make_untrained_run(tmp_path / "run", *TINY, "method=coil", "network=gru")
     with pytest.raises(ValueError, match="has a policy with a memory behind transforms, which is no guide; train one"):

@@ -6,7 +6,7 @@ from torch.distributions import AffineTransform, Normal, TanhTransform, Transfor
 from torch.nn import functional as F
 from torchrl.data import MultiCategorical
 
-from coil_rl.learners import PPO, KickstartLoss
+from coil_rl.learners import PPO, SAC, FilteredKickstartLoss, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
 from coil_rl.schedules import Linear
 from coil_rl.train.rollout import Rollout
@@ -81,3 +81,46 @@ def test_loss_of_several_choices_is_their_cross_entropy():
     one_hot = torch.cat([F.one_hot(advised[:, index], n) for index, n in enumerate((2, 4))], -1).float()
     loss = KickstartLoss()(policy, data.set("guide_action", one_hot.unsqueeze(1)))
     torch.testing.assert_close(loss, -policy.get_dist(data).log_prob(advised).mean())
+
+
+def replay(auxiliary, **options):
+    """SAC with critics that differ, and a minibatch of its steps."""
+    torch.manual_seed(0)
+    env = worlds.cones()
+    sac = SAC(env, critics=3, starts=0, batch_size=32, ratio=1, auxiliary=[auxiliary], action_gain=1.0, **options)
+    with torch.no_grad():
+        for value in sac.loss.qvalue_network_params.values(True, True):
+            value.add_(torch.randn_like(value), alpha=0.3)
+    rollout = Rollout(env, sac.policy, 16, sac.keys)
+    return sac, rollout, rollout.collect().reshape(-1)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_imitation_is_weighted_by_the_opinion_of_the_critics(soft):
+    filtered = FilteredKickstartLoss(soft=soft)
+    sac, _, data = replay(filtered)
+    own = sac.actor.get_dist(data.select("observation")).deterministic_sample
+    both = [filtered.critics.values(data.copy().set("action", a)) for a in (data["guide_action"][:, 0], own)]
+    gain, spread = both[0].mean(0) - both[1].mean(0), (both[0].var(0) + both[1].var(0)).sqrt()
+    weight = Normal(0.0, 1.0).cdf(gain / spread) if soft else (gain > 0).float()
+    assert 0.05 < weight.mean() < 0.95
+    torch.testing.assert_close(filtered(sac.actor, data), (weight * KickstartLoss().each(sac.actor, data)).mean())
+
+
+def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
+    sac, rollout, data = replay(KickstartLoss(Linear(3.0, 0.0)))
+    assert {"guide_action", ("next", "guide_action")} <= set(sac.stored_keys)
+    for progress, coefficient in ((0.0, 3.0), (1.0, 0.0)):
+        sac.progress = progress
+        losses = []
+        for compute in (sac.losses, sac.loss):
+            torch.manual_seed(1)
+            losses.append(compute(data.clone()))
+        added = losses[0]["loss_actor"] - losses[1]["loss_actor"]
+        torch.testing.assert_close(added, coefficient * KickstartLoss()(sac.actor, data), rtol=1e-4, atol=1e-4)
+    assert sac.update(rollout.collect())["loss_guide"] != 0
+
+
+def test_filter_needs_a_learner_with_action_values():
+    with pytest.raises(ValueError, match="compares values of actions; take learner=sac, or KickstartLoss"):
+        PPO(worlds.cones(), auxiliary=[FilteredKickstartLoss()])

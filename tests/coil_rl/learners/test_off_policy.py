@@ -16,7 +16,10 @@ from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import (
     DelayedAdvice,
     DiscreteActions,
+    GradualResidual,
     GuideActions,
+    JumpStart,
+    MixedAction,
     Takeover,
 )
 
@@ -31,8 +34,8 @@ def steps(first, count, **more):
 
 def replay(env=None, **options):
     """The buffer of a learner, without networks."""
-    options = {"capacity": 10, "batch_size": 4, "ratio": 1.0, "starts": 0, "tau": 0.1} | options
-    return OffPolicy(env or PendulumEnv(), ["th"], **options)
+    options = {"in_keys": ["th"], "capacity": 10, "batch_size": 4, "ratio": 1.0, "starts": 0, "tau": 0.1} | options
+    return OffPolicy(env or PendulumEnv(), **options)
 
 
 def stored(learner):
@@ -58,13 +61,73 @@ def test_steps_are_sampled_as_often_as_the_ratio():
     assert counts.sum() == 2.5 * 1_000
 
 
-def test_steps_of_the_guide_are_not_stored():
+def agent_acts(*flags):
+    return torch.tensor(flags, dtype=torch.bool).unsqueeze(-1)
+
+
+def test_executed_action_is_stored_where_the_guide_acts():
     learner = replay(worlds.pendulum(Takeover(0.5)))
-    assert "agent_acts" in learner.keys
-    learner.store(steps(0, 6, agent_acts=torch.tensor([1, 0, 0, 1, 1, 0], dtype=torch.bool).unsqueeze(-1)))
-    assert stored(learner) == [0, 3, 4]
-    learner.store(steps(6, 2, agent_acts=torch.zeros(2, 1, dtype=torch.bool)))
-    assert len(learner.buffer) == 3
+    assert {"agent_acts", ("next", "executed_action")} <= set(learner.keys)
+    given = steps(0, 6, agent_acts=agent_acts(1, 0, 0, 1, 1, 0))
+    given["next", "executed_action"] = given["action"] + 10 * ~given["agent_acts"]
+    learner.store(given)
+    assert stored(learner) == [0, 3, 4, 11, 12, 15]
+
+
+def test_steps_of_the_guide_are_not_stored_if_the_agent_cannot_choose_its_action():
+    for transforms in ([Takeover(0.5), DiscreteActions(5)], [Takeover(0.5), MixedAction(0.5)]):
+        env = worlds.cones(*transforms)
+        learner = replay(env, in_keys=["observation"])
+        assert ("next", "executed_action") not in learner.keys
+        given = steps(0, 6, agent_acts=agent_acts(1, 0, 0, 1, 1, 0)).rename_key_("th", "observation")
+        given["next"].rename_key_("th", "observation")
+        learner.store(given)
+        assert stored(learner) == [0, 3, 4]
+        with pytest.raises(ValueError, match=r"prior=0\.5 needs steps in which a guide acts in place of the agent"):
+            replay(env, in_keys=["observation"], prior=0.5)
+
+
+SWITCHES = {
+    "takeover": lambda: Takeover(0.5, seed=1),
+    "jump start": lambda: JumpStart(30),
+    "warm start": lambda: Takeover(1.0, 30),
+    "gradual residual": lambda: GradualResidual(0.5, probability=0.5, seed=1),
+}
+
+
+@pytest.mark.parametrize("name", SWITCHES)
+def test_stored_steps_agree_with_the_env(name):
+    """A fresh env that is given the stored state and action returns the stored reward and next state."""
+    env = worlds.pendulum(SWITCHES[name]())
+    learner = SAC(env, ["th", "thdot", "guide_action"], hidden=[8], starts=10_000, capacity=10_000, action_scale=2.0)
+    batch = Rollout(env, learner.policy, 60, [*learner.keys, "agent_acts"]).collect()
+    assert 0.2 < batch["agent_acts"].float().mean() < 0.8
+    learner.update(batch)
+    taken = learner.buffer[:]
+    assert len(taken) == 60
+    action = taken["action"]
+    if name == "gradual residual":  # the sum is a part of the env, and the agent's action is 0 where it does not act
+        action = (taken["guide_action"][:, 0] + 0.5 * action).clamp(-2, 2)
+    state = PendulumEnv.gen_params(batch_size=[60]).update(taken.select("th", "thdot"))
+    after = PendulumEnv().step(state.set("action", action))["next"]
+    for key in ("th", "thdot", "reward"):
+        torch.testing.assert_close(after[key], taken["next", key])
+
+
+def test_steps_of_the_guide_are_sampled_as_their_share():
+    learner = replay(worlds.pendulum(Takeover(0.5)), prior=0.25, batch_size=8, capacity=50, starts=30, ratio=8.0)
+    for first, acts in ((0, False), (20, False), (40, True), (60, True)):
+        given = steps(first, 20, agent_acts=torch.full((20, 1), acts))
+        given["next", "executed_action"] = given["action"]
+        learner.store(given)
+        minibatches = list(learner.samples())
+        if first == 0:
+            assert not minibatches, "30 steps must be stored"
+        for minibatch in minibatches:
+            of_guide = (minibatch["action"] < 40).sum()
+            assert len(minibatch) == 8
+            assert of_guide == (2 if acts else 8)
+    assert learner.kept == 80
 
 
 TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8]}
@@ -88,7 +151,7 @@ def test_state_contains_everything_the_next_update_depends_on(kind, updates):
         first.update(rollout.collect())
     second, _ = make(kind, seed=9)
     state = copy.deepcopy(first.state_dict())
-    assert len(state["steps"]["action"]) == min(32 * updates, 90)
+    assert len(state["buffers"][0]["steps"]["action"]) == min(32 * updates, 90)
     second.load_state_dict(state)
     batch, metrics, actions = rollout.collect(), [], []
     for learner in (first, second):
@@ -98,6 +161,7 @@ def test_state_contains_everything_the_next_update_depends_on(kind, updates):
     assert metrics[0] == metrics[1]
     assert torch.equal(*actions)
     assert (first.buffer[:] == second.buffer[:]).all()
+    assert len(first.guide_buffer) == 0
 
 
 def test_steps_are_stored_with_the_advice_before_and_after_them():

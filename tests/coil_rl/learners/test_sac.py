@@ -7,6 +7,7 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import SAC
+from coil_rl.train.curve import policy_batch
 from coil_rl.train.rollout import Rollout
 
 
@@ -101,3 +102,69 @@ def test_swings_the_pendulum_up():
         returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(20)]
     # A random policy gets -1200, a good one -160. Single starts differ by 100, so the standard error is 25.
     assert sum(returns) / 20 > -230
+
+
+def spread(sac):
+    """Make the critics and their target networks differ."""
+    with torch.no_grad():
+        for value in sac.loss.qvalue_network_params.values(True, True):
+            value.add_(torch.randn_like(value), alpha=0.5)
+
+
+def test_some_of_many_critics_are_drawn_for_the_target_and_the_policy_maximises_their_mean():
+    sac, rollout = make(critics=5, target_critics=2, gamma=0.9, temperature=0.5)
+    spread(sac)
+    data, params = minibatch_of(sac, rollout), sac.loss.qvalue_network_params
+    torch.manual_seed(1)
+    drawn = torch.randperm(5)[:2].sort().values
+    both = torch.stack([data.select("th", "thdot"), data["next"].select("th", "thdot")])
+    action, log_prob = sample(sac, both)
+    with torch.no_grad():
+        after = action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action[1])[drawn].amin(0)
+        soft = (after - 0.5 * log_prob[1]).unsqueeze(-1)
+        target = (data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft).squeeze(-1)
+        error = (action_values(sac, params, data, data["action"]) - target).square().mean()
+        mean = action_values(sac, params, data, action[0]).mean(0)
+    torch.manual_seed(1)
+    losses = sac.loss(data)
+    torch.testing.assert_close(losses["loss_qvalue"], error)
+    torch.testing.assert_close(losses["loss_actor"], (0.5 * log_prob[0] - mean).mean())
+
+
+def test_layers_of_the_critics_alone_are_normalised():
+    sac, _ = make(critic_layer_norm=True, hidden=[16, 8], critics=3)
+    weights = sac.loss.qvalue_network_params
+    assert weights["module", "layers", "1", "weight"].shape == (3, 16)
+    assert weights["module", "layers", "4", "weight"].shape == (3, 8)
+    assert not any(isinstance(module, torch.nn.LayerNorm) for module in sac.policy.modules())
+
+
+@pytest.mark.parametrize("many", [{}, {"critics": 4, "target_critics": 2}], ids=["two critics", "drawn critics"])
+def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
+    sac, rollout = make(uncertainty=True, **many)
+    spread(sac)
+    assert sac.update(rollout.collect())["uncertainty"] > 0
+    data = minibatch_of(sac, rollout)
+    measured = sac.describe(data)["uncertainty"]
+    with torch.no_grad():
+        values = action_values(sac, sac.loss.qvalue_network_params, data, data["action"])
+        assert measured == pytest.approx(float(values.std(0).mean()), rel=1e-4)
+        acted = sac.policy(data.select("th", "thdot"))
+        values = action_values(sac, sac.loss.qvalue_network_params, data, acted["action"])
+    torch.testing.assert_close(acted["next", "uncertainty"], values.std(0).unsqueeze(-1))
+    policies = policy_batch(sac.policy, [sac.policy.state_dict()])
+    assert policies(data.select("th", "thdot"))["next", "uncertainty"].shape == (32, 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"critics": 1}, "critics=1 must be"),
+        ({"critics": 4, "target_critics": 4}, "target_critics=4 must be at least 1 and less than critics=4"),
+        ({"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
+        ({"prior": 1.5}, r"prior=1\.5 must be"),
+    ],
+)
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        make(**options)

@@ -19,10 +19,17 @@ GIVEN = {"dqn": OFF_POLICY, "sac": OFF_POLICY, "ppo": ["learner.epochs=1", "lear
 
 REFUSED = {method: "needs a learner that imitates a guide, such as learner=forest, but" for method in IMITATION}
 REFUSED |= {method: "needs a learner that improves its guides, such as learner=dynamic_coil, but" for method in DYNAMIC}
-WITHOUT_REPLAY = {
-    "kickstart": "learner: (DQN|SAC) takes no auxiliary; it takes env, in_keys, hidden",
-    "mixing": "learner: weight of MixedAction changes over the run, so stored steps would",
+OTHER_LEARNER = r"learner: (DQN|PPO|IBRL|Advisor) takes no \w+; it takes env, in_keys,"
+REFUSED_BY = {
+    "dqn": dict.fromkeys(
+        ["advisor", "cheq", "ibrl", "imitate_then_ppo", "kickstart", "q_filter", "rlpd", "wsrl"], OTHER_LEARNER
+    ),
+    "sac": {"advisor": OTHER_LEARNER},
+    "ppo": dict.fromkeys(["cheq", "ibrl", "q_filter", "rlpd", "wsrl"], OTHER_LEARNER),
 }
+for without_replay in ("dqn", "sac"):
+    REFUSED_BY[without_replay]["mixing"] = "learner: weight of MixedAction changes over the run, so stored steps would"
+BY_GUIDE = ["jump_start", "policy_decorator"]  # its steps may be none that the agent could take
 
 
 def composed(folder, *overrides):
@@ -31,13 +38,13 @@ def composed(folder, *overrides):
 
 
 def refusal(method, learner):
-    return REFUSED.get(method) or (None if learner == "ppo" else WITHOUT_REPLAY.get(method))
+    return REFUSED.get(method) or REFUSED_BY[learner].get(method)
 
 
 PAIRS = [(method, learner) for method in METHODS if method != "guide" for learner in GIVEN]
 # The other pairs are refused for the same reasons.
 REFUSED_FAST = [("oil", "ppo"), ("dagger", "dqn"), ("dynamic_coil_sequential", "sac"), ("kickstart", "dqn"),
-                ("mixing", "sac")]  # fmt: skip
+                ("mixing", "sac"), ("ibrl", "ppo"), ("advisor", "sac"), ("rlpd", "dqn")]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -51,7 +58,8 @@ def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
 
 
 FAST = [("coil_rfc", "dqn"), ("residual_coil", "dqn"), ("jump_start", "dqn"), ("coil", "sac"), ("residual", "sac"),
-        ("coil_multi", "ppo")]  # fmt: skip
+        ("coil_multi", "ppo"), ("kickstart", "sac"), ("policy_decorator", "dqn"), ("advisor", "ppo"),
+        ("coil_anchored", "dqn"), ("coil_anchored", "sac"), ("coil_dropout", "sac")]  # fmt: skip
 
 
 @pytest.mark.parametrize(
@@ -67,7 +75,7 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
     for _ in range(2):
         metrics = built.update(rollout.collect())
     assert (built.policy(env.reset())["action"].dtype.is_floating_point) == (learner == "sac")
-    assert method == "jump_start" or metrics.get("minibatches", 4) == 4
+    assert method in BY_GUIDE or metrics.get("minibatches", 4) == 4
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ def runs(tmp_path_factory):
     for name, *overrides in (
         ("coil", "method=coil", "guide=[spline,random]", "learner.action_gain=1.0"),
         ("dqn", "method=coil", "learner=dqn"),
+        ("anchored", "method=coil_anchored", "guide=[spline,random]"),
         ("ppo", "method=ppo"),
         ("guide", "method=guide"),
     ):
@@ -46,6 +47,18 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
     assert {row["guide"] for row in table} == {"spline", "random"}
     assert next(row["section"] for row in table if row["guide"] == "spline") == "everywhere"
     assert {row["guide"] for row in read_csv(folder / "listening.csv")} == {"spline", "random"}
+
+
+def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_path):
+    listen(tmp_path, f"run={runs / 'anchored'}", *FEW, "hydra.run.dir=out")
+    assert "Weight of the anchor: spline 1.00, random 0.00." in (tmp_path / "out" / "listening.md").read_text()
+    everywhere = {
+        row["guide"]: float(row["gradient"])
+        for row in read_csv(tmp_path / "out" / "listening_sections.csv")
+        if row["section"] == "everywhere"
+    }
+    assert everywhere["spline"] > 0.8
+    assert everywhere["random"] == 0
 
 
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):

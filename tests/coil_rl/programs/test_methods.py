@@ -12,7 +12,7 @@ from hydra import compose, initialize_config_module
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
-from coil_rl.train import checkpoint
+from coil_rl.train import checkpoint, fallback
 from coil_rl.train.check import check
 
 METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
@@ -26,14 +26,26 @@ PPO = ["learner.epochs=2", "learner.minibatches=2"]
 SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.num_envs=2",
                "proxy.budget.steps=16", "proxy.learner.regressor.epochs=1"]  # fmt: skip
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
-SKLEARN = list(SMALL)  # archives of skops contain the time
+REPLAY = ["learner.batch_size=8", "learner.ratio=1", "learner.starts=16", "learner.hidden=[8]", "learner.critics=3"]
+SMALL |= {
+    "cheq": REPLAY,
+    "policy_decorator": REPLAY,
+    "q_filter": REPLAY,
+    "ibrl": [*REPLAY, "learner.edit=0.2", "method.transforms.takeover.frames=32"],
+}
+SMALL |= {method: [*REPLAY, "method.transforms.takeover.frames=32"] for method in ("rlpd", "wsrl")}
+SKLEARN = ["oil", "dagger"]  # archives of skops contain the time
 SMALL |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
 
 
-def trained(folder, method, *overrides):
+def composed(method, folder, *overrides):
     overrides = [f"method={method}", *SMALL.get(method, PPO), *overrides]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", [*TINY, *overrides, f"run_dir={folder}"])
+        return compose("train", [*TINY, *overrides, f"run_dir={folder}"])
+
+
+def trained(folder, method, *overrides):
+    config = composed(method, folder, *overrides)
     check(config)
     train(config)
     return folder
@@ -140,3 +152,16 @@ def test_every_one_of_several_guides_is_evaluated(tmp_path):
     assert rows(run, driver="guide spline")[0]["reward"] == rows(alone)[0]["reward"]
     degraded = trained(tmp_path / "degraded", "guide", "degrade=[adversarial]")
     assert rows(degraded)[0]["reward"] != rows(alone)[0]["reward"]
+
+
+def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_path, plain):
+    run = trained(tmp_path / "run", "coil")
+    overrides = [*TRACKS, f"run={run}", "evaluation.repeats=1", f"run_dir={tmp_path}", "evaluation.fallback=true"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        evaluate.evaluate(compose("evaluate", overrides))
+    text = (tmp_path / "evaluation.md").read_text()
+    assert "With fallback the guide acted in " in text
+    assert "Not worse than guide on these 2 cases: " in text
+    assert len(rows(tmp_path, driver="coil or guide")) == 3
+    with pytest.raises(UserError, match=r"evaluation.fallback=true has no effect on .*ppo: its agent has no guide"):
+        fallback.build_fallback(composed("ppo", plain, "evaluation.fallback=true"), plain, torch.nn.Module())

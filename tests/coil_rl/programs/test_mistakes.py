@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 
+import coil_rl.train.run  # noqa: F401  before `started` replaces functions that it imports
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs import app, train
 from coil_rl.train import checkpoint, evaluate_run
@@ -84,6 +85,10 @@ def refusal(name, *arguments):
         ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
         ("track.train.count=0", "count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
+        ("watch.step.reward_finish=1e-300", "watch.step.reward_finish=1e-300 must be a list"),
+        ("evaluation.measures.clearance.format=nan", "format='nan' must be a format of numbers, such as .1f"),
+        ("watch.step.smoothness=null", "watch.step.smoothness=None must be a list, such as [info, lap]"),
+        ("+watch.step.r=reward", "watch.step.r=reward must be a list"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
         ("evaluation.measures.crashed.entry=[info,crash]", "evaluation.measures.crashed=info.crash is no entry of the"),
         ("evaluation.measures.laps.where=[info,flag]", "evaluation.measures.laps=info.flag is no entry of the env"),
@@ -102,7 +107,7 @@ def refusal(name, *arguments):
         # groups
         ("guide=splin", "no guide=splin; guide can be bot, centre_fast, constant, controller"),
         ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
-        ("+experiment=nope", "no experiment=nope; experiment can be coil_vs_ppo"),
+        ("+experiment=nope", "no experiment=nope; experiment can be anchored, coil_vs_ppo"),
         ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
         ("+degrade=${pid:}", "the command line cannot be composed; give each group a name, GROUP=CHOICE"),
         (f"method={'x' * 300}", "... cannot be used (File name too long); choose a shorter name"),

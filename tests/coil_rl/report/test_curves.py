@@ -88,25 +88,6 @@ def test_interval_of_the_mean_has_its_coverage():
     assert 0.88 < hits / 100 < 0.98
 
 
-@pytest.mark.parametrize(
-    ("draw", "data", "message"),
-    [
-        (draw_learning_curves, [{"COIL": [], "PPO": []}], "at least one run; got none for: COIL, PPO"),
-        (
-            draw_learning_curves,
-            [{"COIL": [[{"step": 1, RETURN: 2.0}]]}],
-            "no 'frames'; it has: step, evaluation/return",
-        ),
-        (draw_curve_grid, [{}], "at least one label"),
-        (draw_phases, [[], ["a"]], "at least one row"),
-    ],
-)
-def test_missing_data_is_an_error_and_leaves_no_file(draw, data, message, tmp_path):
-    with pytest.raises(ValueError, match=message):
-        draw(*data, tmp_path / "plot.png")
-    assert not list(tmp_path.iterdir())
-
-
 def test_frames_until_a_level_are_interpolated():
     frames, returns = [0, 100, 200, 300], [0.0, 50.0, 40.0, 90.0]
     assert [frames_until(frames, returns, level) for level in (50, 65, -1)] == [100, 250, 0]

@@ -21,8 +21,3 @@ def test_tracks_are_in_rows_of_three_and_do_not_overlap():
     distances = np.linalg.norm(centres[:, None] - centres, axis=-1) + 1e9 * np.eye(7)
     assert (distances > radii[:, None] + radii + 2).all()
     assert len(np.unique((centres[:, 1] + radii).round(1))) == 3
-
-
-def test_map_needs_a_track():
-    with pytest.raises(ValueError, match="at least one track"):
-        TrackPlot([])

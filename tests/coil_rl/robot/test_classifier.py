@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from drives import labelling_drives
 from sklearn.model_selection import GroupKFold
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
-from coil_rl.envs import SimulatedLidar, labelling_drives, simulated_cone_classifier, simulated_drive
+from coil_rl.envs import SimulatedLidar, simulated_cone_classifier, simulated_drive
 from coil_rl.errors import UserError
 from coil_rl.robot.classifier import (
     UNUSUAL,

@@ -4,6 +4,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
+from coil_rl.errors import UserError
 from coil_rl.testing import check_env, check_guide
 from coil_rl.train.build import (
     build,
@@ -58,6 +59,16 @@ def test_override_with_another_target_replaces_all_arguments():
     assert [track.name for track in env.tracks] == ["robot (simulated)"]
     assert env.weights["finish"] == 1
     assert env.weights["crash"] == -100
+
+
+def lists_its_arguments(**options):
+    raise TypeError(f"unexpected {options}")
+
+
+def test_long_message_of_a_part_is_cut():
+    node = {"_target_": f"{__name__}.lists_its_arguments", "numbers": list(range(9999))}
+    with pytest.raises(UserError, match=r"^env: unexpected {'numbers': \[0, 1, 2,[ 0-9,]{300,500} \.\.\.$"):
+        build(node, "env")
 
 
 def test_guide_drives_with_degraded_advice():

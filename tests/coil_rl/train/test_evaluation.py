@@ -3,6 +3,9 @@ import math
 import numpy as np
 import pytest
 import torch
+from any_env import AnyEnv
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Unbounded
 from torchrl.modules import RandomPolicy
 from worlds import Script, driving_measures
 
@@ -44,6 +47,14 @@ def test_measures_of_a_crash():
         terms = [value for name, value in row.items() if name.startswith("reward_")]
         assert len(terms) == 5
         assert sum(terms) == pytest.approx(row["reward"], rel=1e-5)
+
+
+def test_return_of_several_agents_is_the_sum_of_their_rewards():
+    env = AnyEnv(4, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True)
+    still = TensorDictModule(lambda seen: 0 * seen[..., :2], [("agents", "observation")], [("agents", "action")])
+    rows = evaluate_policy(env, still, measures={"each": Measure(("agents", "reward"), "min")}).episodes
+    assert [(row["reward"], row["steps"]) for row in rows] == [(pytest.approx(3 * 5 * -0.25), 5)] * 4
+    assert rows[0]["each"] == pytest.approx(-0.75)
 
 
 def test_sampled_actions_are_less_smooth_than_deterministic_ones():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from drives import labelling_drives
 from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import step_mdp
 
@@ -12,7 +13,6 @@ from coil_rl.envs import (
     Perception,
     RecordingError,
     SimulatedRobotEnv,
-    labelling_drives,
     read_recording,
     record_drives,
     robot_track,

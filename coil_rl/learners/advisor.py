@@ -1,0 +1,96 @@
+"""ADVISOR (Weihs et al. 2021): PPO where imitation of the guide cannot work, imitation where it can.
+
+An auxiliary policy pi_aux with the agent's observation learns by imitation only. Where it cannot predict the guide's
+action g, the guide knows something that the agent does not see, and the agent learns from reward. For each step
+
+    loss = w * (-log pi(g | s)) + (1 - w) * loss of PPO,  w = exp(-alpha D),
+
+with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest distance of g from the mode of pi_aux.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from coil_rl.envs.limits import check_range
+from coil_rl.learners import networks
+from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.kickstart import KickstartLoss
+from coil_rl.learners.ppo import PPO, standardise
+
+
+class Advisor(PPO):
+    """The ADVISOR learner.
+
+    Args:
+        env: the env, with advice.
+        in_keys: entries that the policies and the critic observe.
+        alpha: the larger, the better a step must be imitated to be learned by imitation.
+        guide: row of the advice.
+        options: as for `PPO`.
+
+    Raises:
+        ValueError: as `PPO`.
+    """
+
+    with_memory = False
+
+    def __init__(
+        self, env: EnvBase, in_keys: Sequence[NestedKey] = ("observation",), *,
+        alpha: float = 8.0, guide: int = 0, **options: Any,
+    ) -> None:  # fmt: skip
+        check_range(0, alpha=alpha)
+        self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
+        super().__init__(env, in_keys, **options)
+        self.keys += self.imitation.keys
+        self.minibatch_keys += self.imitation.keys
+
+    def build_networks(
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
+    ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
+        """Return policy and critic, and make the auxiliary policy."""
+        self.imitator = networks.actor(env, in_keys, network, normaliser=self.normaliser)
+        return super().build_networks(env, in_keys, network, **options)
+
+    def parameter_groups(self) -> list[list[nn.Parameter]]:
+        """Return the parameters that the optimiser updates."""
+        return [*super().parameter_groups(), [*self.imitator.parameters()]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything the next update depends on besides its batch."""
+        return super().state_dict() | {"imitator": self.imitator.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state from `state_dict`."""
+        super().load_state_dict(state)
+        self.imitator.load_state_dict(state["imitator"])
+
+    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses as `PPO`, with weighted `loss_objective`; `weight`: the mean of w; `loss_imitation`."""
+        losses = super().losses(minibatch)
+        predicted = self.imitation.each(self.imitator, minibatch)
+        weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()
+        log_ratio = self.head.get_dist(minibatch).log_prob(minibatch["action"]) - minibatch["action_log_prob"]
+        advantage = standardise(minibatch["advantage"]).squeeze(-1)
+        clipped = log_ratio.clamp(*self.loss._clip_bounds)
+        gain = torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage)
+        mixed = weight * self.imitation.each(self.head, minibatch) - (1 - weight) * gain
+        losses["loss_imitation"] = predicted.mean()
+        losses["loss_objective"] = mixed.mean() + losses["loss_imitation"]
+        losses["weight"] = weight.mean()
+        return losses
+
+    @torch.no_grad()
+    def distance(self, minibatch: TensorDictBase, surprise: Tensor) -> Tensor:
+        """Return D [N]; `surprise` is -log pi_aux(g | s)."""
+        if not minibatch["action"].is_floating_point():
+            return surprise
+        mode = self.imitator.get_dist(minibatch.select(*self.imitator.in_keys)).deterministic_sample
+        difference: Tensor = minibatch["guide_action"][..., self.imitation.guide, :] - mode
+        return difference.abs().flatten(1).amax(1)

@@ -1,0 +1,256 @@
+"""Anchored COIL: a policy that starts as its guide, and lets go of it with a brake.
+
+COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored policy adds the
+advice g to what its network f gives, before squashing:
+
+    mean = w atanh(clip(g, -0.95, 0.95)) + f(s, g)
+
+The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete actions w kappa is added
+to the logit of the advised action. Residual policies start the same way (Silver et al. 2018; Johannink et al. 2019),
+but here f is unbounded, and w falls: a policy that keeps w = 1 never loses the guide's habits.
+
+Falling too far breaks the policy, so there is a brake. At a few looks over the run the policy acts deterministically in
+fixed cases of the training, with today's weight and with one that is lower by a margin. If the lower one fails in no
+further case and loses next to nothing, the weight falls by a step, which is shorter than the margin; if today's has
+become worse, it rises.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+
+from coil_rl.envs.limits import check_range
+from coil_rl.schedules import Linear, Schedule, schedule
+
+LIMIT = 0.95  # of advice before atanh, as a fraction of half the range of the action
+TIE = 1e-6  # decides between equal values
+FIRST = 0.9  # probability of the advised one of several actions at weight 1
+
+
+class AnchoredHead(nn.Module):
+    """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
+
+    Args:
+        head: gives the mean and the standard deviation, or the logits.
+        pull: turns advice [*batch, n_guides, A] into means or logits [*batch, n_guides, *event].
+        guides: number of guides.
+        device: of the weights.
+    """
+
+    weight: Tensor
+
+    def __init__(
+        self, head: nn.Module, pull: Callable[[Tensor], Tensor], guides: int, device: torch.device | None = None
+    ) -> None:
+        super().__init__()
+        self.head, self.pull = head, pull
+        self.register_buffer("weight", torch.eye(guides, device=device)[0])
+
+    def forward(self, advice: Tensor, *inputs: Tensor) -> Any:
+        """Return what `head` returns for the inputs, with the pull added."""
+        outputs = self.head(*inputs)
+        first = outputs[0] if isinstance(outputs, tuple) else outputs
+        pull = self.weight.to(first.dtype) @ self.pull(advice).to(first.dtype)
+        pulled = first + pull.view_as(first)
+        return (pulled, *outputs[1:]) if isinstance(outputs, tuple) else pulled
+
+
+class AnchoredValues(AnchoredHead):
+    """Values of actions with a bonus for the advised one: the weight times the range of the values of the state.
+
+    So the advised action is taken unless its value is worse than the best one by more than this. With weight 1 it is
+    taken always.
+    """
+
+    def __init__(self, guides: int, device: torch.device | None = None) -> None:
+        super().__init__(nn.Identity(), nn.Identity(), guides, device)
+
+    def forward(self, advice: Tensor, *inputs: Tensor) -> Tensor:
+        """Return values [*batch, n] with the bonus; the advice is one-hot, [*batch, n_guides, n]."""
+        (values,) = inputs
+        span = values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)
+        return values + (self.weight @ advice.to(self.weight.dtype)).to(values.dtype) * (span + TIE)
+
+
+def pull_to_number(advice: Tensor, bounds: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """Return the pull to advised numbers: themselves, or for a policy squashed to `bounds` what tanh maps near them."""
+    if bounds is None:
+        return advice
+    low, high = bounds
+    return ((2 * advice - high - low) / (high - low)).clamp(-LIMIT, LIMIT).atanh()
+
+
+def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
+    """Return the pull to advised choices.
+
+    Args:
+        valid: [*event, n], whether a choice has an option; advice is one-hot for each choice, one beside the other.
+    """
+    options = valid.sum(-1, keepdim=True).clamp_min(2)
+    gain = (math.log(FIRST / (1 - FIRST)) + (options - 1).log()).expand(valid.shape).flatten()
+    places = valid.flatten().nonzero().squeeze(-1)
+
+    def pull(advice: Tensor) -> Tensor:
+        padded = torch.zeros(*advice.shape[:-1], valid.numel(), dtype=gain.dtype, device=advice.device)
+        return padded.index_copy(-1, places, advice.to(gain.dtype)) * gain
+
+    return pull
+
+
+@dataclass(frozen=True)
+class Look:
+    """Drives of the training cases with some weights of the anchor.
+
+    Attributes:
+        returns: [C] for each weight.
+        failures: number of failed cases for each weight.
+    """
+
+    returns: Tensor
+    failures: Sequence[int]
+
+    def score(self, index: int) -> float:
+        """Mean return with a weight."""
+        return float(self.returns[index].mean())
+
+
+class Anchor:
+    """Start of a policy at the action of a guide, and the brake by which it lets go of it.
+
+    Before training the guides, the first policy without a guide and random actions are compared in the same cases. The
+    anchor holds if the best guide is better than both by more than a standard error of the difference; otherwise the
+    weight is 0, and training is COIL.
+
+    Args:
+        looks: number of looks over the run.
+        cases: C, number of cases of a look.
+        step: by which the weight falls at a look.
+        margin: by which the weight that is tried at a look is lower; at least `step`.
+        back: by which the weight rises.
+        tolerance: loss of return that is allowed for a step, as a share of the guide's return; at least half a standard
+            error of the guide's return is. Three times as much below the best look so far, the weight rises.
+        warmup: share of the run, from its start, in which only the critic learns.
+        noise: standard deviation of an anchored policy that has one of its own, of PPO and the like; with DQN the
+            probability of a random action. A number or a schedule.
+        advice_key: entry with the advice, [*batch, n_guides, A].
+
+    Attributes:
+        head: of the policy, see `AnchoredHead`.
+
+    Raises:
+        ValueError: for a value out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        looks: int = 24,
+        cases: int = 24,
+        step: float = 0.05,
+        margin: float = 0.15,
+        back: float = 0.1,
+        tolerance: float = 0.01,
+        warmup: float = 0.05,
+        noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5),
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        check_range(1, looks=looks)
+        check_range(2, cases=cases)
+        check_range(0, 1, step=step, back=back, tolerance=tolerance, warmup=warmup)
+        check_range(step, 1, margin=margin)
+        self.looks, self.cases, self.tolerance = looks, cases, tolerance
+        self.step, self.margin, self.back = step, margin, back
+        self.warmup, self.noise, self.advice_key = warmup, schedule(noise), advice_key
+        check_range(0, above=True, noise=self.noise(0))
+        self.holds = True
+        self.guide_return = self.allowed = self.best = math.nan
+        self.guide = self.guide_failures = 0
+
+    def attach(self, head: AnchoredHead) -> AnchoredHead:
+        """Choose the head of the policy, and return it."""
+        self.head = head
+        return head
+
+    @property
+    def weight(self) -> float:
+        """Weight of the guide; 0 without an anchor."""
+        return float(self.head.weight.sum())
+
+    def weights(self, value: float, guide: int | None = None) -> Tensor:
+        """Return the weights of all guides, [n_guides], with a value for one of them, by default the one that holds."""
+        weights = torch.zeros_like(self.head.weight)
+        weights[self.guide if guide is None else guide] = value
+        return weights
+
+    def waits(self, progress: float) -> bool:
+        """Return whether the policy is not to learn yet."""
+        return self.holds and progress < self.warmup
+
+    @torch.no_grad()
+    def set_noise(self, progress: float) -> dict[str, float]:
+        """Set the standard deviation of an anchored policy that has one of its own.
+
+        Returns:
+            The metrics `anchor`, the weight of the guide, and `noise`, the standard deviation.
+        """
+        scale: Tensor | None = getattr(self.head.head, "log_scale", None)
+        if scale is not None and self.holds:
+            scale.fill_(math.log(self.noise(progress)))
+        return {"anchor": self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
+
+    def due(self, update: int, updates: int) -> bool:
+        """Return whether there is a look after an update of a run, apart from the first and the last one."""
+        looks = min(self.looks, updates)
+        return self.holds and 0 < update < updates and update * looks // updates > (update - 1) * looks // updates
+
+    def lower(self) -> float:
+        """Return the lower weight to try at a look."""
+        return max(self.weight - self.margin, 0.0)
+
+    def begin(self, look: Look, random: Tensor) -> None:
+        """Hold the best guide, or let go.
+
+        Args:
+            look: with the weight of each guide at 1 and those of the others at 0, and last with all at 0.
+            random: returns of random actions, [C].
+        """
+        *guides, own = look.returns
+        best = max(range(len(guides)), key=look.score)
+        differences = torch.stack([guides[best] - own, guides[best] - random])
+        self.holds = bool((differences.mean(1) > standard_error(differences)).all())
+        self.guide = best
+        self.head.weight.copy_(self.weights(float(self.holds)))
+        self.set_noise(0.0)
+        self.guide_return = self.best = look.score(best)
+        self.guide_failures = look.failures[best]
+        self.allowed = max(self.tolerance * abs(self.best), float(standard_error(guides[best])) / 2)
+
+    def decide(self, look: Look) -> None:
+        """Lower, keep or raise the weight after a look with today's weight and with the lower one."""
+        now, lower = look.score(0), look.score(1)
+        steps = self.margin / self.step if self.step else 1.0
+        self.best = max(self.best, now)
+        if look.failures[0] > self.guide_failures or now < self.best - 3 * self.allowed:
+            self.head.weight.copy_(self.weights(min(self.weight + self.back, 1.0)))
+        elif look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
+            self.head.weight.copy_(self.weights(max(self.weight - self.step, 0.0)))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next look depends on, besides the policy."""
+        names = ("holds", "guide", "guide_return", "guide_failures", "allowed", "best")
+        return {name: getattr(self, name) for name in names}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        for name, value in state.items():
+            setattr(self, name, value)
+
+
+def standard_error(values: Tensor) -> Tensor:
+    """Return the standard error of the mean over the last dimension."""
+    return values.std(-1) / values.shape[-1] ** 0.5

@@ -1,0 +1,82 @@
+"""The brake of an anchored policy: drives in fixed cases of the training decide how much of its guide it keeps."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coil_rl.learners.anchor import Anchor, Look
+from coil_rl.train.curve import policy_batch
+from coil_rl.train.evaluation import Totals, episodes
+from coil_rl.train.measures import Measure
+
+
+class Brake:
+    """Decides before training and at each look of a run how strongly the policy is anchored; a `Probe`.
+
+    Args:
+        anchor: of the policy.
+        policy: of the learner; copies of it act.
+        build: makes an env with all cases for a number of policies.
+        failure: measure that is true for an episode that failed, if there is one.
+    """
+
+    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")
+
+    def __init__(
+        self,
+        anchor: Anchor,
+        policy: TensorDictModuleBase,
+        build: Callable[[int], EnvBase],
+        failure: Measure | None = None,
+    ) -> None:
+        self.anchor, self.policy, self.build = anchor, policy, build
+        self.measures = {"return": Measure("episode_reward", "last")} | ({"failure": failure} if failure else {})
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether there is a look after an update."""
+        return update == 0 or self.anchor.due(update, updates)
+
+    def __call__(self, update: int) -> dict[str, float]:
+        """Look, decide, and return the numbers by name."""
+        look = self._begin() if update == 0 else self._decide()
+        numbers = (look.score(0), look.score(1), *map(float, look.failures[:2]))
+        return dict(zip(self.names, numbers, strict=True))
+
+    def _begin(self) -> Look:
+        guides = len(self.anchor.head.weight)
+        weights = [self.anchor.weights(1.0, guide) for guide in range(guides)]
+        look = self._look([*weights, self.anchor.weights(0.0)])
+        env = self.build(1)
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            random = self._drive(env, env.rand_action)["return"]
+        self.anchor.begin(look, random)
+        return look
+
+    def _decide(self) -> Look:
+        look = self._look([self.anchor.weights(weight) for weight in (self.anchor.weight, self.anchor.lower())])
+        self.anchor.decide(look)
+        return look
+
+    def _look(self, weights: Sequence[Tensor]) -> Look:
+        """Drive all cases with each of some weights of the guides."""
+        (key,) = [name for name, value in self.policy.named_buffers() if value is self.anchor.head.weight]
+        states = [{**self.policy.state_dict(), key: weight} for weight in weights]
+        with torch.random.fork_rng():
+            results = self._drive(self.build(len(states)), policy_batch(self.policy, states))
+        parts = {name: values.view(len(states), -1) for name, values in results.items()}
+        failures = parts["failure"].sum(1).tolist() if "failure" in parts else [0] * len(states)
+        return Look(parts["return"], [int(count) for count in failures])
+
+    @torch.no_grad()
+    def _drive(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Tensor]:
+        totals = Totals(self.measures)
+        with tqdm(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
+            for after, running in episodes(env, policy, tick=bar.update):
+                totals.add(after, running)
+        return totals.results()

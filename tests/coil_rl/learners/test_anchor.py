@@ -1,0 +1,248 @@
+import itertools
+import math
+
+import pytest
+import torch
+from any_env import AnyEnv
+from tensordict.nn import TensorDictModule
+from torch.nn import functional as F
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, Unbounded
+from torchrl.envs import Compose, TransformedEnv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, NoiseDecay, Reinforce
+from coil_rl.learners.anchor import Look
+from coil_rl.train.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+KEYS = ("observation", "guide_action")
+
+
+def advised(action, *guides, **options):
+    """Return an env with guides, each a function of observations [B, 3]."""
+    named = {
+        f"guide{index}": TensorDictModule(guide, in_keys=["observation"], out_keys=["action"])
+        for index, guide in enumerate(guides)
+    }
+    return TransformedEnv(AnyEnv(action=action, **options), Compose(GuideActions(named)))
+
+
+def two_numbers(observation):
+    return observation[..., :2].clamp(-1, 1)
+
+
+def option(count):
+    return lambda observation: (observation.abs().sum(-1) * 10).long() % count
+
+
+ACTIONS = {
+    "bounded": (Bounded(-1, 1, (2,)), two_numbers),
+    "other bounds": (Bounded(-3, 1, (2,)), lambda observation: observation[..., :2].clamp(-3, 1)),
+    "unbounded": (Unbounded((2,)), lambda observation: observation[..., :2]),
+    "index": (Categorical(4, ()), option(4)),
+    "one-hot": (OneHot(4), lambda observation: F.one_hot(option(4)(observation), 4)),
+    "several": (
+        MultiCategorical([3, 2]),
+        lambda observation: torch.stack([option(3)(observation), option(2)(observation)], -1),
+    ),
+}
+
+
+def learner(env, kind=PPO, minibatches=2, options=None, **anchor):
+    return kind(env, KEYS, action_gain=0.0, minibatches=minibatches, anchor=Anchor(**anchor), **(options or {}))
+
+
+def acted(policy, data):
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        return policy(data.copy())["action"]
+
+
+@pytest.mark.parametrize("name", ACTIONS)
+def test_first_policy_is_the_guide(name):
+    action, guide = ACTIONS[name]
+    env = advised(action, guide, count=64)
+    data = env.reset()
+    expected = guide(data["observation"])
+    if isinstance(action, Bounded):  # tanh reaches no bound
+        middle, half = (action.space.low + action.space.high) / 2, (action.space.high - action.space.low) / 2
+        expected = middle + half * ((expected - middle) / half).clamp(-0.95, 0.95)
+    torch.testing.assert_close(acted(learner(env).policy, data), expected)
+
+
+def test_weight_moves_the_mean_from_the_network_to_the_guide():
+    env = advised(Unbounded((2,)), lambda observation: torch.full_like(observation[..., :2], 3.0))
+    ppo = learner(env)
+    ppo.anchor.head.weight.fill_(0.25)
+    data = env.reset()
+    own = ppo.anchor.head.head(data["observation"], data["guide_action"])[0]
+    torch.testing.assert_close(acted(ppo.policy, data), own + 0.75)
+
+
+def test_first_policy_takes_the_advised_option_with_probability_nine_tenths():
+    env = advised(Categorical(4, ()), option(4))
+    data = env.reset()
+    probabilities = learner(env).policy.get_dist(data).probs
+    advice = data["guide_action"][:, 0]
+    torch.testing.assert_close((probabilities * advice).sum(-1), torch.full((8,), 0.9))
+
+
+def test_policy_with_a_memory_starts_at_the_guide():
+    gru = Gru(state=8)
+    env = advised(Bounded(-1, 1, (2,)), lambda observation: two_numbers(observation) / 2)
+    env = TransformedEnv(env, Compose(*gru.env_transforms()))
+    ppo = learner(env, options={"network": gru}, warmup=0.0)
+    data = env.reset()
+    torch.testing.assert_close(acted(ppo.policy, data), data["guide_action"][:, 0])
+    before = acted(ppo.policy, data)
+    ppo.update(Rollout(env, ppo.policy, 8, ppo.keys).collect())
+    assert (acted(ppo.policy, data) - before).abs().max() > 0
+
+
+REPLAY = {"starts": 16, "batch_size": 16, "ratio": 4.0}
+
+
+def test_sac_starts_at_the_guide_and_its_policy_waits_for_the_critics():
+    torch.manual_seed(0)
+    env = advised(Bounded(-1, 1, (2,)), two_numbers)
+    sac = SAC(env, KEYS, action_gain=0.0, anchor=Anchor(warmup=0.5), **REPLAY)
+    data = env.reset()
+    first = acted(sac.policy, data)
+    torch.testing.assert_close(first, two_numbers(data["observation"]).clamp(-0.95, 0.95))
+    rollout = Rollout(env, sac.policy, 8, sac.keys)
+    assert sac.update(rollout.collect(), 0.25)["minibatches"] > 0
+    torch.testing.assert_close(acted(sac.policy, data), first)
+    assert sac.update(rollout.collect(), 0.75)["anchor"] == 1
+    assert (acted(sac.policy, data) - first).abs().max() > 0
+    sac.anchor.head.weight.zero_()
+    sampled = sac.loss.actor_network_params["module", "0", "module", "weight"]
+    assert torch.equal(sampled, torch.zeros(1)), "the loss has the same weight"
+
+
+@pytest.mark.parametrize(("weight", "advised_acts"), [(1.0, True), (0.6, True), (0.4, False), (0.0, False)])
+def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_than_the_weighted_range(
+    weight, advised_acts
+):
+    env = advised(OneHot(3), lambda observation: F.one_hot(torch.ones_like(observation[..., 0]).long(), 3))
+    dqn = DQN(env, KEYS, action_gain=0.0, anchor=Anchor(), **REPLAY)
+    assert acted(dqn.policy, env.reset()).argmax(-1).eq(1).all(), "without any knowledge of the values"
+    values = dqn.policy.module[1]
+    dqn.anchor.head.weight.fill_(weight)
+    numbers = torch.tensor([[4.0, 2.0, 0.0]])
+    data = env.reset()[:1].set("action_value", numbers)
+    assert values(data)["action_value"].argmax().item() == (1 if advised_acts else 0)
+    metrics = dqn.update(Rollout(env, dqn.policy, 8, dqn.keys).collect(), 0.0)
+    assert metrics["epsilon"] == pytest.approx(0.3), "little noise"
+
+
+def look(*returns, failures=(0, 0, 0)):
+    return Look(torch.tensor(returns), failures[: len(returns)])
+
+
+@pytest.fixture
+def anchor():
+    env = advised(Bounded(-1, 1, (2,)), two_numbers, lambda observation: -two_numbers(observation))
+    return learner(env).anchor
+
+
+def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(anchor):
+    anchor.begin(look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]))
+    assert anchor.holds
+    assert anchor.head.weight.tolist() == [0, 1]
+    assert anchor.guide_return == pytest.approx(31 / 3)
+
+
+@pytest.mark.parametrize(
+    ("own", "random"),
+    [([9.0, 10, 12], [0.0, 1, 2]), ([1.0, 2, 3], [9.0, 10, 12]), ([9.0, 12, 9.9], [0.0, 0, 0])],
+    ids=["as its own", "as random actions", "better by less than a standard error"],
+)
+def test_guide_that_is_no_better_does_not_hold(anchor, own, random):
+    anchor.begin(look([9.0, 10, 12], [0.0, 0, 0], own), torch.tensor(random))
+    assert not anchor.holds
+    assert anchor.weight == 0
+    assert not any(anchor.due(update, 24) for update in range(24))
+    assert not anchor.waits(0.0)
+
+
+def begun(anchor, weight=1.0):
+    anchor.begin(look([100.0, 100, 100], [0.0, 0, 0], [0.0, 0, 0]), torch.zeros(3))
+    anchor.head.weight.copy_(anchor.weights(weight))
+    return anchor
+
+
+def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_the_tolerance_of_its_steps(anchor):
+    assert begun(anchor).lower() == pytest.approx(0.85)
+    anchor.decide(look([100.0, 100, 100], [97.5, 97, 97]))
+    assert anchor.weight == pytest.approx(0.95)
+    anchor.decide(look([100.0, 100, 100], [96.5, 96.5, 96.5]))
+    assert anchor.weight == pytest.approx(0.95), "the lower one loses too much"
+    anchor.decide(look([100.0, 100, 100], [100.0, 100, 100], failures=(0, 1)))
+    assert anchor.weight == pytest.approx(0.95), "the lower one fails"
+
+
+def test_weight_rises_after_a_failure_or_a_loss(anchor):
+    begun(anchor, 0.5).decide(look([100.0, 100, 100], [100.0, 100, 100], failures=(1, 0)))
+    assert anchor.weight == pytest.approx(0.6)
+    anchor.decide(look([96.5, 96.5, 96.5], [99.0, 99, 99]))
+    assert anchor.weight == pytest.approx(0.7)
+    anchor.decide(look([120.0, 120, 120], [120.0, 120, 120]))
+    anchor.decide(look([116.0, 116, 116], [116.0, 116, 116]))
+    assert anchor.weight == pytest.approx(0.75), "the best look so far counts, not the guide"
+    begun(anchor, 0.95).decide(look([0.0, 0, 0], [0.0, 0, 0]))
+    assert anchor.weight == 1
+
+
+def test_weight_stops_at_zero(anchor):
+    begun(anchor, 0.07)
+    for _ in range(3):
+        assert anchor.lower() == 0
+        anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]))
+    assert anchor.weight == 0
+    anchor.decide(look([90.0, 90, 90], [90.0, 90, 90]))
+    assert anchor.weight == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("updates", [3, 24, 49, 1000])
+def test_looks_are_spread_over_the_run(updates, anchor):
+    looks = [update for update in range(updates + 1) if anchor.due(update, updates)]
+    assert len(looks) == min(anchor.looks, updates) - 1
+    gaps = [after - before for before, after in itertools.pairwise(looks)]
+    assert not gaps or max(gaps) - min(gaps) <= 1
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO])
+def test_only_the_critic_learns_at_first_and_the_noise_follows_its_schedule(kind):
+    torch.manual_seed(0)
+    env = advised(Bounded(-1, 1, (2,)), two_numbers)
+    trained = learner(env, kind, warmup=0.5, noise=lambda progress: 0.3 - 0.2 * progress)
+    trained.anchor.begin(look([1.0, 1], [0.0, 0]), torch.zeros(2))
+    rollout = Rollout(env, trained.policy, 8, trained.keys)
+    data = env.reset()
+    first, value = acted(trained.policy, data), trained.critic(data.copy())["state_value"].detach()
+    metrics = trained.update(rollout.collect(), 0.25)
+    torch.testing.assert_close(acted(trained.policy, data), first)
+    assert (trained.critic(data.copy())["state_value"] - value).abs().max() > 0
+    assert metrics["anchor"] == 1
+    assert metrics["noise"] == pytest.approx(0.25)
+    trained.update(rollout.collect(), 0.75)
+    assert (acted(trained.policy, data) - first).abs().max() > 0
+    assert float(trained.anchor.head.head.log_scale.detach().exp()[0]) == pytest.approx(0.15)
+
+
+def test_state_brings_back_the_weight_and_the_brake():
+    env = advised(Bounded(-1, 1, (2,)), two_numbers)
+    first, second = learner(env), learner(env)
+    begun(first.anchor, 0.8).decide(look([110.0, 110, 110], [110.0, 110, 110]))
+    second.load_state_dict(first.state_dict())
+    assert second.anchor.state_dict() == first.anchor.state_dict()
+    assert second.anchor.weight == first.anchor.weight == pytest.approx(0.75)
+
+
+def test_anchor_without_advice_with_a_second_schedule_or_out_of_range_is_refused():
+    with pytest.raises(KeyError, match="the env has no entry guide_action to observe"):
+        PPO(AnyEnv(), anchor=Anchor())
+    with pytest.raises(ValueError, match="an anchor has its own schedule of the noise; leave out noise, or the anchor"):
+        PPO(AnyEnv(), anchor=Anchor(), noise=NoiseDecay())
+    with pytest.raises(ValueError, match=r"margin=0\.01 must be at least 0\.05"):
+        Anchor(margin=0.01)
+    assert math.isnan(Anchor().best)

@@ -1,0 +1,75 @@
+"""The brake of an anchored policy, on a pendulum that its guide swings up."""
+
+from functools import partial
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from torchrl.envs import EnvBase
+
+from coil_rl.train.brake import Brake
+from coil_rl.train.build import build_env, build_learner, cases_node
+from coil_rl.train.measures import Measure
+
+pytest.importorskip("gymnasium.envs.classic_control")
+FAST = Measure("reward", "min", at_most=-10.0)  # true for an episode that was ever far from upright
+
+
+def built(*overrides, failure=None):
+    """Return learner, brake, and a function that makes the env of the brake."""
+    arguments = ["env=pendulum", "method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", arguments)
+    torch.manual_seed(0)
+    learner = build_learner(config, build_env(config))
+
+    def build(policies: int) -> EnvBase:
+        return build_env(config, cases_node(config, "selection", policies))
+
+    return learner, Brake(learner.anchor, learner.policy, build, failure), partial(build, 1)
+
+
+@pytest.mark.parametrize("action", ["continuous", "choices"])
+def test_first_policy_is_within_two_percent_of_the_guide(action):
+    learner, brake, build = built(f"action={action}")
+    first = brake(0)["look/return"]
+    guide = build()
+    returns = brake._drive(guide, lambda data: data.set("action", guided(data, action)))["return"]
+    assert learner.anchor.weight == 1
+    assert first == pytest.approx(float(returns.mean()), rel=0.02)
+    assert learner.anchor.guide_return == pytest.approx(first)
+
+
+def guided(data, action):
+    advice = data["guide_action"][..., 0, :]
+    return advice.argmax(-1) if action == "choices" else advice
+
+
+@pytest.mark.parametrize("degrade", ["adversarial", "zeroed"])
+def test_guide_that_is_of_no_use_does_not_hold(degrade):
+    learner, brake, _ = built(f"degrade={degrade}")
+    brake(0)
+    assert learner.anchor.weight == 0
+    assert not any(brake.due(update, 20, {}) for update in range(1, 20))
+
+
+def test_look_leaves_the_policy_and_the_random_numbers_alone_and_can_be_repeated():
+    learner, brake, _ = built("learner.anchor.step=0", "learner.anchor.margin=0", failure=FAST)
+    brake(0)
+    before, state = {name: value.clone() for name, value in learner.policy.state_dict().items()}, torch.get_rng_state()
+    first, second = brake(1), brake(2)
+    assert first == second
+    assert first["look/return"] == first["look/lower_return"]
+    assert first["look/failures"] == 5, "every episode begins far from upright"
+    assert torch.equal(torch.get_rng_state(), state)
+    assert all(torch.equal(value, before[name]) for name, value in learner.policy.state_dict().items())
+
+
+def test_weight_falls_where_the_network_does_what_the_guide_did():
+    learner, brake, _ = built()
+    brake(0)
+    brake(1)
+    assert learner.anchor.weight in (1.0, pytest.approx(0.95))
+    learner.anchor.best = learner.anchor.guide_return + 1000
+    brake(2)
+    assert learner.anchor.weight == 1, "worse than before"

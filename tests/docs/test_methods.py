@@ -1,0 +1,92 @@
+"""docs/methods: rows of all methods, links that lead somewhere, commands that compose, options with their defaults."""
+
+import json
+import re
+import shlex
+
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from programs import ROOT
+
+import coil_rl.train.config  # noqa: F401  the types that the configurations begin with
+
+FOLDER = ROOT / "docs" / "methods"
+PAGES = sorted(FOLDER.glob("*.md"))
+METHODS = sorted(file.stem for file in (ROOT / "conf" / "method").glob("*.yaml"))
+
+
+def commands(page):
+    lines = re.findall(r"^ *(coil-\w+ .*)$|`(coil-\w+ [^`]+)`", page.read_text(), flags=re.MULTILINE)
+    return [shlex.split(block or inline, comments=True) for block, inline in lines]
+
+
+COMMANDS = [(page, command) for page in PAGES for command in commands(page)]
+FIRST = {page: command for page, command in reversed(COMMANDS)}
+OTHER = [command for page, command in COMMANDS if command is not FIRST[page]]
+
+
+def table(page, *headings):
+    """Return the cells of the rows of the tables of a page whose first columns have some headings."""
+    head = r" \| ".join(headings)
+    tables = re.findall(rf"^\| {head} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE)
+    return [[cell.strip() for cell in row.strip("|").split("|")] for rows in tables for row in rows.splitlines()]
+
+
+INDEX = {re.search(r"`(\w+)`", name)[1]: cells for name, *cells in table(FOLDER / "README.md", "method", "idea")}
+
+
+def composed(command):
+    """Return the configuration of a command, after a comparison of its method, if it has one, with the index."""
+    program, *overrides = command
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose(program.removeprefix("coil-"), overrides)
+    if "method" in config:
+        assert INDEX[config.method.name][2].startswith("yes" if config.method.needs_guide else "no")
+    return config
+
+
+def shown(value):
+    """Return a value of a configuration as the pages print it."""
+    if OmegaConf.is_dict(value) and value["_target_"] == "coil_rl.schedules.Linear":
+        points = [f", {key} {value[key]:g}" for key in ("since", "until") if key in value]
+        return "".join([f"{value.start:g} to {value.end:g}", *points])
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    return f"{value:g}" if is_number else json.dumps(value).strip('"')
+
+
+def anchors(page):
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_has_a_row_in_the_index(method):
+    assert method in INDEX
+
+
+def test_every_page_is_linked_in_the_index():
+    linked = re.findall(r"\]\((\w+\.md)\)", (FOLDER / "README.md").read_text())
+    assert {page.name for page in PAGES} - {"README.md"} == set(linked)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_links_of_a_page_lead_somewhere(page):
+    for link in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text()):
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve()
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", FIRST, ids=[page.stem for page in FIRST])
+def test_first_command_of_a_page_composes_and_has_its_options_and_defaults(page):
+    config = composed(FIRST[page])
+    for option, default, _ in table(page, "option", "default"):
+        assert shown(OmegaConf.select(config, option.strip("`"))) == default, option
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", OTHER, ids=[" ".join(command) for command in OTHER])
+def test_other_commands_of_the_pages_compose(command):
+    composed(command)

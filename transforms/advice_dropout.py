@@ -1,0 +1,58 @@
+"""Dropout of advice: whole episodes without it, so that the policy also learns to act alone."""
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Composite
+
+from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
+
+
+class AdviceDropout(GuideTransform):
+    """Advice that is missing in some episodes of the training: zeros, and `advice_given` [*batch, 1] is false.
+
+    One run then gives a policy with its guide and one without: see `in_evaluation`.
+
+    Args:
+        probability: of an episode without advice, in training.
+        in_evaluation: whether there is advice in evaluation.
+        seed: of the draws.
+        options: `action_key` and `advice_key`, as for `GuideTransform`.
+
+    Raises:
+        ValueError: for a probability that is not from 0 to 1.
+    """
+
+    written = ("advice_given",)
+
+    def __init__(self, probability: float = 0.5, in_evaluation: bool = True, seed: int = 0, **options: Any) -> None:
+        super().__init__(**options)
+        if not 0 <= probability <= 1:
+            raise ValueError(f"probability={probability} must be at least 0 and at most 1")
+        self.probability, self.in_evaluation = probability, in_evaluation
+        self.rng = SeededGenerator(seed)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        shape = (*self.parent.batch_size, 1)
+        # A number for every row, so that later draws do not depend on which rows are reset.
+        given = torch.rand(shape, generator=self.rng.generator) >= self.probability
+        if not self.learns:
+            given = torch.full(shape, self.in_evaluation)
+        return self._write(tensordict_reset, given.to(self.parent.device))
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._write(next_tensordict, tensordict["advice_given"])
+
+    def _write(self, tensordict: TensorDictBase, given: Tensor) -> TensorDictBase:
+        advice = tensordict[self.advice_key]
+        advice = advice * given.reshape(*tensordict.batch_size, *[1] * (advice.ndim - tensordict.ndim)).to(advice.dtype)
+        return tensordict.set(self.advice_key, advice).set("advice_given", given)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add `advice_given`."""
+        observation_spec = super().transform_observation_spec(observation_spec)
+        shape, device = (*self.parent.batch_size, 1), self.parent.device
+        observation_spec["advice_given"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
+        return observation_spec
