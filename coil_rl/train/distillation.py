@@ -55,15 +55,20 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
     """Copy proxies into the folder of the run that uses them, all at once.
 
-    `runs` are their run folders by the name of the guide.
+    `runs` are their run folders by the name of the guide. A file in their place is a `UserError`.
     """
-    unfinished = temporary(folder / load.PROXIES)
-    unfinished.mkdir()
-    for name, run in runs.items():
-        for file in FILES:
-            with whole_file(unfinished / name / file) as copy:
-                shutil.copyfile(run / file, copy)
-    unfinished.rename(folder / load.PROXIES)
+    proxies = folder / load.PROXIES
+    if proxies.is_file():
+        raise UserError(f"{proxies} is a file, but a folder is to be made there; remove it")
+    unfinished = temporary(proxies)
+    try:
+        for name, run in runs.items():
+            for file in FILES:
+                with whole_file(unfinished / name / file) as copy:
+                    shutil.copyfile(run / file, copy)
+        unfinished.rename(proxies)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
 
 
 def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictModuleBase]:

@@ -78,3 +78,16 @@ def test_degraded_advice_is_refused_for_guides_that_learn():
     config = composed("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
     with pytest.raises(UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"):
         check(config)
+
+
+def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
+    run, folder = tmp_path / "run", tmp_path / "folder"
+    for made in (run, folder):
+        made.mkdir()
+    (folder / load.PROXIES).write_text("a file in their place")
+    with pytest.raises(UserError, match="proxies is a file, but a folder is to be made there; remove it"):
+        distillation.copy_proxies({"guide": run}, folder)
+    (folder / load.PROXIES).unlink()
+    with pytest.raises(FileNotFoundError):
+        distillation.copy_proxies({"guide": run}, folder)
+    assert not list(folder.iterdir())
