@@ -91,7 +91,8 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
     import stable_baselines3
     from stable_baselines3.common.env_util import make_vec_env
 
-    envs = make_vec_env(env_id, values["envs"], seed=seed)
+    # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no picture removes them.
+    envs = make_vec_env(env_id, values["envs"], seed=seed, env_kwargs={"render_mode": None})
     common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")}
     common |= {"batch_size": values["minibatch"], "seed": seed, "device": "cpu"}
     if algorithm == "ppo":
