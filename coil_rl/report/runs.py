@@ -1,7 +1,7 @@
 """Configuration, evaluation and learning curve of finished runs, read from their folders."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -91,7 +91,7 @@ def _read_run(folder: Path) -> Run:
     if not path.exists():
         return run
     with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
-        evaluation = _read_evaluation(path)
+        evaluation = _read_evaluation(path, [name for name, measure in measures.items() if measure.title])
     remedy = "restore the file, or remove the run from the folder"
     with file_of_a_run(path := folder / "metrics.csv", remedy):
         curve = read_curve(path) if path.exists() else []
@@ -105,8 +105,10 @@ def _read_run(folder: Path) -> Run:
     )
 
 
-def _read_evaluation(path: Path) -> pd.DataFrame:
+def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:
     frame = _read_csv(path)
+    if missing := [name for name in shown if name not in frame and set(DRIVER) <= set(frame)]:
+        raise ValueError(f"no column {missing[0]}")
     numbers = ["reward", *(column for column in frame if column not in (*DRIVER, "reward"))]
     frame = frame[[*DRIVER, *numbers]].astype(dict.fromkeys(numbers, float))
     frame = frame[frame["case"] != "mean"]

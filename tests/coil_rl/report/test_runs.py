@@ -57,6 +57,7 @@ ROW = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,c
         ("evaluation.csv", "", r"is damaged \(No columns.*\); remove the file and write it again by coil-train"),
         ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"\['advice', .*not in index"),
+        ("evaluation.csv", ROW.replace("lap_time,", "") + "1,1,1,1,1\n", r"is damaged \(no column lap_time\)"),
         ("evaluation.csv", ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
         ("evaluation.csv", ROW + "1,1,1,1,1,1,1", "more values than columns"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
