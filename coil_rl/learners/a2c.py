@@ -11,7 +11,7 @@ from typing import Any
 
 from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase
-from torchrl.objectives import A2CLoss
+from torchrl.objectives import A2CLoss, LossModule
 
 from coil_rl.learners.ppo import PPO, standardise
 from coil_rl.schedules import Linear, Schedule
@@ -35,10 +35,13 @@ class A2C(PPO):
         standardise: bool = True,
         **options: Any,
     ) -> None:
-        # The clipped loss is replaced: naming its options here rejects them in `options`.
-        super().__init__(env, in_keys, learning_rate=learning_rate, epochs=1, clip=1.0, compile=False, **options)
+        # Naming the options of the clipped loss here rejects them in `options`.
+        super().__init__(env, in_keys, learning_rate=learning_rate, epochs=1, clip=1.0, **options)
         self.standardise = standardise
-        self.loss = A2CLoss(
+
+    def build_loss(self, clip: float) -> LossModule:
+        """Return TorchRL's loss of policy and critic."""
+        return A2CLoss(
             self.head,
             self.critic,
             entropy_bonus=self.entropy(0) > 0,

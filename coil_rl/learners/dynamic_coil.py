@@ -164,7 +164,7 @@ class DynamicCoil(PPO):
     """
 
     kind = "guides"
-    with_memory = False
+    with_memory = compilable = False  # some networks are frozen in each phase
 
     def __init__(
         self,

@@ -49,6 +49,8 @@ class IBRL(SAC):
         KeyError: if the env writes no advice.
     """
 
+    reported = (*SAC.reported, "guide_share")
+
     def __init__(
         self, env: EnvBase, in_keys: Sequence[NestedKey] = ("observation",), *,
         sharpness: float | None = None, edit: float = 0.0, guide: int = 0, **options: Any,
@@ -72,9 +74,9 @@ class IBRL(SAC):
             editor = self.build_actor(env, [*in_keys, ADVICE], network)
         return ProposalLoss(partial(self.choice, space=space, editor=editor), **arguments)
 
-    def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return the share of the guide in the choices of the last target, 0 before learning starts."""
-        return {"guide_share": 0.0 if minibatch is None else float(self.loss.guide_share)}
+    def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch [N] and other values, with the share of the guide in the target."""
+        return super().losses(minibatch).set("guide_share", self.loss.guide_share)
 
 
 class Proposals(Critics):

@@ -1,6 +1,6 @@
 """Off-policy learning with a replay buffer, the base class of `DQN` and `SAC`."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
@@ -45,11 +46,12 @@ class OffPolicy:
         starts: number of stored steps before learning starts.
         prior: share of each minibatch that is sampled from the steps of guides, which are then stored apart: the
             symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all steps are sampled alike.
+        compile: whether to compile the update, see `GradientStep`.
         anchor: makes the policy start as its guide.
         seed: of the samples.
 
     Attributes:
-        kind: as for `PPO`.
+        kind, compilable: as for `PPO`.
         keys: entries that a batch must have.
 
     Raises:
@@ -57,6 +59,7 @@ class OffPolicy:
     """
 
     kind: ClassVar[str] = "agent"
+    compilable: ClassVar[bool] = True
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
 
@@ -75,10 +78,11 @@ class OffPolicy:
         batch_size: int = 256,
         starts: int = 5_000,
         prior: float = 0.0,
+        compile: bool | Literal["auto"] = "auto",
         anchor: Anchor | None = None,
         seed: int = 0,
     ) -> None:
-        self.anchor = anchor
+        self.anchor, self.compile = anchor, compile
         self.learning_rate = schedule(learning_rate)
         check_range(0, 1, gamma=gamma, tau=tau, prior=prior)
         check_range(0, learning_rate=self.learning_rate(0), starts=starts)
@@ -134,8 +138,17 @@ class OffPolicy:
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.gamma)
         self.target = SoftUpdate(self.loss, tau=self.tau)
-        self.parameters = list(self.loss.parameters())
-        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), fused=True)
+        self.gradient = GradientStep(
+            self.losses,
+            [list(self.loss.parameters())],
+            [self.loss],
+            rate=self.learning_rate(0),
+            eps=1e-8,
+            max_grad_norm=self.max_grad_norm,
+            after=self.target.step,
+            compile=self.compile,
+            compilable=self.compilable,
+        )
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.
@@ -148,20 +161,18 @@ class OffPolicy:
             Means over the minibatches of the `reported` values, 0 before learning starts; the number of `minibatches`;
             the number of stored steps (`kept`); the learning rate; and the values of `describe`.
         """
-        for group in self.optimiser.param_groups:
+        for group in self.gradient.optimiser.param_groups:
             group["lr"] = self.learning_rate(progress)
-        self.progress = progress
         self.store(batch)
-        reports, minibatch = [], None
+        self.gradient.decide(progress)
+        weights, reports, minibatch = self.loss_weights(progress), [], None
         for minibatch in self.samples():
-            reports.append(self.step(minibatch))
-        means = {
-            name: float(torch.stack([report[name] for report in reports]).mean()) if reports else 0.0
-            for name in self.reported
-        }
-        return means | {
+            reports.append(self.gradient(minibatch, weights))
+        means = self.gradient.means(reports) if reports else {}
+        return {name: means.get(name, 0.0) for name in self.reported} | {
             **self.describe(minibatch),
             "minibatches": float(len(reports)),
+            "compiled": float(self.gradient.compile is True),
             "kept": float(self.kept),
             "learning_rate": self.learning_rate(progress),
             **(self.anchor.set_noise(progress) if self.anchor else {}),
@@ -193,35 +204,31 @@ class OffPolicy:
                 buffer.extend(new[-self.capacity :])
                 self.pending_updates += len(new) * self.ratio / self.batch_size
 
-    def samples(self) -> Iterator[TensorDictBase]:
-        """Yield as many minibatches [N] as are due for the steps stored so far, with replacement."""
-        while self.pending_updates >= 1 and self.kept >= self.starts:
-            self.pending_updates -= 1
-            prior = self.prior if len(self.buffer) else self.batch_size
-            prior = prior if len(self.guide_buffer) else 0
-            sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
-            minibatch: TensorDictBase = torch.cat([buffer.sample(size) for buffer, size in sizes.items() if size])
-            if self.normaliser is not None:
-                minibatch["next"] = self.normaliser(minibatch["next"])
-                minibatch = self.normaliser(minibatch)
-            yield minibatch
-
-    def step(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Take one step of the optimiser; returns the values of `losses`."""
-        losses = self.losses(minibatch)
-        for parameter in self.parameters:  # as `zero_grad`, in less time
-            parameter.grad = None
-        sum(losses[name] for name in self.minimised).backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        self.optimiser.step()
-        self.target.step()
-        detached: TensorDictBase = losses.detach()
-        return detached
+    def samples(self) -> Sequence[TensorDictBase]:
+        """Return as many minibatches [N] as are due for the steps stored so far, with replacement."""
+        due = int(self.pending_updates) if self.kept >= self.starts else 0
+        if not due:
+            return []
+        self.pending_updates -= due
+        prior = self.prior if len(self.buffer) else self.batch_size
+        prior = prior if len(self.guide_buffer) else 0
+        sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
+        # All at once: a call of the buffer takes as long as a step.
+        parts = [buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size]
+        minibatches: TensorDictBase = torch.cat(parts, 1)
+        if self.normaliser is not None:
+            minibatches["next"] = self.normaliser(minibatches["next"])
+            minibatches = self.normaliser(minibatches)
+        return minibatches.unbind(0)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and other values, scalars."""
         losses: TensorDictBase = self.loss(minibatch)
         return losses
+
+    def loss_weights(self, progress: float) -> dict[str, float]:
+        """Return the weights of the losses in the sum that an update minimises."""
+        return dict.fromkeys(self.minimised, 1.0)
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return further metrics of the last minibatch of an update, which is None before learning starts."""
@@ -231,7 +238,7 @@ class OffPolicy:
         """Return everything the next update depends on besides its batch."""
         return {
             "loss": self.loss.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+            "gradient": self.gradient.state_dict(),
             "buffers": [
                 {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
                 for buffer in (self.buffer, self.guide_buffer)
@@ -245,7 +252,7 @@ class OffPolicy:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
         self.loss.load_state_dict(state["loss"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.gradient.load_state_dict(state["gradient"])
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if stored["steps"]:

@@ -6,8 +6,8 @@ passes over the batch in minibatches. Clipping the probability ratio keeps it ne
     loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -25,6 +25,7 @@ from coil_rl.errors import UserError
 from coil_rl.learners import networks
 from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp, without_memory
+from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.normaliser import normaliser
@@ -36,7 +37,7 @@ class PPO:
     """The PPO learner, and the base class of the other on-policy learners.
 
     COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps (`agent_acts` is false),
-    the policy learns from the agent's steps only, and the critic from all. Subclasses override `loss`, `losses`,
+    the policy learns from the agent's steps only, and the critic from all. Subclasses override `build_loss`, `losses`,
     `build_networks`, `parameter_groups` and `set_learning_rates`.
 
     A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
@@ -60,7 +61,7 @@ class PPO:
         entropy: coefficient of the entropy bonus, a number or a schedule.
         critic: coefficient of the critic's loss.
         max_grad_norm: gradients are scaled down to this norm.
-        compile: whether to use `torch.compile` for the loss, which changes the last digits of the numbers.
+        compile: whether to compile the update, see `GradientStep`.
         noise: schedule of the standard deviation of the policy.
         anchor: makes the policy start as its guide.
         auxiliary: additional losses of the policy.
@@ -70,6 +71,7 @@ class PPO:
         kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions)
             or "guides" (guides besides an agent).
         with_memory: whether the learner can train a network with a memory.
+        compilable: whether the update can be compiled.
         policy: writes `action` and `action_log_prob`.
         head: the part of the policy after its memory; all of it without one.
         critic: writes `state_value`.
@@ -89,6 +91,7 @@ class PPO:
 
     kind: ClassVar[str] = "agent"
     with_memory: ClassVar[bool] = True
+    compilable: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -110,7 +113,7 @@ class PPO:
         entropy: float | Schedule = 0.0,
         critic: float = 0.5,
         max_grad_norm: float = 0.5,
-        compile: bool = False,
+        compile: bool | Literal["auto"] = "auto",
         noise: NoiseDecay | None = None,
         anchor: Anchor | None = None,
         auxiliary: Sequence[KickstartLoss] = (),
@@ -124,7 +127,7 @@ class PPO:
         check_range(0, LARGEST_SEED, seed=seed)
         if noise and anchor:
             raise ValueError("an anchor has its own schedule of the noise; leave out noise, or the anchor")
-        self.epochs, self.minibatches, self.max_grad_norm = epochs, minibatches, max_grad_norm
+        self.epochs, self.minibatches = epochs, minibatches
         self.critic_coefficient, self.auxiliary, self.noise, self.anchor = critic, list(auxiliary), noise, anchor
         in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
@@ -138,24 +141,20 @@ class PPO:
         if noise:
             noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss: LossModule = ClippedLoss(
-            self.head,
-            self.critic,
-            clip_epsilon=clip,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=critic,
-            loss_critic_type="l2",
-            normalize_advantage=True,
-            functional=False,
-        )
-        self.compiled: Callable[..., TensorDictBase] | None = torch.compile(self.loss.__call__) if compile else None
-        groups = self.parameter_groups()
-        self.parameters = [parameter for group in groups for parameter in group]
-        rate = self.learning_rate(0)
-        self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=1e-5, fused=True)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.loss = self.build_loss(clip)
         self.guide_may_act = "agent_acts" in env.observation_spec
+        self.gradient = GradientStep(
+            self.all_losses,
+            self.parameter_groups(),
+            [self.policy, self.critic, self.loss],
+            rate=self.learning_rate(0),
+            eps=1e-5,
+            max_grad_norm=max_grad_norm,
+            compile=compile,
+            compilable=self.compilable and self.memory is None and not self.guide_may_act,
+        )
+        self.optimiser = self.gradient.optimiser
+        self.generator = torch.Generator().manual_seed(seed)
         self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
         self.reward_key = unravel_key(("next", env.reward_key))
         read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), self.sample_key, "action_log_prob"]
@@ -173,6 +172,20 @@ class PPO:
         """Return policy and critic; `options` are those of `networks.actor`."""
         policy = networks.actor(env, in_keys, network, normaliser=self.normaliser, **options)
         return policy, networks.critic(env, in_keys, network, self.normaliser)
+
+    def build_loss(self, clip: float) -> LossModule:
+        """Return TorchRL's loss of policy and critic."""
+        return ClippedLoss(
+            self.head,
+            self.critic,
+            clip_epsilon=clip,
+            entropy_bonus=self.entropy(0) > 0,
+            entropy_coeff=self.entropy(0),
+            critic_coeff=self.critic_coefficient,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+            functional=False,
+        )
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
@@ -194,28 +207,26 @@ class PPO:
             Means over the minibatches of the losses and of the other values that TorchRL's loss reports, and the
             learning rate.
         """
-        rows = self.prepare(batch, progress)
-        reports = []
-        for minibatch in self.draw_minibatches(rows):
-            losses = self.masked_losses(minibatch)
-            for auxiliary in self.auxiliary:
-                losses[f"loss_{auxiliary.name}"] = auxiliary(self.head, minibatch)
-            self.step(self.total_loss(losses, progress))
-            reports.append(losses.detach())
-        names = list(reports[0].keys())
-        means = {name: float(torch.stack([report[name] for report in reports]).mean()) for name in names}
-        return means | {"learning_rate": self.learning_rate(progress)} | self.finish(batch, progress)
+        rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
+        self.gradient.decide(progress)
+        reports = [self.gradient(minibatch, weights) for minibatch in self.draw_minibatches(rows)]
+        known = {"learning_rate": self.learning_rate(progress), "compiled": float(self.gradient.compile is True)}
+        return self.gradient.means(reports) | known | self.finish(batch, progress)
 
-    def total_loss(self, losses: TensorDictBase, progress: float) -> Tensor:
-        """Return the sum of losses by name that an update minimises."""
-        if self.policy_waits(progress):
-            return losses["loss_critic"] + 0 * losses["loss_objective"]
-        total = losses["loss_objective"] + losses["loss_critic"]
-        if "loss_entropy" in losses:
-            total = total + losses["loss_entropy"]
+    def all_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return all losses of a minibatch by name, and the other values that TorchRL's loss reports."""
+        losses = self.masked_losses(minibatch)
         for auxiliary in self.auxiliary:
-            total = total + auxiliary.coefficient(progress) * losses[f"loss_{auxiliary.name}"]
-        return total
+            losses[f"loss_{auxiliary.name}"] = auxiliary(self.head, minibatch)
+        return losses
+
+    def loss_weights(self, progress: float) -> dict[str, float]:
+        """Return the weights of the losses in the sum that an update minimises."""
+        learns = float(not self.policy_waits(progress))
+        weights = {"loss_objective": learns, "loss_critic": 1.0}
+        if getattr(self.loss, "entropy_bonus", False):
+            weights["loss_entropy"] = learns
+        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
 
     def policy_waits(self, progress: float) -> bool:
         """Return whether only the critic learns."""
@@ -273,14 +284,7 @@ class PPO:
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
-        try:
-            losses: TensorDictBase = (self.compiled or self.loss)(minibatch)
-        except RuntimeError as error:
-            if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-                raise UserError(
-                    "learner.compile=true: the loss cannot be compiled; install a C++ compiler, or leave it out"
-                ) from error
-            raise
+        losses: TensorDictBase = self.loss(minibatch)
         return losses
 
     def masked_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
@@ -297,20 +301,12 @@ class PPO:
         losses["loss_critic"] = self.loss.loss_critic(minibatch)[0].mean()
         return losses
 
-    def step(self, loss: Tensor) -> None:
-        """Take one step of the optimiser."""
-        for parameter in self.parameters:  # as `zero_grad`, which takes as long as the step
-            parameter.grad = None
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        self.optimiser.step()
-
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""
         return {
             "policy": self.policy.state_dict(),
             "critic": self.critic.state_dict(),
-            "optimiser": self.optimiser.state_dict(),
+            "gradient": self.gradient.state_dict(),
             "generator": self.generator.get_state(),
             "noise": self.noise.state_dict() if self.noise else {},
             "anchor": self.anchor.state_dict() if self.anchor else {},
@@ -320,7 +316,7 @@ class PPO:
         """Restore a state from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
         self.critic.load_state_dict(state["critic"])
-        self.optimiser.load_state_dict(state["optimiser"])
+        self.gradient.load_state_dict(state["gradient"])
         self.generator.set_state(state["generator"])
         if self.noise:
             self.noise.load_state_dict(state["noise"])

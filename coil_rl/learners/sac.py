@@ -146,11 +146,13 @@ class SAC(OffPolicy):
         losses = super().losses(minibatch)
         for each in self.auxiliary:
             losses[f"loss_{each.name}"] = each(self.actor, minibatch)
-            weighted = each.coefficient(self.progress) * losses[f"loss_{each.name}"]
-            losses["loss_actor"] = losses["loss_actor"] + weighted
-        if self.anchor is not None and self.anchor.waits(self.progress):
-            losses["loss_actor"] = 0 * losses["loss_actor"]
         return losses
+
+    def loss_weights(self, progress: float) -> dict[str, float]:
+        """Return the weights of the losses in the sum that an update minimises."""
+        learns = float(self.anchor is None or not self.anchor.waits(progress))
+        weights = super().loss_weights(progress) | {"loss_actor": learns}
+        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:

@@ -74,7 +74,7 @@ class TRPO(PPO):
         for minibatch in self.draw_minibatches(rows):
             value = self.critic(minibatch.select(*self.critic.in_keys))["state_value"]
             error = F.mse_loss(value, minibatch["value_target"])
-            self.step(error)
+            self.gradient.minimise(error)
             errors.append(error.detach())
         means = {"loss_critic": float(torch.stack(errors).mean()), "learning_rate": self.learning_rate(progress)}
         return {name: float(value) for name, value in report.items()} | means | self.finish(batch, progress)

@@ -68,7 +68,7 @@ def test_imitator_learns_from_the_guide_alone_and_tells_what_it_can_predict():
     data["guide_action"][:, 0, 0] = torch.where(known, 0.5, coin)
     before = copy.deepcopy(advisor.critic.state_dict())
     for _ in range(150):
-        advisor.step(advisor.losses(data.clone())["loss_imitation"])
+        advisor.gradient.minimise(advisor.losses(data.clone())["loss_imitation"])
     close = distance(advisor, data, categorical=False)
     assert close[known].mean() < 0.2 < 0.5 < close[~known].mean()
     assert all(torch.equal(value, before[key]) for key, value in advisor.critic.state_dict().items())

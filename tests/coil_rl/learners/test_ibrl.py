@@ -103,7 +103,7 @@ def test_edited_action_stays_near_the_guide_and_learns_to_have_a_larger_value():
         ibrl.loss.actor_loss(batch.copy())[0].backward()
         optimiser.step()
     assert gain() > first + 0.01
-    assert any(parameter in set(ibrl.parameters) for parameter in proposals.editor.parameters())
+    assert any(parameter in set(ibrl.gradient.parameters) for parameter in proposals.editor.parameters())
     assert not all(map(torch.equal, before, proposals.editor.parameters()))
 
 

@@ -145,7 +145,7 @@ def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
         ppo.optimiser.zero_grad()
         losses = loss(rows)
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        found.append((losses.detach(), [parameter.grad.clone() for parameter in ppo.parameters]))
+        found.append((losses.detach(), [parameter.grad.clone() for parameter in ppo.gradient.parameters]))
     (losses, gradients), (our_losses, our_gradients) = found
     assert losses["clip_fraction"] > 0
     assert list(our_losses.keys()) == list(losses.keys())  # the columns of the log

@@ -1,0 +1,136 @@
+"""Machine code for functions of tensors, compiled once and kept on disk.
+
+With small networks and few cars the calls of single operations take longer than their arithmetic. Here a function is
+recorded as one graph of operations, which TorchInductor compiles ahead of time to a library. The library is kept under
+a name made from the graph, so that later processes load it within milliseconds and need no compiler.
+"""
+
+import hashlib
+import os
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.fx import GraphModule
+
+from coil_rl.errors import UserError
+from coil_rl.files import whole_file
+
+# Random numbers come from PyTorch's generators, as without compilation; tanh from exp, which is twice as fast.
+OPTIONS = {"fallback_random": True, "cpp.use_decompose_tanh": True}
+# Operations whose result has a shape that depends on values.
+DYNAMIC = torch.Tag.dynamic_output_shape
+
+
+class Compiled:
+    """A function of tensors that is compiled at its first call, and again for other shapes.
+
+    The results differ from those of the function in the last digits.
+
+    Args:
+        function: takes tensors and returns tensors. It may change its arguments in place. Every tensor that it reads
+            and that changes between calls must be among the arguments. It is run once for each set of shapes; after
+            that only its operations on tensors are repeated, so Python's decisions are those of that run.
+
+    Raises:
+        UserError: at a call, if there is no C++ compiler, or if the shape of a tensor depends on values.
+    """
+
+    def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
+        self.function = function
+        self.libraries: dict[tuple[Any, ...], Any] = {}
+
+    def __call__(self, *arguments: Tensor) -> list[Tensor]:
+        """Return the results of the function."""
+        shapes = tuple((argument.shape, argument.dtype) for argument in arguments)
+        if shapes not in self.libraries:
+            self.libraries[shapes] = library(self.function, arguments)
+        results: list[Tensor] = self.libraries[shapes].run(list(arguments))
+        return results
+
+
+def library(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor]) -> Any:
+    """Return the loaded library of a function for arguments of these shapes; compiles it unless it is on disk."""
+    graph = record(function, arguments)
+    device = arguments[0].device
+    path = folder() / f"{fingerprint(graph, arguments)}.so"
+    if not path.is_file():
+        compile_graph(graph, arguments, path)
+    runners = torch._C._aoti
+    if device.type == "cpu":
+        return runners.AOTIModelContainerRunnerCpu(str(path), 1)
+    return runners.AOTIModelContainerRunnerCuda(str(path), 1, str(device))
+
+
+def folder() -> Path:
+    """Return the folder of the compiled libraries, `coil-rl` in the user's cache folder."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coil-rl"
+
+
+def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor]) -> GraphModule:
+    """Run a function and return the graph of its operations; the arguments keep their values.
+
+    Raises:
+        UserError: if the shape of a tensor depends on values.
+    """
+    from torch.fx.experimental.proxy_tensor import make_fx  # takes half a second to import
+
+    before = [argument.detach().clone() for argument in arguments]
+    with compiling(), torch.random.fork_rng():
+        # Checks of values, as in TorchRL's distributions, are Python's decisions.
+        graph = make_fx(function, _error_on_data_dependent_ops=False)(*arguments)
+    with torch.no_grad():
+        for argument, value in zip(arguments, before, strict=True):
+            argument.copy_(value)
+    for node in graph.graph.nodes:
+        node.meta.clear()
+    graph.graph.eliminate_dead_code()
+    graph.recompile()
+    for node in graph.graph.nodes:
+        if DYNAMIC in getattr(node.target, "tags", ()):
+            raise UserError(f"this cannot be compiled, because {node.target} gives shapes that depend on values")
+    return graph
+
+
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Let `torch.compiler.is_compiling()` be true."""
+    torch.compiler._is_compiling_flag = True
+    try:
+        yield
+    finally:
+        torch.compiler._is_compiling_flag = False
+
+
+def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
+    """Return a name for the compiled code of a graph on this machine."""
+    parts = [graph.code, torch.__version__, OPTIONS, platform.node(), torch.backends.cpu.get_cpu_capability()]
+    parts += [(argument.shape, argument.stride(), argument.dtype, argument.device) for argument in arguments]
+    digest = hashlib.sha256(repr(parts).encode())
+    for name, constant in sorted(graph.named_buffers()):
+        digest.update(f"{name} {constant.dtype} {constant.shape}".encode())
+        digest.update(constant.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()[:32]
+
+
+def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -> None:
+    """Compile a graph to a library at `path`."""
+    import torch._inductor  # takes two seconds to import
+
+    print("compiling (once for this configuration and machine) ...", end=" ", flush=True)
+    start = time.perf_counter()
+    try:
+        made = torch._inductor.aot_compile(graph, tuple(argument.detach() for argument in arguments), options=OPTIONS)
+    except RuntimeError as error:
+        if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
+            raise UserError("compile=true needs a C++ compiler; install one, or take compile=false") from error
+        raise
+    with whole_file(path) as unfinished:
+        shutil.copyfile(str(made), unfinished)
+    print(f"{time.perf_counter() - start:.0f} s")

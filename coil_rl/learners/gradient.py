@@ -1,0 +1,151 @@
+"""Steps of an optimiser on the losses of minibatches, one operation after another or as machine code."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+
+from coil_rl.compiled import Compiled
+from coil_rl.envs.limits import check_choice
+
+ENOUGH = 2_000  # steps of a run, for which compilation pays in the second run of the same sizes
+
+
+class GradientStep:
+    """One step of Adam on the weighted losses of a minibatch.
+
+    Args:
+        losses: returns scalars by name for a minibatch.
+        groups: parameters, grouped by learning rate.
+        modules: hold the tensors that the losses read, besides the parameters.
+        rate: initial learning rate.
+        eps: of Adam.
+        max_grad_norm: gradients are scaled down to this norm, over all parameters together.
+        after: what follows each step.
+        compile: whether to compile the step, which changes the last digits; "auto": after the first update with any, if
+            the run will have 2,000 steps or more.
+        compilable: whether it can be compiled.
+
+    Raises:
+        ValueError: for another value of `compile`, or true if it cannot be compiled.
+    """
+
+    def __init__(
+        self,
+        losses: Callable[[TensorDictBase], TensorDictBase],
+        groups: Sequence[Sequence[nn.Parameter]],
+        modules: Sequence[nn.Module],
+        *,
+        rate: float,
+        eps: float,
+        max_grad_norm: float,
+        after: Callable[[], Any] | None = None,
+        compile: bool | Literal["auto"] = "auto",
+        compilable: bool = True,
+    ) -> None:
+        check_choice((True, False, "auto"), compile=compile)
+        if compile is True and not compilable:
+            raise ValueError("compile=true: this learner's update depends on data in its shapes; take compile=auto")
+        self.losses, self.modules, self.max_grad_norm, self.after = losses, modules, max_grad_norm, after
+        self.parameters = [parameter for group in groups for parameter in group]
+        self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=eps, fused=True)
+        self.compile = compile if compilable else False
+        self.compiled = Compiled(self._on_tensors)
+        self.steps = 0
+        self.names: list[str] = []  # of the losses
+        self.keys: list[Any] = []
+        self.weighted: list[str] = []
+
+    def decide(self, progress: float) -> None:
+        """Decide for "auto", when a share of the run is over."""
+        if self.compile == "auto" and self.steps and progress > 0:
+            self.compile = self.steps / progress >= ENOUGH
+
+    def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
+        """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`."""
+        self.steps += 1
+        if self.compile is not True:
+            losses = self.losses(minibatch)
+            self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
+            self.names = list(losses.keys())
+            return _vector(losses)
+        self.keys, self.weighted = list(minibatch.keys(True, True)), list(weights)
+        rates = [group["lr"] for group in self.optimiser.param_groups]
+        numbers = torch.tensor([*weights.values(), *rates], device=minibatch.device)
+        (values,) = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self._state())
+        return values
+
+    def minimise(self, loss: Any) -> None:
+        """Take a step on a loss."""
+        for parameter in self.parameters:  # as `zero_grad`, which takes as long as the step
+            parameter.grad = None
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
+        self.optimiser.step()
+        if self.after is not None:
+            self.after()
+
+    def means(self, reports: Sequence[Tensor]) -> dict[str, float]:
+        """Return the means of what the calls returned, by name."""
+        columns = torch.stack(list(reports), -1).unbind(0)
+        return {name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)}
+
+    def _state(self) -> list[Tensor]:
+        """Return all tensors that a step reads, besides its minibatch."""
+        state = self.optimiser.state
+        for parameter in self.parameters:
+            if parameter not in state:  # as Adam does at the first step
+                moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
+                state[parameter] = {"step": torch.zeros((), device=parameter.device), **moments}
+        tensors = [*self.parameters, *(value for parameter in self.parameters for value in state[parameter].values())]
+        tensors += [tensor for module in self.modules for tensor in (*module.parameters(), *module.buffers())]
+        return list({id(tensor): tensor for tensor in tensors}.values())
+
+    def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
+        """Take a step on the entries of a minibatch, for compilation; `tensors` end with those of `_state`."""
+        minibatch = TensorDict(dict(zip(self.keys, tensors, strict=False)), len(tensors[0]))
+        weights, rates = numbers[: len(self.weighted)].unbind(0), numbers[len(self.weighted) :].unbind(0)
+        losses = self.losses(minibatch)
+        self.names = list(losses.keys())
+        total = sum(weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True))
+        with self._traceable(rates):
+            gradients = torch.autograd.grad(total, self.parameters, allow_unused=True)  # type: ignore[arg-type]
+            for parameter, gradient in zip(self.parameters, gradients, strict=True):
+                parameter.grad = gradient
+            torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)
+            self.optimiser.step()
+            if self.after is not None:
+                self.after()
+        return [_vector(losses)]
+
+    @contextmanager
+    def _traceable(self, rates: Sequence[Tensor]) -> Iterator[None]:
+        """Let the optimiser use learning rates that are tensors, and single operations."""
+        groups = self.optimiser.param_groups
+        before = [dict(group) for group in groups]
+        for group, rate in zip(groups, rates, strict=True):
+            group.update(lr=rate, fused=False, foreach=False, capturable=True)
+        try:
+            yield
+        finally:
+            for group, values in zip(groups, before, strict=True):
+                group.update(values)
+            for parameter in self.parameters:
+                parameter.grad = None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the state of the optimiser, the number of steps, and whether they are compiled."""
+        return {"adam": self.optimiser.state_dict(), "steps": self.steps, "compile": self.compile}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        self.optimiser.load_state_dict(state["adam"])
+        self.steps, self.compile = state["steps"], state["compile"]
+
+
+def _vector(losses: TensorDictBase) -> Tensor:
+    """Return the means of values as a vector."""
+    return torch.stack([value.mean() for value in losses.detach().values()])
