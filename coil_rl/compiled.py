@@ -9,7 +9,8 @@ import hashlib
 import os
 import platform
 import shutil
-import time
+import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.fx import GraphModule
+from tqdm import tqdm
 
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
@@ -82,9 +84,10 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     from torch.fx.experimental.proxy_tensor import make_fx  # takes half a second to import
 
     before = [argument.detach().clone() for argument in arguments]
-    with compiling(), torch.random.fork_rng():
+    with compiling(), torch.random.fork_rng(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         # Checks of values, as in TorchRL's distributions, are Python's decisions.
-        graph = make_fx(function, _error_on_data_dependent_ops=False)(*arguments)
+        graph = make_fx(lambda *tensors: function(*tensors), _error_on_data_dependent_ops=False)(*arguments)
     with torch.no_grad():
         for argument, value in zip(arguments, before, strict=True):
             argument.copy_(value)
@@ -123,14 +126,17 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
     """Compile a graph to a library at `path`."""
     import torch._inductor  # takes two seconds to import
 
-    print("compiling (once for this configuration and machine) ...", end=" ", flush=True)
-    start = time.perf_counter()
+    tqdm.write("compiling, once for these sizes and this machine: about 20 s ...", file=sys.stderr)
+    examples = tuple(argument.detach() for argument in arguments)
     try:
-        made = torch._inductor.aot_compile(graph, tuple(argument.detach() for argument in arguments), options=OPTIONS)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            made = torch._inductor.aot_compile(graph, examples, options=OPTIONS)
     except RuntimeError as error:
         if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
-            raise UserError("compile=true needs a C++ compiler; install one, or take compile=false") from error
+            raise UserError(
+                "the update cannot be compiled without a C++ compiler; install one, or take compile=false"
+            ) from error
         raise
     with whole_file(path) as unfinished:
         shutil.copyfile(str(made), unfinished)
-    print(f"{time.perf_counter() - start:.0f} s")

@@ -1,5 +1,6 @@
 """Steps of an optimiser on the losses of minibatches, one operation after another or as machine code."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 
 from coil_rl.compiled import Compiled
 from coil_rl.envs.limits import check_choice
+from coil_rl.errors import UserError
 
 ENOUGH = 2_000  # steps of a run, for which compilation pays in the second run of the same sizes
 
@@ -52,12 +54,13 @@ class GradientStep:
         self.losses, self.modules, self.max_grad_norm, self.after = losses, modules, max_grad_norm, after
         self.parameters = [parameter for group in groups for parameter in group]
         self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=eps, fused=True)
-        self.compile = compile if compilable else False
+        self.compile, self.required = compile if compilable else False, compile is True
         self.compiled = Compiled(self._on_tensors)
         self.steps = 0
         self.names: list[str] = []  # of the losses
         self.keys: list[Any] = []
         self.weighted: list[str] = []
+        self.state: list[Tensor] = []  # all tensors that a step reads, besides its minibatch
 
     def decide(self, progress: float) -> None:
         """Decide for "auto", when a share of the run is over."""
@@ -65,17 +68,31 @@ class GradientStep:
             self.compile = self.steps / progress >= ENOUGH
 
     def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
-        """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`."""
+        """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`.
+
+        Raises:
+            UserError: if `compile` is true and there is no C++ compiler.
+        """
         self.steps += 1
-        if self.compile is not True:
-            losses = self.losses(minibatch)
-            self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
-            self.names = list(losses.keys())
-            return _vector(losses)
+        if self.compile is True:
+            try:
+                return self._compiled(minibatch, weights)
+            except UserError as error:
+                if self.required:
+                    raise
+                warnings.warn(f"{error}; the update goes on uncompiled", stacklevel=2)
+                self.compile = False
+        losses = self.losses(minibatch)
+        self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
+        self.names = list(losses.keys())
+        return _vector(losses)
+
+    def _compiled(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         self.keys, self.weighted = list(minibatch.keys(True, True)), list(weights)
         rates = [group["lr"] for group in self.optimiser.param_groups]
         numbers = torch.tensor([*weights.values(), *rates], device=minibatch.device)
-        (values,) = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self._state())
+        self.state = self.state or self._state()
+        (values,) = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self.state)
         return values
 
     def minimise(self, loss: Any) -> None:
@@ -94,7 +111,6 @@ class GradientStep:
         return {name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)}
 
     def _state(self) -> list[Tensor]:
-        """Return all tensors that a step reads, besides its minibatch."""
         state = self.optimiser.state
         for parameter in self.parameters:
             if parameter not in state:  # as Adam does at the first step
@@ -143,7 +159,7 @@ class GradientStep:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self.optimiser.load_state_dict(state["adam"])
-        self.steps, self.compile = state["steps"], state["compile"]
+        self.steps, self.compile, self.state = state["steps"], state["compile"], []
 
 
 def _vector(losses: TensorDictBase) -> Tensor:

@@ -1,0 +1,97 @@
+import copy
+import warnings
+from functools import partial
+
+import pytest
+import torch
+import worlds
+from tensordict.nn import TensorDictModule
+
+from coil_rl.errors import UserError
+from coil_rl.learners import A2C, DQN, PPO, SAC, DynamicCoil, gradient
+from coil_rl.train.rollout import Rollout
+from coil_rl.transforms import DiscreteActions
+
+
+def make(learner, compile, *transforms, **options):
+    torch.manual_seed(0)
+    env = worlds.cones(*(transform() for transform in transforms))
+    made = learner(env, ["observation", "guide_action"], hidden=[8], compile=compile, **options)
+    return made, Rollout(env, made.policy, 16, made.keys)
+
+
+def numbers(learner):
+    return torch.cat([parameter.detach().flatten() for parameter in learner.gradient.parameters])
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp()))  # one for all tests here
+
+
+CASES = [
+    pytest.param(PPO, (), {"minibatches": 4}, id="ppo"),
+    pytest.param(A2C, (), {"minibatches": 4}, id="a2c", marks=pytest.mark.slow),
+    pytest.param(PPO, (), {"minibatches": 4, "normalise": True, "squash": False}, id="clipped", marks=pytest.mark.slow),
+    pytest.param(SAC, (), {"starts": 64, "batch_size": 32}, id="sac", marks=pytest.mark.slow),
+    pytest.param(
+        DQN, (partial(DiscreteActions, 5),), {"starts": 64, "batch_size": 32}, id="dqn", marks=pytest.mark.slow
+    ),
+]
+
+
+@pytest.mark.parametrize(("learner", "transforms", "options"), CASES)
+def test_compiled_update_is_the_update_and_continues_to_the_bit(learner, transforms, options):
+    one, rollout = make(learner, False, *transforms, **options)
+    other, _ = make(learner, True, *transforms, **options)
+    third, _ = make(learner, True, *transforms, **options)
+    batches = [rollout.collect() for _ in range(3)]
+    for count, batch in enumerate(batches):
+        states = []
+        for each in (one, other, third):
+            torch.manual_seed(count)
+            states.append(each.update(batch.clone(), count / 3))
+        expected, found, _ = states
+        assert (found.pop("compiled"), expected.pop("compiled")) == (1.0, 0.0)
+        assert list(found) == list(expected)
+        torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-4)
+        third.load_state_dict(copy.deepcopy(third.state_dict()))
+        if count == 1:
+            fresh, _ = make(learner, True, *transforms, **options)
+            fresh.load_state_dict(copy.deepcopy(third.state_dict()))
+            third = fresh
+    torch.testing.assert_close(numbers(one), numbers(other), rtol=1e-3, atol=1e-4)
+    assert torch.equal(numbers(other), numbers(third))
+
+
+def test_auto_compiles_a_run_of_many_steps_and_remembers_it(monkeypatch):
+    monkeypatch.setattr(gradient, "ENOUGH", 100)
+    for updates, expected in ((2, False), (10, True)):  # of 20 steps each
+        ppo, rollout = make(PPO, "auto", minibatches=4)
+        ppo.update(rollout.collect(), 0.0)
+        assert ppo.gradient.compile == "auto"
+        ppo.gradient.decide(1 / updates)
+        assert ppo.gradient.compile is expected
+        assert ppo.state_dict()["gradient"]["compile"] is expected
+
+
+def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path):
+    monkeypatch.setenv("CXX", "missing")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr(gradient, "ENOUGH", 1)
+    ppo, rollout = make(PPO, "auto", minibatches=3)
+    ppo.update(rollout.collect(), 0.0)
+    with pytest.warns(UserWarning, match=r"without a C\+\+ compiler.*the update goes on uncompiled"):
+        assert ppo.update(rollout.collect(), 0.5)["compiled"] == 0.0
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ppo.update(rollout.collect(), 0.75)
+    required, _ = make(PPO, True, minibatches=3)
+    with pytest.raises(UserError, match="install one, or take compile=false"):
+        required.update(rollout.collect())
+
+
+def test_update_with_shapes_from_data_is_not_compiled():
+    driver = TensorDictModule(torch.nn.Linear(20, 1), ["observation"], ["action"])
+    with pytest.raises(ValueError, match="compile=true: this learner's update depends on data in its shapes"):
+        make(DynamicCoil, True, guides={"driver": driver})

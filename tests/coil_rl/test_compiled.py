@@ -1,0 +1,69 @@
+from functools import partial
+
+import pytest
+import torch
+
+from coil_rl import compiled
+from coil_rl.compiled import Compiled
+from coil_rl.errors import UserError
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    return tmp_path
+
+
+def walk(position, step, bias=2.0):
+    """Move by a noisy step in place; return the distance and a random number."""
+    noise = torch.randn_like(position)
+    position.add_(step.tanh() * noise + bias)
+    return position.norm(), torch.rand(3)
+
+
+def test_compiled_function_has_the_results_the_changes_and_the_random_numbers_of_the_function():
+    function = Compiled(walk)
+    found, expected = torch.ones(5), torch.ones(5)
+    for seed in range(3):
+        step = torch.linspace(-1, seed, 5)
+        torch.manual_seed(seed)
+        distance, drawn = function(found, step)
+        torch.manual_seed(seed)
+        reference = walk(expected, step)
+        torch.testing.assert_close([distance, drawn, found], [*reference, expected])
+
+
+def test_code_is_found_by_the_operations_and_the_shapes_and_constants(cache, monkeypatch):
+    sizes = (torch.ones(4), torch.ones(4))
+    Compiled(walk)(*sizes)
+    made = []
+    monkeypatch.setattr(compiled, "compile_graph", lambda graph, arguments, path: made.append(path))
+    before, *_ = sizes = (torch.zeros(4), torch.ones(4))
+    Compiled(walk)(*sizes)
+    assert not made  # from the disk
+    assert before.abs().min() > 0
+    for function, arguments in (
+        (walk, (torch.ones(6), torch.ones(6))),
+        (partial(walk, bias=3.0), sizes),
+        (partial(walk, bias=torch.arange(4.0)), sizes),
+        (partial(walk, bias=torch.arange(4.0) + 1), sizes),
+    ):
+        with pytest.raises(RuntimeError, match="cannot open shared object file"):
+            Compiled(function)(*arguments)
+    assert len(set(made)) == 4
+    assert len(list((cache / "coil-rl").iterdir())) == 1
+
+
+def test_shapes_that_depend_on_values_are_refused():
+    with pytest.raises(UserError, match=r"cannot be compiled, because aten\.nonzero"):
+        Compiled(lambda x: [x[x.nonzero()[:, 0]]])(torch.ones(3))
+    with pytest.raises(UserError, match=r"cannot be compiled, because aten\.index"):
+        Compiled(lambda x: [x[x > 0].sum()])(torch.ones(3))
+
+
+def test_missing_compiler_is_named(monkeypatch, tmp_path):
+    monkeypatch.setenv("CXX", "missing")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match=r"without a C\+\+ compiler; install one, or take compile=false"):
+        Compiled(lambda x: [x.sin()])(torch.ones(3))
+    assert not (tmp_path / "coil-rl").exists()
