@@ -81,6 +81,7 @@ class ConeTrackEnv(SeededEnv):
         sight: m, range of view.
         hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It is then made without
             cones that share their x or y with a nearer one, and a side with fewer than two cones lies at the origin.
+        late_observation: whether `observation` is the one of the step before; `cones` are not late.
         finish_in_sight: whether the finish line is between the first cones of the level file that are visible from the
             track's start, in place of the first ones.
         kept_cones: K.
@@ -121,6 +122,7 @@ class ConeTrackEnv(SeededEnv):
         assignment: Literal["random", "cyclic"] = "random",
         sight: float = SIGHT,
         hold_boundary: bool = False,
+        late_observation: bool = False,
         finish_in_sight: bool = False,
         kept_cones: int = 16,
         speed: float = 2.0,
@@ -151,7 +153,8 @@ class ConeTrackEnv(SeededEnv):
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
-        self.fit, self.sight, self.hold_boundary = spline_fit(spline, smoothing), sight, hold_boundary
+        self.fit, self.sight = spline_fit(spline, smoothing), sight
+        self.hold_boundary, self.late_observation = hold_boundary, late_observation
         if finish_in_sight:
             tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]
         self.map = TrackMap(tracks, sight=sight, dtype=dtype).to(self.device)
@@ -200,6 +203,7 @@ class ConeTrackEnv(SeededEnv):
         self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)  # epoch of each cone's last sighting
         self.samples: Tensor = zeros(2, SAMPLES, 2)  # m, last boundary estimate, in world coordinates
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
+        self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)  # observation that is not yet output
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
@@ -212,8 +216,10 @@ class ConeTrackEnv(SeededEnv):
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
         new, sampled = torch.ones_like(lap_start, dtype=torch.bool), torch.zeros_like(samples[0, 0])
         observation, samples, sampled = self._observe(frame, visible, cones, new, samples, sampled)
-        outputs = {"observation": observation.t(), "cones": visible.cones, "count": visible.count.long()}
+        latest = observation.t()
+        outputs = {"observation": latest, "cones": visible.cones, "count": visible.count.long()}
         state = {"track": tracks, "pose": pose, "lap_start": lap_start, "samples": samples, "sampled": sampled}
+        state["latest"] = latest[: len(self.latest)]
         state["in_finish"] = _in_finish(location) & (lap_start > NEVER)
         for name, value in {**outputs, **state}.items():
             self.register_buffer(f"start_{name}", value, persistent=False)
@@ -236,7 +242,8 @@ class ConeTrackEnv(SeededEnv):
         def start(of_places: Tensor) -> Tensor:
             return of_places.index_select(-1, place)
 
-        copied = {name: start(getattr(self, f"start_{name}")) for name in ("track", "pose", "samples", "sampled")}
+        kept = ("track", "pose", "samples", "sampled", "latest")
+        copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
         copied |= {
             "steps": steps,
             "in_finish": start(self.start_in_finish),
@@ -275,6 +282,8 @@ class ConeTrackEnv(SeededEnv):
         discovered, new = self._count_new_cones(visible, slots, finished)
         observed = self._observe(frame, visible, cones, new, self.samples, self.sampled)
         observation, self.samples, self.sampled = observed
+        if self.late_observation:
+            observation, self.latest = self.latest.t(), observation.t()
         to_boundaries = self.map.to_boundaries(location)
         clearance = self.map.clearance(location, to_boundaries)
 
