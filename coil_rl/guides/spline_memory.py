@@ -66,9 +66,10 @@ class SplineMemoryGuide(SplineGuide):
             "path_targets": ((2, TARGETS), NOWHERE, torch.float32),
             "path_target_count": ((1,), 0, torch.int64),
             "path_passed": ((TARGETS,), False, torch.bool),
-            "path_cones": ((2, 2, CONES), NOWHERE, torch.float32),  # ever seen: coordinate, side, cone
+            # Ever seen: coordinate, side, cone. Half precision halves the cost of resets, and is fine enough to tell cones.
+            "path_cones": ((2, 2, CONES), NOWHERE, torch.float16),
             "path_cone_count": ((2,), 0, torch.int64),
-            "path_in_view": ((2, 2, self.cones), NOWHERE, torch.float32),  # at the last step: coordinate, side, cone
+            "path_in_view": ((2, self.cones, 2), NOWHERE, torch.float32),  # at the last step: coordinate, cone, side
         }
         if oddities:
             self.memory["path_chosen"] = ((2,), NOWHERE, torch.float32)
@@ -96,7 +97,7 @@ class SplineMemoryGuide(SplineGuide):
         pose = torch.cat([Frame(old).to_world(motion[:, :2].t()), (old[2] + motion[:, 2]).unsqueeze(0)])
         frame = Frame(pose)
         memory["path_pose"] = pose.t()
-        target = self._nearest_unpassed(memory, frame)
+        target = self._nearest_unpassed(memory, frame, old[:2])
         if self.oddities:
             target, memory["path_chosen"] = memory["path_chosen"].t(), target.t()
         self._discover(memory, frame, cones, count)
@@ -109,8 +110,11 @@ class SplineMemoryGuide(SplineGuide):
             tensordict.set(("next", key), value)
         return tensordict.set(self.out_keys[0], action)
 
-    def _nearest_unpassed(self, memory: dict[str, Tensor], frame: Frame) -> Tensor:
-        """Update which targets are passed; return the nearest visible one that is not, or a place far away, [2, B]."""
+    def _nearest_unpassed(self, memory: dict[str, Tensor], frame: Frame, before: Tensor) -> Tensor:
+        """Update which targets are passed; return the nearest visible one that is not, or a place far away, [2, B].
+
+        `before` is the position at the last step, [2, B].
+        """
         slots = slots_in_use(memory["path_target_count"], TARGETS)
         targets, passed = memory["path_targets"][:, :, :slots], memory["path_passed"][:, :slots]
         position, cos, sin = frame.position, frame.cos.unsqueeze(-1), frame.sines[0].unsqueeze(-1)
@@ -119,7 +123,7 @@ class SplineMemoryGuide(SplineGuide):
         ahead = torch.addcmul(x * cos, y, sin)
         if self.oddities:
             passed = passed & ~memory["path_in_circle"]
-            offset = position - memory["path_gate"].t()
+            offset = before - memory["path_gate"].t()
             inside = torch.addcmul(offset[0] * offset[0], offset[1], offset[1]) < TARGET_REACHED**2
             memory["path_in_circle"] = inside.unsqueeze(-1)
         else:
@@ -138,17 +142,17 @@ class SplineMemoryGuide(SplineGuide):
         real = count.t() > constant(range(slots), count.t().unsqueeze(0))
         local = cones[:, :, :slots].permute(3, 2, 1, 0)
         world = torch.where(real, frame.to_world(local), constant(NOWHERE, local))
-        before = memory["path_in_view"].permute(1, 3, 2, 0)
+        before = memory["path_in_view"].permute(1, 2, 3, 0)
         appeared = real & ~_near(world, before[:, :slots], SAME_CONE)
-        room = self.cones - slots
-        memory["path_in_view"] = torch.nn.functional.pad(world.permute(3, 0, 2, 1), (0, room), value=NOWHERE)
+        empty = constant(NOWHERE, world).expand(2, self.cones - slots, *world.shape[2:])
+        memory["path_in_view"] = torch.cat([world, empty], 1).permute(3, 0, 1, 2)
         rows = rows_in_use(appeared.flatten(0, 1).any(0))
         if not len(rows):
             return
         world, appeared, local, count = world[..., rows], appeared[..., rows], local[..., rows], count[rows]
         seen, seen_count = memory["path_cones"][rows].permute(1, 3, 2, 0), memory["path_cone_count"][rows].t()
-        new = appeared & ~_near(world, seen[:, : slots_in_use(seen_count, CONES)], SAME_CONE)
-        seen, total = append(seen, seen_count, world, new)
+        new = appeared & ~_near(world, seen[:, : slots_in_use(seen_count, CONES)].to(world), SAME_CONE)
+        seen, total = append(seen, seen_count, world.to(seen), new)
         plans = (total > seen_count).any(0) & (count > 1).all(-1)
         memory["path_cones"] = memory["path_cones"].index_copy(0, rows, seen.permute(3, 0, 2, 1))
         memory["path_cone_count"] = memory["path_cone_count"].index_copy(0, rows, total.t())
