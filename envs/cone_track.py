@@ -26,9 +26,10 @@ from coil_rl.envs.reward import (
     recent_mean,
     weighted_terms,
 )
-from coil_rl.envs.sight import SAMPLES, Frame, View, encode_samples, view
-from coil_rl.envs.splines import quadratic_spline, smoothing_spline
-from coil_rl.envs.track import NEVER, Track, places
+from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, encode_samples, view
+from coil_rl.envs.sorting import append, first_come, rows_in_use
+from coil_rl.envs.splines import spline_fit
+from coil_rl.envs.track import NEVER, Track, begin_in_sight, places
 from coil_rl.envs.track_map import Location, TrackMap
 
 FINISH_RADIUS = 0.625  # m
@@ -56,8 +57,8 @@ class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
-    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force,
-    `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
+    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force, `motion`
+    [B, 3] the way since the last observation (m ahead, m to the left, radians) in the car's frame there, `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
     laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash),
     `smoothness` |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
 
@@ -65,7 +66,7 @@ class ConeTrackEnv(SeededEnv):
         tracks: the tracks.
         num_envs: B.
         rate: control steps per second.
-        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (interpolating).
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares parabola).
         smoothing: lambda of the cubic smoothing spline, m^3.
         cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes into sight.
         reward: weights, see `RewardWeights`.
@@ -77,6 +78,12 @@ class ConeTrackEnv(SeededEnv):
             for the starts of the tracks.
         assignment: "random" draws a place at each reset; with `starts` it also draws at the first reset how much of
             `time_limit` is over, so that the episodes do not end together. "cyclic" keeps car i on place i mod places.
+        sight: m, range of view.
+        hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It is then made without
+            cones that share their x or y with a nearer one, and a side with fewer than two cones lies at the origin.
+        late_observation: whether `observation` is the one of the step before; `cones` are not late.
+        finish_in_sight: whether the finish line is between the first cones of the level file that are visible from the
+            track's start, in place of the first ones.
         kept_cones: K.
         speed: m/s.
         car_length: m.
@@ -113,6 +120,10 @@ class ConeTrackEnv(SeededEnv):
         held_steps: int = 0,
         starts: int | None = None,
         assignment: Literal["random", "cyclic"] = "random",
+        sight: float = SIGHT,
+        hold_boundary: bool = False,
+        late_observation: bool = False,
+        finish_in_sight: bool = False,
         kept_cones: int = 16,
         speed: float = 2.0,
         car_length: float = 2.0,
@@ -122,10 +133,10 @@ class ConeTrackEnv(SeededEnv):
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
-        check_choice(("cubic", "quadratic"), spline=spline)
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
         check_choice(("random", "cyclic"), assignment=assignment)
         check_range(0, above=True, num_envs=num_envs, kept_cones=kept_cones, speed=speed, car_length=car_length)
+        check_range(0, 100, above=True, sight=sight)
         check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, 1000, above=True, rate=rate)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
@@ -142,8 +153,11 @@ class ConeTrackEnv(SeededEnv):
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
-        self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
-        self.map = TrackMap(tracks, dtype=dtype).to(self.device)
+        self.fit, self.sight = spline_fit(spline, smoothing), sight
+        self.hold_boundary, self.late_observation = hold_boundary, late_observation
+        if finish_in_sight:
+            tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]
+        self.map = TrackMap(tracks, sight=sight, dtype=dtype).to(self.device)
         weights = torch.tensor(RewardWeights(**(reward or {})), dtype=dtype, device=self.device)
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()
@@ -159,7 +173,7 @@ class ConeTrackEnv(SeededEnv):
         flag = Binary(1, dtype=torch.bool, device=self.device)
         observation = Composite(
             observation=bounded((4 * SAMPLES,)), cones=real((2, self.kept_cones, 2)), cone_count=count((2,)),
-            steering=bounded((1,)),
+            steering=bounded((1,)), motion=real((3,)),
         )  # fmt: skip
         if self.info:
             terms = Composite({term: real((1,)) for term in self.reward_terms})
@@ -184,10 +198,12 @@ class ConeTrackEnv(SeededEnv):
         self.lap: Tensor = zeros(dtype=torch.int32)  # completed laps
         self.lap_start: Tensor = zeros(dtype=torch.int32)  # step of the last entry of the finish circle
         self.in_finish: Tensor = zeros(dtype=torch.bool)  # whether inside the finish circle
-        self.epoch: Tensor = zeros(dtype=torch.int32)  # period of one reward per cone, a lap or a step
+        self.epoch: Tensor = zeros(dtype=torch.int32)  # number of steps over all episodes, and of resets
+        self.lap_epoch: Tensor = zeros(dtype=torch.int32)  # epoch in which the lap began
         self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)  # epoch of each cone's last sighting
         self.samples: Tensor = zeros(2, SAMPLES, 2)  # m, last boundary estimate, in world coordinates
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
+        self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)  # observation that is not yet output
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
@@ -196,11 +212,14 @@ class ConeTrackEnv(SeededEnv):
         lap_start = torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed).round().int().to(self.device)
         frame = Frame(pose)
         location = self.map.locate(tracks, frame.position)
-        visible, _ = self._view(location, pose, frame)
+        visible, _, cones = self._view(location, pose, frame)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
-        observation, samples, sampled = self._observe(frame, visible, samples, torch.zeros_like(samples[0, 0]))
-        outputs = {"observation": observation.t(), "cones": visible.cones, "count": visible.count.long()}
+        new, sampled = torch.ones_like(lap_start, dtype=torch.bool), torch.zeros_like(samples[0, 0])
+        observation, samples, sampled = self._observe(frame, visible, cones, new, samples, sampled)
+        latest = observation.t()
+        outputs = {"observation": latest, "cones": visible.cones, "count": visible.count.long()}
         state = {"track": tracks, "pose": pose, "lap_start": lap_start, "samples": samples, "sampled": sampled}
+        state["latest"] = latest[: len(self.latest)]
         state["in_finish"] = _in_finish(location) & (lap_start > NEVER)
         for name, value in {**outputs, **state}.items():
             self.register_buffer(f"start_{name}", value, persistent=False)
@@ -223,7 +242,8 @@ class ConeTrackEnv(SeededEnv):
         def start(of_places: Tensor) -> Tensor:
             return of_places.index_select(-1, place)
 
-        copied = {name: start(getattr(self, f"start_{name}")) for name in ("track", "pose", "samples", "sampled")}
+        kept = ("track", "pose", "samples", "sampled", "latest")
+        copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
         copied |= {
             "steps": steps,
             "in_finish": start(self.start_in_finish),
@@ -235,6 +255,7 @@ class ConeTrackEnv(SeededEnv):
             setattr(self, name, getattr(self, name).index_fill(-1, cars, 0))
         # Under either rule of the cone bonus, no cone was seen in the epoch before the new one.
         self.epoch = self.epoch.index_add(0, cars, torch.full_like(cars, 2, dtype=self.epoch.dtype))
+        self.lap_epoch = self.lap_epoch.index_copy(0, cars, self.epoch.index_select(0, cars))
         zero = torch.zeros_like(self.pose[0])
         observation, cones, count = (
             at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
@@ -242,7 +263,8 @@ class ConeTrackEnv(SeededEnv):
         )
         flags = {"crashed": zero.bool(), "completed": zero.bool()}
         info = {"lap_time": zero, **flags, "clearance": zero, "smoothness": zero}
-        return self._output(observation.t(), cones, count, info, dict.fromkeys(self.reward_terms, zero))
+        motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
+        return self._output(observation.t(), cones, count, motion, info, terms)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
@@ -250,15 +272,18 @@ class ConeTrackEnv(SeededEnv):
             action = action * (self.steps >= self.held_steps)
         roughness = (action - recent_mean(self.history)).abs_()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
-        self.pose = self._move(action)
+        self.pose, motion = self._move(action)
         self.steps = self.steps + constant(1, self.steps)
 
         frame = Frame(self.pose)
         location = self.map.locate(self.track, frame.position)
         lap_time, finished = self._count_laps(location)
-        visible, slots = self._view(location, self.pose, frame)
-        discovered = self._count_new_cones(visible, slots, finished)
-        observation, self.samples, self.sampled = self._observe(frame, visible, self.samples, self.sampled)
+        visible, slots, cones = self._view(location, self.pose, frame)
+        discovered, new = self._count_new_cones(visible, slots, finished)
+        observed = self._observe(frame, visible, cones, new, self.samples, self.sampled)
+        observation, self.samples, self.sampled = observed
+        if self.late_observation:
+            observation, self.latest = self.latest.t(), observation.t()
         to_boundaries = self.map.to_boundaries(location)
         clearance = self.map.clearance(location, to_boundaries)
 
@@ -272,15 +297,16 @@ class ConeTrackEnv(SeededEnv):
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         flags = {"crashed": crashed, "completed": completed}
         info = {"lap_time": lap_time, **flags, "clearance": clearance, "smoothness": roughness}
-        return self._output(observation, visible.cones, visible.count.long(), info, terms, reward=reward, **ends)
+        return self._output(observation, visible.cones, visible.count.long(), motion, info, terms, reward=reward, **ends)
 
-    def _move(self, action: Tensor) -> Tensor:
-        """Return the next pose by the bicycle model (equations 99-100): move along the heading, then turn."""
+    def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the next pose by the bicycle model (equations 99-100): move along the heading, then turn; and the motion."""
         heading = self.pose[2]
         turn = (action * constant(self.max_steering, action)).sin_()
         step = self.speed / self.rate
         strides = constant((step, step, step / self.car_length), self.pose)
-        return torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
+        pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
+        return pose, strides * torch.stack([torch.ones_like(turn), torch.zeros_like(turn), turn])
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
@@ -293,48 +319,69 @@ class ConeTrackEnv(SeededEnv):
         self.lap = self.lap + finished
         return lap_time, finished
 
-    def _view(self, location: Location, pose: Tensor, frame: Frame) -> tuple[View, Tensor]:
-        """Return the visible cones and the slots of all candidates."""
+    def _view(self, location: Location, pose: Tensor, frame: Frame) -> tuple[View, Tensor, Tensor]:
+        """Return the visible cones, and the slots and positions of all candidates."""
         slots, cones = self.map.candidates(location, pose[2])
-        return view(frame.to_car(cones), self.kept_cones), slots
+        return view(frame.to_car(cones), self.kept_cones, self.sight), slots, cones
 
-    def _observe(self, frame: Frame, visible: View, samples: Tensor, sampled: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _observe(
+        self, frame: Frame, visible: View, cones: Tensor, new: Tensor, samples: Tensor, sampled: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation [B, 20] and the new `samples` and `sampled`.
 
-        A side with fewer than two visible cones keeps its last estimate.
+        A side with fewer than two visible cones keeps its last estimate. A held boundary is estimated where a cone of
+        the candidates is `new` [B] in sight.
         """
+        if self.hold_boundary:
+            rows = rows_in_use(new)
+            if len(rows):
+                index = visible.index.view(visible.real.shape)[..., rows]
+                estimate = self._estimate_distinct(cones.flatten(1)[:, index], visible.count[:, rows])
+                estimate = torch.where(new[rows], estimate, samples[..., rows])
+                samples = samples.index_copy(-1, rows, estimate)
+            sampled = torch.ones_like(sampled)
+            return encode_samples(frame.to_car(samples), sampled, self.sight), samples, sampled
         fresh = visible.real[1]
         local = self.fit(visible.cones, visible.count).equidistant(SAMPLES)
         samples = torch.lerp(samples, frame.to_world(local), fresh)
         sampled = torch.maximum(sampled, fresh)
-        return encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled), samples, sampled
+        return encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled, self.sight), samples, sampled
 
-    def _count_new_cones(self, visible: View, slots: Tensor, finished: Tensor) -> Tensor:
-        """Mark newly visible cones as rewarded; return the number of sides with one [B]."""
+    def _estimate_distinct(self, cones: Tensor, count: Tensor) -> Tensor:
+        """Return the samples of a held boundary in world coordinates [2, 5, 2, R], for cones [2, K, 2, R]."""
+        real = count > constant(range(cones.shape[1]), cones[0])
+        distinct = first_come(real, (cones.unsqueeze(1) == cones.unsqueeze(2)).any(0))
+        points, count = append(torch.zeros_like(cones), torch.zeros_like(count, dtype=torch.int64), cones, distinct)
+        return self.fit(points, count).equidistant(SAMPLES) * (count > 1)
+
+    def _count_new_cones(self, visible: View, slots: Tensor, finished: Tensor) -> tuple[Tensor, Tensor]:
+        """Note the visible cones; return the number of sides with a rewarded one, and whether one came into view, [B]."""
         before = self.epoch
-        self.epoch = before + (1 if self.every_sighting else finished)
-        rewarded = before if self.every_sighting else self.epoch
+        self.epoch = before + constant(1, before)
+        self.lap_epoch = torch.where(finished, self.epoch, self.lap_epoch)
         slots = slots.flatten().index_select(0, visible.index).view_as(visible.candidate)
         cars = len(self.epoch)
         index = torch.add(constant(range(cars), self.epoch, torch.int64), slots, alpha=cars).flatten()
         last_seen = self.last_seen.view(-1)
         last = last_seen.index_select(0, index).view_as(slots)
-        new = visible.real * torch.ne(last, rewarded)
+        rewarded = visible.real * torch.lt(last, before if self.every_sighting else self.lap_epoch)
+        entered = visible.real * torch.lt(last, before) if self.hold_boundary else rewarded
         last_seen.scatter_(0, index, torch.where(visible.real.bool(), self.epoch, last).flatten())
-        return new.amax(0).sum(0)
+        return rewarded.amax(0).sum(0), entered.flatten(0, 1).amax(0).bool()
 
     def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
         """Return the terms of the reward, [B] each."""
         return weighted_terms(outcome, dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True)))
 
     def _output(
-        self, observation: Tensor, cones: Tensor, count: Tensor, info: dict[str, Tensor], terms: dict[str, Tensor],
-        **ends: Tensor,
+        self, observation: Tensor, cones: Tensor, count: Tensor, motion: Tensor, info: dict[str, Tensor],
+        terms: dict[str, Tensor], **ends: Tensor,
     ) -> TensorDict:  # fmt: skip
         missing = self.kept_cones - cones.shape[1]
         if missing > 0:
             cones = torch.cat([cones, cones.new_zeros(2, missing, *cones.shape[2:])], 1)
         data: dict[str, Any] = {"observation": observation, "cones": cones.permute(3, 2, 1, 0), "cone_count": count.t()}
+        data["motion"] = motion.t()
         data |= {key: value.unsqueeze(-1) for key, value in {"steering": self.history[0], **ends}.items()}
         if self.info:
             info = {"track": self.track, "lap": self.lap.long(), **info}

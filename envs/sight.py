@@ -60,11 +60,11 @@ def field_of_view_margin(x: Tensor, square: Tensor) -> Tensor:
     return torch.add(x * x.abs(), square, alpha=-(math.cos(HALF_FIELD_OF_VIEW) ** 2))
 
 
-def view(local: Tensor, limit: int) -> View:
+def view(local: Tensor, limit: int, sight: float = SIGHT) -> View:
     """Select the visible cones of candidates [2, N, 2, B] m in the car's frame, at most the nearest `limit` a side."""
     x, y = local.unbind(0)
     square = torch.addcmul(x * x, y, y)
-    margin = torch.minimum(constant(SIGHT**2, x) - square, field_of_view_margin(x, square))
+    margin = torch.minimum(constant(sight**2, x) - square, field_of_view_margin(x, square))
     hidden = margin.lt_(constant(0, x))
     count = (constant(len(x), x) - hidden.sum(0)).clamp_(max=limit)
     slots = slots_in_use(count, min(limit, len(x)))

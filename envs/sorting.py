@@ -1,4 +1,4 @@
-"""Batched selection of the smallest entries of each column.
+"""Batched selection: the smallest entries of each column, entries without a conflict, and lists that grow.
 
 `Tensor.topk` processes one column after another, up to a microsecond each. A sorting network of minima and maxima
 applies a few dozen operations to all columns at once, which is faster for many columns.
@@ -72,3 +72,39 @@ def _compare(first: Tensor, second: Tensor) -> Tensor:
     torch.minimum(first, second, out=both[:, 0])
     torch.maximum(first, second, out=both[:, 1])
     return both.view(-1, columns)
+
+
+def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
+    """Select each eligible entry that is in conflict with no selected one before it.
+
+    Args:
+        eligible: [N, *batch], bool.
+        conflict: [N, N, *batch], bool, symmetric.
+    """
+    selected = list(eligible.unbind(0))
+    for i in range(1, len(selected)):
+        selected[i] = selected[i] & ~(torch.stack(selected[:i]) & conflict[i, :i]).any(0)
+    return torch.stack(selected)
+
+
+def append(points: Tensor, count: Tensor, more: Tensor, selected: Tensor) -> tuple[Tensor, Tensor]:
+    """Append the selected ones of `more` [D, M, *batch] to lists of points in order, as far as there is room.
+
+    Args:
+        points: [D, N, *batch], of which `count` [*batch], integers, are in use.
+        selected: [M, *batch], bool.
+
+    Returns:
+        The new points and count.
+    """
+    room = points.shape[1]
+    slot = torch.where(selected, count + selected.cumsum(0) - 1, room).clamp_(max=room)
+    longer = torch.cat([points, points[:, :1]], 1).scatter_(1, slot.expand_as(more), more)
+    return longer[:, :room], (count + selected.sum(0)).clamp_(max=room)
+
+
+def rows_in_use(mask: Tensor) -> Tensor:
+    """Return the rows to compute for a mask [B]: those in it where reading the data is cheap, as on a CPU, else all."""
+    if mask.device.type != "cpu" or torch.compiler.is_compiling():
+        return torch.arange(len(mask), device=mask.device)
+    return mask.nonzero().squeeze(-1)

@@ -1,10 +1,10 @@
 """Parametric splines through padded batches of points, and the self-evolving spline (appendix A.2).
 
 A spline is stored as its positions and second derivatives at its knots, which determine the curve between two knots.
-The cubic smoothing spline, the quadratic interpolating spline and the least-squares parabola are therefore one class
-with three fits. All fits take `points` [D, K, *batch] in m, in order, K >= 2, and `count` [*batch], the number of real
-points of each row; other slots may hold any finite number. They raise ValueError for other shapes. A row with two
-points yields a line, with one a constant, with none zeros.
+The cubic smoothing spline and the least-squares parabola are therefore one class with two fits. Both take `points`
+[D, K, *batch] in m, in order, K >= 2, and `count` [*batch], the number of real points of each row; other slots may hold
+any finite number. They raise ValueError for other shapes. A row with two points yields a line, with one a constant,
+with none zeros.
 
 The batch comes last, so each step of a recursion over the K slots is one contiguous operation for the whole batch.
 Sums are taken in slot order and no branch depends on data, so a row's result depends on its own points only, to the
@@ -12,8 +12,9 @@ last bit. Masks are numbers 0 and 1, which are much faster than booleans in PyTo
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce
+from functools import partial, reduce
 from itertools import accumulate
 from typing import Literal
 
@@ -21,6 +22,7 @@ import torch
 from torch import Tensor, nn
 
 from coil_rl.envs.constants import constant, flat_index
+from coil_rl.envs.limits import check_choice
 
 
 @dataclass(frozen=True)
@@ -29,8 +31,7 @@ class Spline:
 
     knots: Tensor  # [K, *batch], m, chord length up to each point
     values: Tensor  # [D, K, *batch], m, positions at the knots
-    bends: Tensor  # [D, K, *batch], 1/m, second derivatives at the knots
-    degree: Literal[2, 3]  # the second derivative is linear between two knots, or steps halfway
+    bends: Tensor  # [D, K, *batch], 1/m, second derivatives at the knots, linear between two of them
 
     @property
     def length(self) -> Tensor:
@@ -74,12 +75,17 @@ class Spline:
         # Real intervals are much wider than eps (see _chords); splines of one point or none have width 0.
         t = before / width.clamp(min=torch.finfo(u.dtype).eps)
         chord = torch.lerp(y0, y1, t)
-        if self.degree == 3:
-            return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
-        # The second derivative steps from g0 to g1 halfway.
-        early, late = (after - before).clamp(min=0).square(), (before - after).clamp(min=0).square()
-        sag = torch.addcmul((early - width * after) * g0, late - width * before, g1)
-        return torch.add(chord, sag, alpha=1 / 8)
+        return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
+
+
+def spline_fit(spline: Literal["cubic", "quadratic"], smoothing: float) -> Callable[[Tensor, Tensor], Spline]:
+    """Return the fit of that name: the cubic smoothing spline, or the least-squares parabola, which has no `smoothing`.
+
+    Raises:
+        ValueError: for another name.
+    """
+    check_choice(("cubic", "quadratic"), spline=spline)
+    return partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else least_squares_parabola
 
 
 def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
@@ -107,24 +113,7 @@ def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     values = points.clone()
     values[:, :-1].sub_(jerk, alpha=smoothing)
     values[:, 1:].add_(jerk, alpha=smoothing)
-    return Spline(knots, _repeat_last(values, real), bends, 3)
-
-
-def quadratic_spline(points: Tensor, count: Tensor) -> Spline:
-    """Fit an interpolating quadratic spline, parametric in chord length, with breaks halfway between points.
-
-    The same curve as `scipy.interpolate.make_interp_spline(u, y, k=2)` and FITPACK's `splprep(s=0, k=2)`: no break in
-    the first and in the last interval.
-    """
-    real, knots, step, h = _chords(points, count)
-    span = h[:-1] + h[1:]
-    # Without a break in the first and last interval, the outer second derivative equals its neighbour.
-    first, last = torch.cat([h[:1], 0 * h[1:-1]]), h[1:] * (1 - real[3:])
-    diagonal = (3 * span + first + last) / 8
-    far, turns = torch.zeros_like(h[3:]), _turns(step, h.reciprocal())
-    bends = _solve(diagonal, h[1:-1] / 8, far, turns, real[2:-1], span / 4)
-    inner = _repeat_last(bends, torch.cat([real[1:], real[-1:]]))
-    return Spline(knots, _repeat_last(points, real), torch.cat([inner[:, 1:2], inner[:, 1:]], 1), 2)
+    return Spline(knots, _repeat_last(values, real), bends)
 
 
 def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
@@ -152,7 +141,7 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     c1 = (_total(left * p1, 1) / n1).unsqueeze(1)
     c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
     fitted = origin + (c0 + c1 * p1 + c2 * p2)
-    return Spline(knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points), 2)
+    return Spline(knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points))
 
 
 class SelfEvolvingSpline(nn.Module):

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -121,6 +122,24 @@ class Track:
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
             fault = f"The left side of track {self.name!r} is not on the left of its driving direction"
             raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
+
+
+@lru_cache(maxsize=64)
+def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
+    """Return a track whose sides begin with the first cones that are visible from its start, as does its finish line.
+
+    Args:
+        track: a side of which no cone is visible stays as it is.
+        sight: m, range of view.
+        half_angle: radians to either side of the heading.
+    """
+    x, y, heading = track.start
+    rings = []
+    for ring in (track.left, track.right):
+        offset = (ring - (x, y)) @ AS_COMPLEX * np.exp(-1j * heading)
+        visible = (np.abs(offset) < sight) & (np.abs(np.angle(offset)) < half_angle)
+        rings.append(np.roll(ring, -int(visible.argmax()), axis=0))
+    return Track(track.name, *rings, track.start)
 
 
 def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:

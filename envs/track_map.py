@@ -46,7 +46,7 @@ class Location(NamedTuple):
 class TrackMap(nn.Module):
     """The static geometry of several tracks on one device, for a batch of cars that refer to tracks by index."""
 
-    def __init__(self, tracks: Sequence[Track], *, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(self, tracks: Sequence[Track], *, sight: float = SIGHT, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         if not tracks:
             raise ValueError("a track map needs at least one track, none was given")
@@ -58,7 +58,7 @@ class TrackMap(nn.Module):
                 cones[:, index, side, : len(ring)] = ring.T
         self.cones: Tensor = _buffer(cones.reshape(2, -1), dtype)
         self.starts: Tensor = _buffer(np.array([track.start for track in tracks]).T, dtype)
-        self._register_nearby(tracks, dtype)
+        self._register_nearby(tracks, sight, dtype)
         field = [boundary_distances(track, dtype) for track in tracks]
         self.field: Tensor = _buffer(np.concatenate(field).ravel(), dtype)
 
@@ -74,13 +74,13 @@ class TrackMap(nn.Module):
     def __len__(self) -> int:
         return len(self.tracks)
 
-    def _register_nearby(self, tracks: Sequence[Track], dtype: torch.dtype) -> None:
+    def _register_nearby(self, tracks: Sequence[Track], sight: float, dtype: torch.dtype) -> None:
         """Register `candidate` [blocks * SECTORS, most * 2], `candidate_count`, `block` [cells] and `near`.
 
         A block holds the candidates of one cell in all sectors; cells without candidates share block 0. The count is
         that of the side with more candidates.
         """
-        used, visible, near = zip(*(nearby_cones(track, dtype) for track in tracks), strict=True)
+        used, visible, near = zip(*(nearby_cones(track, sight, dtype) for track in tracks), strict=True)
         filled = np.concatenate(used)
         self.block: Tensor = _buffer(np.where(filled, filled.cumsum(), 0), torch.int64)
         candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
@@ -161,8 +161,8 @@ class Grid:
 
 # Cached, because programs build several envs with the same tracks and these functions dominate the time of building.
 @lru_cache(maxsize=64)
-def nearby_cones(track: Track, dtype: torch.dtype) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
-    """Return the relevant cones of each cell of a track, by number, ascending, then -1.
+def nearby_cones(track: Track, sight: float, dtype: torch.dtype) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
+    """Return the relevant cones of each cell of a track, by number, ascending, then -1; `sight` is in m.
 
     Returns:
         Whether any cone may be visible, [cells]; the cones of the left and of the right side that may be visible,
@@ -180,7 +180,7 @@ def nearby_cones(track: Track, dtype: torch.dtype) -> tuple[NDArray[np.bool_], N
         offset = ring - centre[:, None]
         distance = np.linalg.norm(offset, axis=-1)
         near.append(distance <= CONE_RADIUS + EXACT + half_diagonal + 1e-3)
-        cell, cone = np.nonzero(distance <= SIGHT + half_diagonal + 1e-3)
+        cell, cone = np.nonzero(distance <= sight + half_diagonal + 1e-3)
         offset, distance = offset[cell, cone], distance[cell, cone]
         bearing = np.arctan2(offset[:, 1], offset[:, 0])[:, None] - heading
         bearing = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)

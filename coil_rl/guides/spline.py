@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Literal, NamedTuple
 
 import torch
@@ -11,10 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
-from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import field_of_view_margin
 from coil_rl.envs.sorting import smallest
-from coil_rl.envs.splines import Spline, least_squares_parabola, slots_in_use, smoothing_spline
+from coil_rl.envs.splines import Spline, slots_in_use, spline_fit
 
 PAIR_DISTANCE = 4.0  # m, between the two cones of a pair
 TARGET_REACHED = 0.625  # m
@@ -74,11 +73,10 @@ class SplineGuide(TensorDictModuleBase):
     ) -> None:
         self.in_keys, self.out_keys = list(in_keys), [out_key]
         super().__init__()
-        check_choice(("cubic", "quadratic"), spline=spline)
         check_range(0, smoothing=smoothing, sharpness=sharpness)
         check_range(0, above=True, max_steering=max_steering)
         check_range(-1e6, 1e6, gain=gain)
-        self.fit = least_squares_parabola if spline == "quadratic" else partial(smoothing_spline, smoothing=smoothing)
+        self.fit = spline_fit(spline, smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -3,7 +3,7 @@
 import json
 import math
 from dataclasses import KW_ONLY, dataclass, fields
-from functools import cached_property, partial
+from functools import cached_property
 from importlib import resources
 from typing import Literal
 
@@ -16,10 +16,10 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import make_composite_from_td
 
-from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
-from coil_rl.envs.splines import quadratic_spline, smoothing_spline
+from coil_rl.envs.splines import spline_fit
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -196,8 +196,7 @@ class BoundaryMemory(nn.Module):
         sight: float = SIGHT,
     ) -> None:
         super().__init__()
-        check_choice(("cubic", "quadratic"), spline=spline)
-        self.fit = partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else quadratic_spline
+        self.fit = spline_fit(spline, smoothing)
         self.sight = sight
         self.samples: Tensor = nn.Buffer(torch.zeros(2, SAMPLES, 2, batch))
         self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
