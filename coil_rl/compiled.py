@@ -39,21 +39,27 @@ class Compiled:
         function: takes tensors and returns tensors. It may change its arguments in place. Every tensor that it reads
             and that changes between calls must be among the arguments. It is run once for each set of shapes; after
             that only its operations on tensors are repeated, so Python's decisions are those of that run.
+        once: whether to compile it for the shapes of the first call only, and to run it as it is for others.
 
     Raises:
         UserError: at a call, if there is no C++ compiler, or if the shape of a tensor depends on values.
     """
 
-    def __init__(self, function: Callable[..., Sequence[Tensor]]) -> None:
-        self.function = function
+    def __init__(self, function: Callable[..., Sequence[Tensor]], once: bool = False) -> None:
+        self.function, self.once = function, once
+        self.shapes: set[tuple[torch.Size, ...]] = set()
         self.libraries: dict[tuple[Any, ...], Any] = {}
 
-    def __call__(self, *arguments: Tensor) -> list[Tensor]:
+    def __call__(self, *arguments: Tensor) -> Sequence[Tensor]:
         """Return the results of the function."""
-        shapes = tuple((argument.shape, argument.dtype) for argument in arguments)
-        if shapes not in self.libraries:
-            self.libraries[shapes] = library(self.function, arguments)
-        results: list[Tensor] = self.libraries[shapes].run(list(arguments))
+        layout = tuple((argument.shape, argument.stride(), argument.dtype) for argument in arguments)
+        if layout not in self.libraries:
+            shapes = tuple(argument.shape for argument in arguments)
+            if self.once and self.shapes and shapes not in self.shapes:
+                return self.function(*arguments)
+            self.libraries[layout] = library(self.function, arguments)
+            self.shapes.add(shapes)
+        results: list[Tensor] = self.libraries[layout].run(list(arguments))
         return results
 
 
@@ -126,7 +132,7 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
     """Compile a graph to a library at `path`."""
     import torch._inductor  # takes two seconds to import
 
-    tqdm.write("compiling, once for these sizes and this machine: about 20 s ...", file=sys.stderr)
+    tqdm.write("compiling, once for these sizes and this machine (20 to 60 s) ...", file=sys.stderr)
     examples = tuple(argument.detach() for argument in arguments)
     try:
         with warnings.catch_warnings():
@@ -135,7 +141,7 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
     except RuntimeError as error:
         if type(error).__module__.startswith(("torch._dynamo", "torch._inductor")):
             raise UserError(
-                "the update cannot be compiled without a C++ compiler; install one, or take compile=false"
+                "this cannot be compiled without a C++ compiler; install one, or take compile=false"
             ) from error
         raise
     with whole_file(path) as unfinished:

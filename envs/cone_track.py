@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from coil_rl.compiled import Compiled
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.reward import (
@@ -162,6 +163,8 @@ class ConeTrackEnv(SeededEnv):
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()
         self._register_state(num_envs)
+        self.compiled: Compiled | None = None
+        self.tables = [self.weights, *self.map.buffers()]
         self.staggered = starts is not None
         self._register_starts(starts)
         self.set_seed(seed)
@@ -204,6 +207,7 @@ class ConeTrackEnv(SeededEnv):
         self.samples: Tensor = zeros(2, SAMPLES, 2)  # m, last boundary estimate, in world coordinates
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
         self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)  # observation that is not yet output
+        self.state_names = [name for name, _ in self.named_buffers(recurse=False) if name != "weights"]
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
@@ -266,8 +270,32 @@ class ConeTrackEnv(SeededEnv):
         motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
         return self._output(observation.t(), cones, count, motion, info, terms)
 
+    def compile_steps(self) -> None:
+        """Compile the steps, which changes the last digits of the numbers."""
+        self.compiled = Compiled(self._step_on_tensors)
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
+        if self.compiled is None:
+            return self._advance(action)
+        values = self.compiled(action, *(getattr(self, name) for name in self.state_names), *self.tables)
+        entries = len(self.entries)
+        for name, value in zip(self.changed, values[entries:], strict=True):
+            setattr(self, name, value)
+        return TensorDict(dict(zip(self.entries, values, strict=False)), self.batch_size, device=self.device)
+
+    def _step_on_tensors(self, action: Tensor, *tensors: Tensor) -> list[Tensor]:
+        """Return the entries after a step and the state that it replaces, for compilation."""
+        before = {name: getattr(self, name) for name in self.state_names}
+        output = self._advance(action)
+        after = {name: getattr(self, name) for name in self.state_names}
+        for name, value in before.items():
+            setattr(self, name, value)
+        self.entries = list(output.keys(True, True))
+        self.changed = [name for name, value in after.items() if value is not before[name]]
+        return [*(output[key] for key in self.entries), *(after[name] for name in self.changed)]
+
+    def _advance(self, action: Tensor) -> TensorDict:
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
         roughness = (action - recent_mean(self.history)).abs_()
@@ -297,7 +325,9 @@ class ConeTrackEnv(SeededEnv):
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
         flags = {"crashed": crashed, "completed": completed}
         info = {"lap_time": lap_time, **flags, "clearance": clearance, "smoothness": roughness}
-        return self._output(observation, visible.cones, visible.count.long(), motion, info, terms, reward=reward, **ends)
+        return self._output(
+            observation, visible.cones, visible.count.long(), motion, info, terms, reward=reward, **ends
+        )
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Return the next pose by the bicycle model (equations 99-100): move along the heading, then turn; and the motion."""

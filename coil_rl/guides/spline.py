@@ -9,6 +9,7 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from coil_rl.compiled import Compiled
 from coil_rl.envs.constants import constant, flat_index
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import field_of_view_margin
@@ -78,10 +79,17 @@ class SplineGuide(TensorDictModuleBase):
         check_range(-1e6, 1e6, gain=gain)
         self.fit = spline_fit(spline, smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
+        self.compiled: Compiled | None = None
+
+    def compile_steps(self) -> None:
+        """Compile the advice for batches of the size of the first one, which changes the last digits."""
+        self.compiled = Compiled(lambda *entries: [self.steer(*entries)], once=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice."""
-        return tensordict.set(self.out_keys[0], self.steer(*(tensordict[key] for key in self.in_keys)))
+        entries = [tensordict[key] for key in self.in_keys]
+        advice = self.steer(*entries) if self.compiled is None else self.compiled(*entries)[0]
+        return tensordict.set(self.out_keys[0], advice)
 
     def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
         """Return the advice, [B, 1], as a fraction of `max_steering`.

@@ -98,6 +98,13 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
     return add_transforms(config, build_bare_env(config, overrides), advice=advice)
 
 
+def compile_steps(config: DictConfig, env: EnvBase) -> EnvBase:
+    """Return an env whose steps, and those of its guides, are compiled where they can be, if `compile` is true."""
+    for module in env.modules() if config.compile else ():
+        getattr(module, "compile_steps", lambda: None)()
+    return env
+
+
 def add_transforms(config: DictConfig, env: EnvBase, *, advice: str | None = None) -> EnvBase:
     """Return an env with the transforms of a configuration; arguments and errors as in `build_env`."""
     return _transformed(env, build_transforms(config, advice), "method.transforms")

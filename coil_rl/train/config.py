@@ -164,6 +164,7 @@ class DrivingConfig(ProgramConfig):
     seed: Seed = 0
     device: str = "cpu"
     threads: Threads = 2
+    compile: bool = False
     trust: list[str] = field(default_factory=list)
     run_dir: str = MISSING
 

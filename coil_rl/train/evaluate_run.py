@@ -20,7 +20,15 @@ from coil_rl.files import write_text
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
-from coil_rl.train.build import build, build_env, build_guided_env, build_guides, env_node, what_guides_see
+from coil_rl.train.build import (
+    build,
+    build_env,
+    build_guided_env,
+    build_guides,
+    compile_steps,
+    env_node,
+    what_guides_see,
+)
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.train.fallback import Fallback
 from coil_rl.train.measures import Measure, measures_of, summarise
@@ -109,6 +117,7 @@ def evaluate_run(
             # Deterministic and sampling rows in one batch: the time of a step hardly depends on its size.
             rows = torch.arange((1 + repeats) * count, device=config.device)
             env = build_env(config, {**config.evaluation.env, "num_envs": len(rows)}, advice=advice)
+            compile_steps(config, env)
             watching = pictures if not advice else []
             tick = partial(_tick, env, watching, bar.update)
             result = evaluation.drive(env, agent, sampled=repeats > 0 and rows >= count, tick=tick)

@@ -25,6 +25,7 @@ from coil_rl.train.build import (
     build_guides,
     build_learner,
     cases_node,
+    compile_steps,
     trains_guides,
 )
 from coil_rl.train.curve import EvaluationCurve, measures
@@ -83,7 +84,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     guide_returns = _saved_guide_returns(config, folder / "guide_return.json")
     # After the guides, which a resumed run does not drive again.
     torch.manual_seed(config.seed)
-    env = build_env(config, config.training.env)
+    env = compile_steps(config, build_env(config, config.training.env))
     learner = build_learner(config, env, load_guides(folder, config) if improves_guides else None)
     keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(

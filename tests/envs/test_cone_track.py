@@ -7,6 +7,7 @@ import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.envs import TransformedEnv
 from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
@@ -14,6 +15,7 @@ from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
 from coil_rl.testing import check_env
 from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.transforms import GuideActions
 
 AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}
 
@@ -301,3 +303,22 @@ def test_staggered_episodes_end_at_different_times(rings):
     ends = data["next", "truncated"].sum(0).squeeze(-1)
     assert ends.sum() >= 199
     assert ends.max() < 14
+
+
+@pytest.mark.slow
+def test_compiled_steps_are_the_steps(rings, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    envs = [TransformedEnv(ConeTrackEnv(rings, 6), GuideActions({"spline": SplineGuide()})) for _ in "ab"]
+    for module in envs[1].modules():
+        getattr(module, "compile_steps", lambda: None)()
+    carriers = [env.reset() for env in envs]
+    for count in range(60):
+        action = torch.linspace(-1, 1, 6).unsqueeze(-1) * (count / 60)
+        steps, carriers = zip(
+            *(env.step_and_maybe_reset(c.set("action", action)) for env, c in zip(envs, carriers, strict=True)),
+            strict=True,
+        )
+        torch.testing.assert_close(steps[1]["next"], steps[0]["next"], rtol=1e-3, atol=1e-4)
+    assert steps[0]["info", "crashed"].shape == (6, 1)
+    for name, value in envs[0].base_env.state_dict().items():
+        torch.testing.assert_close(envs[1].base_env.state_dict()[name], value, rtol=1e-3, atol=1e-4)
