@@ -59,7 +59,7 @@ def caution(result: OpenLoop, perception: object) -> str:
             problems.append(f"{rejected:.0%} of the clusters in sight are unlike any cone of the training")
     if not problems:
         return ""
-    remedy = "check env.perception, or train the classifier on your own cones with coil-robot steps=[train]"
+    remedy = "check env.perception, or train the classifier on your own cones with coil-reproduce figure=25"
     return f"{recording.path}: {' and '.join(problems)}, so the actions mean little; {remedy}"
 
 

@@ -1,7 +1,7 @@
-"""Measures of a robot's recorded drives: smoothness, laps, crashes and the driven line."""
+"""Recorded drives of a robot: the reuse of existing recordings, and measures of smoothness, laps, crashes and lines."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
-from coil_rl.envs.recordings.reading import SIMULATED, Recording
+from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError, read_recording
 from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_line
-from coil_rl.envs.robot.drives import SPEED, track_of
+from coil_rl.envs.robot.drives import SPEED, record_drives, track_of
 from coil_rl.envs.track import Track
 from coil_rl.replay.open_loop import recorded_steering
 from coil_rl.report import style
@@ -39,6 +41,27 @@ class RecordedDrive:
     row: Row  # its measures without `smoothness`; `seed` is that of its run, None if there is no run
     line: Array  # [M, 2] m, positions of the robot
     track: Track | None  # None if the recording has none
+
+
+def record(
+    make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]],
+    paths: Sequence[Path],
+    notes: Mapping[str, str],
+    tick: Callable[[], Any] | None = None,
+) -> list[Recording]:
+    """Return recordings of a deterministic episode of each robot of an env; complete ones with equal notes are reused.
+
+    The arguments are those of `record_drives`. The notes tell a driver and its robots from others. A policy that cannot
+    drive the robots is a `UserError`.
+    """
+    try:
+        recordings = [read_recording(path, strict=True) for path in paths]
+        if all(notes.items() <= recording.notes.get(SIMULATED, {}).items() for recording in recordings):
+            return recordings
+    except RecordingError:
+        pass
+    record_drives(*make_env_and_policy(), paths, notes, tick)
+    return [read_recording(path) for path in paths]
 
 
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:

@@ -1,5 +1,6 @@
 """Tables 6 and 7 of the paper: drives of a robot, measured from recordings."""
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -9,19 +10,21 @@ from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
+from tqdm import tqdm
 
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.runs import Run, read_runs
 from coil_rl.report.statistics import count_of_seeds, estimate
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
+from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, record, smoothness
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
-from coil_rl.robot.drivers import Driver, agent_driver, record
 from coil_rl.train.build import build_guides
 from coil_rl.train.evaluate_run import driver_names
+from coil_rl.train.load import load_policy_in_env, weights_file
 from coil_rl.train.run_folder import read_config
 
 PAPER_ROBOT: dict[str, dict[str, Any]] = {
@@ -68,19 +71,21 @@ Clopper-Pearson; a single seed has none and decides nothing."""
 class Table6(Result):
     """Smoothness, laps, crashes and lines of several drivers, from recordings.
 
-    A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide and
-    the agents of runs drive the simulated robot and are recorded next to the page; existing recordings are reused.
+    A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide of
+    the first run and the agents of all runs drive the simulated robot and are recorded next to the page; existing
+    recordings are reused.
 
     Raises:
-        UserError: if there are neither recordings nor experiments.
+        UserError: if there are no recordings, runs or experiments.
         RecordingError: for an unusable recording.
     """
 
-    experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings
+    experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings and runs
     # MCAP files, rosbag2 directories or folders of MCAP files; or lists of them by driver name.
     recordings: Sequence[str] | Mapping[str, Sequence[str]] = ()
     _: KW_ONLY
-    labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs that drive, with the guide of the first of them
+    runs: Sequence[str] = ()  # folders of runs whose agents drive if there are no recordings
+    labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs of the experiments that drive
     repeats: int = 3  # drives of each driver, which differ by the LiDAR noise
     laps: int = 3  # laps of a drive
     scan: str = "/scan"  # topic of the LiDAR
@@ -101,15 +106,19 @@ class Table6(Result):
         self.drives = [measure(found, name) for (name, _), found in zip(files, self.read, strict=True)]
         if self.recordings and not files:
             raise UserError(f"recordings={self.recordings} has no MCAP file; give some, or none to let the runs drive")
-        if not files and not self.experiments:
-            raise UserError("recordings=[] and experiments=[] give no driver; give one of them")
-        self.experiments = [] if files else list(self.experiments)
+        if not files and not self.runs and not self.experiments:
+            raise UserError("recordings=[], runs=[] and experiments=[] give no driver; give one of them")
+        self.own = read_runs(list(map(Path, self.runs))) if self.runs and not files else []
+        self.experiments = [] if files or self.own else list(self.experiments)
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
-        if self.experiments:
-            own = {experiment: runs[experiment] for experiment in self.experiments}
-            self.read = self._record(own, stem.with_name(f"{stem.name}_drives"))
+        if self.experiments or self.own:
+            trained = {experiment: runs[experiment] for experiment in self.experiments}
+            selected = self.own or [
+                run for of_label in runs_by_label(self.labels, trained).values() for run in of_label
+            ]
+            self.read = self._record(selected, stem.with_name(f"{stem.name}_drives"))
             self.drives = [measure(recording) for recording in self.read]
         rows = [
             {**drive.row, "smoothness": smoothness(recording, self.car_length, self.max_steering)}
@@ -120,26 +129,38 @@ class Table6(Result):
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
         return robot_page(rows, suffix, self.max_steering)
 
-    def _record(self, runs: Runs, folder: Path) -> list[Recording]:
+    def _record(self, runs: Sequence[Run], folder: Path) -> list[Recording]:
         robot = f"{self.car_length:g} m, {self.max_steering:g} degrees"
-        about = {"robots": f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"}
-        return record(self._drivers(runs), folder, self.repeats, about)
+        robots = f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"
+        recordings: list[Recording] = []
+        with tqdm(desc="drive", unit="step", leave=False, mininterval=0.5) as bar:
+            for name, notes, make_env_and_policy in self._drivers(runs):
+                bar.set_postfix_str(name)
+                paths = [folder / f"{name}_{robot}.mcap" for robot in range(self.repeats)]
+                recordings += record(make_env_and_policy, paths, {**notes, "robots": robots}, bar.update)
+        return recordings
 
-    def _drivers(self, runs: Runs) -> Iterator[Driver]:
-        """Yield the guide of the first run, and the agent of each run."""
+    def _drivers(self, runs: Sequence[Run]) -> Iterator[tuple[str, dict[str, str], Any]]:
+        """Yield name, notes and the maker of env and policy for the guide of the first run and for each agent."""
         make_env = partial(
             SimulatedRobotEnv, num_envs=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
             max_steering=self.max_steering, seed=self.seed,
         )  # fmt: skip
-        selected = [run for of_label in runs_by_label(self.labels, runs).values() for run in of_label]
-        first = read_config(selected[0].folder, "run", {"device": "cpu"})
-        guides = build_guides(first)
+        configs = [read_config(run.folder, "run", {"device": "cpu"}) for run in runs]
+        guides = build_guides(configs[0])
         for display_name, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
-            config = json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))
+            config = json.dumps(OmegaConf.to_container(configs[0].guide[name], resolve=True))
             about = {"policy": display_name, "guide": config}
-            yield Driver(display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide))
-        for run in selected:
-            yield agent_driver(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
+            yield display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide)
+        for run, own in zip(runs, configs, strict=True):
+            about = {"policy": str(own.label), "seed": str(own.seed), "run": run.folder.name}
+            if (weights := weights_file(run.folder)).is_file():  # a missing file is reported when the policy is loaded
+                about["policy_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            yield (
+                run.folder.name,
+                about,
+                partial(lambda run, own: load_policy_in_env(run, own, make_env()), run.folder, own),
+            )
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:

@@ -176,7 +176,7 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot") from None
     except (ValueError, TypeError) as error:
-        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-robot steps=[train]") from None
+        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-reproduce figure=25") from None
     if len(classifier.mean) != len(FEATURES):
         raise UserError(f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again")
     return classifier
