@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 import torch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded

@@ -1,9 +1,8 @@
 """Memory of guides by TorchRL's convention, carried from step to step by the env's data."""
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import unravel_key
 from torchrl.data import Composite
 from torchrl.envs import Compose
 from torchrl.modules.utils import get_primers_from_module

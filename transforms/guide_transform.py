@@ -6,8 +6,7 @@ from collections.abc import Callable
 from functools import cached_property
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform

@@ -4,8 +4,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal

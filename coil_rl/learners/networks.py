@@ -6,14 +6,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
 from torch.distributions import Independent

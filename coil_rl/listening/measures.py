@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import ExplorationType, set_exploration_type
 
 ADVICE = "guide_action"
 

@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 
 from coil_rl.listening.measures import drawn

@@ -17,7 +17,7 @@ from coil_rl.report import style
 from coil_rl.report.lines import animate_lines, draw_lines
 
 if TYPE_CHECKING:
-    from tensordict.utils import NestedKey
+    from tensordict import NestedKey
     from torchrl.envs import EnvBase
 
     from coil_rl.envs.track import Track

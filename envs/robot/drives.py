@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type, step_mdp
 
 from coil_rl.envs.limits import check_choice
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
