@@ -51,11 +51,7 @@ class ActionSpace:
 
     @classmethod
     def of_parent(cls, transform: Transform, action_key: NestedKey) -> ActionSpace:
-        """Return the action space of the env of a transform. Slow: `Transform.parent` rebuilds the env.
-
-        Raises:
-            RuntimeError: outside an env.
-        """
+        """Return the action space of the env of a transform, RuntimeError outside one; slow, it rebuilds the env."""
         if transform.parent is None:
             raise RuntimeError(
                 f"{type(transform).__name__} needs the action spec of an env: use it in a TransformedEnv"

@@ -329,8 +329,7 @@ class GuideActions(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the advice and the memory.
 
-        Raises:
-            ValueError: if another GuideActions has a guide of the same name with a memory, or rows are reset in part.
+        Two guides of one name with a memory, or one in an env that resets its agents one by one, are a `ValueError`.
         """
         observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
             self.parent.batch_size, len(self.guides.names)

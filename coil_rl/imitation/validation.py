@@ -68,8 +68,7 @@ def cross_validate(
 def group_splits(groups: Tensor) -> list[Split]:
     """Return at most ten splits of rows with group numbers [N]; each row is tested once, no group is on both sides.
 
-    Raises:
-        UserError: if there is only one group.
+    A single group is a `UserError`.
     """
     labels = groups.cpu().numpy()
     count = len(np.unique(labels))

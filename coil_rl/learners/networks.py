@@ -155,11 +155,7 @@ class ClippedNormal(SafeProbabilisticModule):
 
 
 def action_spec(env: EnvBase) -> TensorSpec:
-    """Return the spec of the action of an env.
-
-    Raises:
-        ValueError: if the env has several entries for actions, or none that a policy can choose.
-    """
+    """Return the spec of the action of an env; several actions, or one no policy can choose, are a `ValueError`."""
     if len(env.action_keys) != 1:
         names = ", ".join(map(str, env.action_keys))
         raise ValueError(f"this env has the actions {names}, but a policy chooses one; take another env")
@@ -258,10 +254,8 @@ def memory(
 ) -> list[TensorDictModuleBase]:
     """Return the modules of a policy that remember the entries of an episode; they write `remembered` [*batch, H].
 
-    `read` are the keys under which the modules read the entries `in_keys` of the env.
-
-    Raises:
-        ValueError: if the env does not carry the state.
+    `read` are the keys under which the modules read the entries `in_keys` of the env. An env that does not carry the
+    state is a `ValueError`.
     """
     carried = {key: spec.shape[len(env.batch_size) :] for key, spec in env.observation_spec.items(True, True)}
     if IS_INIT not in carried or carried.get(STATE) != (1, network.state):

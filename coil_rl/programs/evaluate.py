@@ -46,10 +46,8 @@ def evaluate(config: DictConfig) -> float:
 def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
     """Return the configuration of a run with the requested evaluation, and its policy.
 
-    Everything is as in the run but for what the command line gives.
-
-    Raises:
-        UserError: if the folder holds no complete run, or one without tracks although tracks are given.
+    Everything is as in the run but for what the command line gives. A folder without a complete run, or one without
+    tracks although tracks are given, is a `UserError`.
     """
     from coil_rl.errors import UserError
     from coil_rl.train.build import build_env

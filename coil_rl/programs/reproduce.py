@@ -70,11 +70,7 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 
 
 def requested(config: DictConfig) -> list[str]:
-    """Return the names in `results` of the requested results.
-
-    Raises:
-        UserError: if one does not exist, or none is requested.
-    """
+    """Return the names in `results` of the requested results, at least one; an unknown one is a `UserError`."""
     if config.all:
         return [str(name) for name in config.results]
     available = {_key(str(name)): str(name) for name in config.results}

@@ -163,8 +163,7 @@ class Comparison:
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     """Group the finished runs, at least one, by label; `actions` of the agents are "deterministic" or "sampled".
 
-    Raises:
-        UserError: if two runs have the same label and seed, or runs of one label differ in cases.
+    Two runs with the same label and seed, or with the same label and other cases, are a `UserError`.
     """
     finished = [run for run in runs if run.finished]
     names = dict.fromkeys(run.label for run in finished)

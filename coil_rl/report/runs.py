@@ -50,8 +50,7 @@ class Run:
 def read_runs(folders: Sequence[Path]) -> list[Run]:
     """Return all runs in some folders, at any depth, sorted by folder.
 
-    Raises:
-        UserError: if a folder is missing or holds no run, or a file of a run is damaged.
+    A folder that is missing or holds no run, and a damaged file of a run, are a `UserError`.
     """
     runs: dict[Path, Run] = {}
     for folder in folders:

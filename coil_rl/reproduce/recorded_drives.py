@@ -67,10 +67,8 @@ def record(
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     """Measure a recorded drive, except for its smoothness.
 
-    `method` is the driver's display name; by default the `policy` in the recording's notes, or the file name.
-
-    Raises:
-        RecordingError: if the recording's notes contain an invalid track.
+    `method` is the driver's display name; by default the `policy` in the recording's notes, or the file name. An
+    invalid track in the notes is a `RecordingError`.
     """
     notes = recording.notes.get(SIMULATED, {})
     poses, seconds = _timed_poses(recording)

@@ -118,12 +118,9 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
 
 
 def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
-    """Train on the scans of drives past left cones alone and past right cones alone.
+    """Train on the scans of drives past left cones alone and past right cones alone; errors as `train_classifier`.
 
     The k-th drives of both are held out together.
-
-    Raises:
-        UserError: as `train_classifier`.
     """
     pairs = min(len(left), len(right))
     if pairs < 2:

@@ -47,11 +47,7 @@ class Evaluation:
 
 
 def build_evaluation(config: DictConfig, record: Mapping[str, NestedKey] | None = None) -> Evaluation:
-    """Return the evaluation of a configuration, with entries to record by name.
-
-    Raises:
-        UserError: for cases that are neither a number nor names, or without one.
-    """
+    """Return the evaluation of a configuration, with entries to record by name; no cases are a `UserError`."""
     cases = config.evaluation.cases
     names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
     names = list(map(str, range(names))) if isinstance(names, int) else names

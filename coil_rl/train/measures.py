@@ -71,11 +71,7 @@ def _key(key: Any) -> str | tuple[str, ...]:
 
 
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
-    """Return measures by name from the key `evaluation.measures` of a configuration.
-
-    Raises:
-        UserError: for an invalid one.
-    """
+    """Return measures by name from the key `evaluation.measures` of a configuration; errors are `UserError`s."""
     measures = {}
     for name, node in nodes.items():
         try:

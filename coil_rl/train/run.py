@@ -40,8 +40,7 @@ from coil_rl.train.run_folder import begin, flat, holds, is_evaluated, locked, r
 def run(config: DictConfig, *, wait: bool = False) -> float:
     """Do a run, or resume it if `existing=resume`, and return the mean test reward of the deterministic agent.
 
-    Raises:
-        UserError: if the folder holds another run, or another process uses it and `wait` is not set.
+    A folder that holds another run, or that another process uses if `wait` is not set, is a `UserError`.
     """
     folder = Path(config.run_dir)
     with locked(folder, wait=wait):

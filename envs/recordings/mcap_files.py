@@ -96,11 +96,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
 
 
 def digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files.
-
-    Raises:
-        RecordingError: if there is no such recording.
-    """
+    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files."""
     sha256 = hashlib.sha256()
     for file in _files(Path(path)):
         _check_format(file)
@@ -122,11 +118,7 @@ class RecordingWriter:
         self._attachments: dict[str, tuple[str, bytes, tuple[int, int] | None]] = {}
 
     def add(self, topic: str, message_type: str, time: int, fields: Mapping[str, Any]) -> None:
-        """Add a message; the time in ns, the type and fields as in `messages.encode`.
-
-        Raises:
-            ValueError: for an unknown type or field.
-        """
+        """Add a message; the time in ns, type, fields and errors as in `messages.encode`."""
         channel = Channel(topic, message_type, definition=definition(message_type))
         self.copy(RawMessage(channel, time, time, encode(message_type, fields)))
 

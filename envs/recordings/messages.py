@@ -43,10 +43,8 @@ def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
 def decode(data: bytes, message_type: str, language: str = "ros2msg", text: bytes = b"") -> Any:
     """Return a message in CDR of either byte order, with its fields as attributes.
 
-    The definition stored with the message is used, or the standard one if that text cannot be parsed.
-
-    Raises:
-        SerdeError: if the bytes are not a message of this type.
+    The definition stored with the message is used, or the standard one if that text cannot be parsed. Bytes that are
+    not a message of this type are a `SerdeError`.
     """
     return _types_of(message_type, language, text).deserialize_cdr(data, message_type)
 

@@ -90,10 +90,8 @@ class Recording:
 
         It is the last command before the next scan: a controller needs time for a scan, and a program that sends
         commands at a higher rate repeats the old one meanwhile. The speed is the command's own, with which its turn
-        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s.
-
-        Raises:
-            ValueError: if the recording has no commands.
+        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s. A
+        recording without commands is a `ValueError`.
         """
         if self.commands is None:
             raise ValueError(f"{self.path} has no commands; check that commands is not None")
@@ -275,8 +273,7 @@ def _remarks_on_loss(contents: Contents, topic: str) -> list[str]:
 def _ignore_other_types(path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str) -> str | None:
     """Remove the messages of other types or encodings of a topic; return a remark on them, if there are any.
 
-    Raises:
-        RecordingError: if only such messages are on the topic of the scans.
+    Only such messages on the topic of the scans are a `RecordingError`.
     """
     channels = [channel for channel in contents.channels if channel.topic == topic]
     others = [channel for channel in channels if channel.message_type not in types or channel.encoding != "cdr"]

@@ -53,11 +53,7 @@ def track_notes(track: Track) -> dict[str, str]:
 
 
 def noted_track(notes: Mapping[str, str]) -> Track:
-    """Return the track of a metadata record; `left` and `right`, each [[x, y], ...] m, are required.
-
-    Raises:
-        TrackError: if the record is not valid.
-    """
+    """Return the track of a metadata record; without valid `left` and `right`, [[x, y], ...] m each, a `TrackError`."""
     try:
         left, right, start = (json.loads(notes.get(key, "null")) for key in ("left", "right", "start"))
         rings = [np.array(ring, dtype=np.float64).reshape(-1, 2) for ring in (left, right)]
