@@ -15,14 +15,12 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.limits import check_range
-from coil_rl.envs.track import AS_COMPLEX, Track, resample
+from coil_rl.envs.track import AS_COMPLEX, Array, Track, resample
 from coil_rl.listening.measures import drawn
 from coil_rl.report import draw_listening_map, write_csv
 
 if TYPE_CHECKING:
     from coil_rl.listening.survey import Survey
-
-Array = NDArray[np.float64]
 
 SECTIONS = ("straight", "left", "right", "entry", "exit")
 STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(SECTIONS))

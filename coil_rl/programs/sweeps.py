@@ -24,17 +24,11 @@ from coil_rl.train.run_folder import is_evaluated
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of an experiment.
+    """The runs of an experiment."""
 
-    Attributes:
-        experiment: name of its file.
-        command: arguments of `coil-train` for the whole sweep.
-        all_folders: of the runs.
-    """
-
-    experiment: str
-    command: tuple[str, ...]
-    all_folders: tuple[Path, ...]
+    experiment: str  # name of its file
+    command: tuple[str, ...]  # arguments of `coil-train` for the whole sweep
+    all_folders: tuple[Path, ...]  # of the runs
 
     @property
     def missing(self) -> list[Path]:

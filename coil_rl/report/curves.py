@@ -13,13 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
-from numpy.typing import NDArray
 
 from coil_rl.report import style
 from coil_rl.report.runs import CHOICE, RETURN, Run
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import Array, mean_interval
 
-Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, object]]
 
 RETURNS = "return from the cases of the evaluation"

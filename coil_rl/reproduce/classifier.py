@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
-from coil_rl.envs.robot.clusters import FEATURES
+from coil_rl.envs.robot.clusters import FEATURES, Array
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
@@ -27,8 +27,6 @@ from coil_rl.robot.classifier import (
     save_classifier,
     train_on_drives,
 )
-
-Array = NDArray[np.float64]
 
 PAPER_ACCURACY = Share(240, 243)
 DRAW_EVERY = 4  # scans

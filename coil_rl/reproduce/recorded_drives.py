@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
@@ -21,12 +20,11 @@ from torchrl.envs import EnvBase
 from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError, read_recording
 from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_line
 from coil_rl.envs.robot.drives import SPEED, record_drives, track_of
-from coil_rl.envs.track import Track
+from coil_rl.envs.track import Array, Track
 from coil_rl.replay.open_loop import recorded_steering
 from coil_rl.report import style
 from coil_rl.report.style import picture
 
-Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 MIDDLE_SPACING = 0.002  # m

@@ -16,16 +16,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
-from coil_rl.envs.robot.clusters import FEATURES, measure, points_of, single_linkage
+from coil_rl.envs.robot.clusters import FEATURES, Array, Integers, measure, points_of, single_linkage
 from coil_rl.envs.robot.drives import Sides, SimulatedDrive, simulated_drive
 from coil_rl.envs.robot.lidar import RANGE_MIN, SimulatedLidar
 from coil_rl.envs.robot.perception import ConeClassifier
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
 
 FOLDS = 5

@@ -7,14 +7,11 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.sight import Frame
-from coil_rl.envs.track import SIDES, Track, TrackError, resample
-
-Array = NDArray[np.float64]
+from coil_rl.envs.track import SIDES, Array, Track, TrackError, resample
 
 THIN, THICK = 0.020, 0.045  # m, radius of a cone on the left and on the right
 HALF_WIDTH = 0.18  # m, from the centre line to the middle of a cone
