@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import mean
 from typing import Any
 
-from coil_rl.report.comparison import Comparison
+from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
@@ -63,7 +63,7 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
         *_parts(comparison, TERM, "term of the reward", ".1f"),
         *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
     ]
-    return "\n\n".join([f"## {heading}", table, *parts, _cases(comparison)])
+    return "\n\n".join([f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")])
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
@@ -156,9 +156,17 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
     return [markdown_table(rows, columns)] if rows else []
 
 
-def _cases(comparison: Comparison) -> str:
-    names = list(dict.fromkeys(case for group in comparison.groups for case in group.cases))
+def cases_table(groups: Sequence[Group], file: str) -> str:
+    """Return the mean reward by driver and case, with the completed share below 1; a hint at a file for many cases."""
+    names = dict.fromkeys(case for group in groups for case in group.cases)
     if len(names) > MAX_CASES:
-        return f"The rewards in each of the {len(names)} cases are in report_cases.csv."
-    rows = [{"driver": group.title} | group.by_seed("reward").mean().to_dict() for group in comparison.groups]
+        return f"The rewards in each of the {len(names)} cases are in {file}."
+    rows = []
+    for group in groups:
+        row: dict[str, Any] = {"driver": group.title}
+        for index, case in enumerate(group.cases):
+            means = group.means(index)
+            reward, completed = means["reward"], means.get("completed", 1.0)
+            row[case] = f"{reward:.1f} ({completed:.0%} completed)" if completed < 1 else reward
+        rows.append(row)
     return markdown_table(rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names})

@@ -7,7 +7,7 @@ from typing import Any
 
 from coil_rl.report import draw_intervals, driver_intervals, markdown_table, write_csv
 from coil_rl.report.comparison import Comparison, Group, compare, paired
-from coil_rl.report.page import with_cells
+from coil_rl.report.page import cases_table, with_cells
 from coil_rl.report.runs import GUIDE, TERM, Run
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
@@ -23,7 +23,6 @@ PAPER_UNSEEN = {
     "coil": {"lap_time": 48.48, "smoothness": 0.606, "reward": 632.9},
 }
 MEASURE_COLUMNS = {"lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"), "reward": ("reward", ".1f")}
-MAX_TRACK_COLUMNS = 8
 
 # The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
 CLAIMS = (
@@ -54,7 +53,9 @@ class Table5(WorldsResult):
         parts, episodes, worlds = ["## Table 5: unseen tracks"], [], {}
         for world, experiments in self.worlds.items():
             of_world = [run for experiment in experiments for run in runs[experiment]]
-            episodes += [{"world": world} | row for run in of_world for row in _episodes(run)]
+            for run in of_world:
+                about = {"world": world, "label": run.label, "seed": run.seed}
+                episodes += [about | row for row in run.evaluation.to_dict("records")]
             compared = worlds[world] = {actions: self._compare(of_world, actions) for actions in ACTIONS}
             rows = {actions: self._rows(compared[actions]) for actions in ACTIONS}
             parts += pages.world_heading(world)
@@ -66,7 +67,7 @@ class Table5(WorldsResult):
             for actions in ACTIONS:
                 table = self._driver_table(rows[actions], compared[actions].score[0])
                 parts += [f"**{actions.capitalize()} actions**", table]
-                parts += [] if world else [_track_table(compared[actions].groups, stem.name)]
+                parts += [] if world else [cases_table(compared[actions].groups, f"{stem.name}.csv")]
         write_csv(episodes, stem.with_suffix(".csv"))
         notes = NOTES.strip().format(against=self.against)
         return "\n\n".join([*parts, notes, self._claims(worlds)])
@@ -146,22 +147,6 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
     return markdown_table(table, columns)
 
 
-def _track_table(groups: Sequence[Group], name: str) -> str:
-    """Return the mean reward by driver and track, with the completed share where it is below 1."""
-    tracks = groups[0].cases
-    if len(tracks) > MAX_TRACK_COLUMNS:
-        return f"The numbers of each of the {len(tracks)} tracks are in {name}.csv."
-    rows = []
-    for group in groups:
-        row = {"driver": group.name}
-        for index, track in enumerate(tracks):
-            means = group.means(index)
-            share = f" ({means['completed']:.0%} completed)" if means["completed"] < 1 else ""
-            row[track] = f"{means['reward']:.1f}{share}"
-        rows.append(row)
-    return markdown_table(rows, {"driver": ("mean reward", "")} | {track: (track, "") for track in tracks})
-
-
 def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> str | None:
     if driver not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
@@ -169,9 +154,3 @@ def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> 
     if measure == "reward" and relative:
         return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+.3f}"
     return f"{difference:+{MEASURE_COLUMNS[measure][1]}}"
-
-
-def _episodes(run: Run) -> list[dict[str, Any]]:
-    """Return the CSV rows of a run, one per driver and track."""
-    rows = run.evaluation.to_dict("records")
-    return [{"label": run.label, "seed": run.seed} | row for row in rows]
