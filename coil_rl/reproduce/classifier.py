@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -19,16 +18,16 @@ from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import NO_RUNS, Result, Runs
 from coil_rl.robot.classifier import (
     Scans,
-    Share,
     accuracy,
     clusters_in_range,
     label_clusters,
     recall,
     save_classifier,
+    share_of,
     train_on_drives,
 )
 
-PAPER_ACCURACY = Share(240, 243)
+PAPER_ACCURACY = share_of(240, 243)
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
@@ -101,7 +100,7 @@ class Figure25(Result):
         save_classifier(training.classifier, stem.with_name("cones.json"))
         classifier = training.classifier
         shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
-        shares["cross-validation"] = {"all": Share(training.correct, training.total)}
+        shares["cross-validation"] = {"all": share_of(training.correct, training.total)}
         if self.test_drives:
             labelled = label_clusters(self.test_drives)
             shares["accuracy"] = accuracy(classifier, labelled)
@@ -117,17 +116,11 @@ class Figure25(Result):
             features, thick, stem.with_suffix(".png"), wrong=classifier.classify(features) != thick,
             title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
         )  # fmt: skip
-        rows = [{"measure": name, **_row(of, share)} for name in shares for of, share in shares[name].items()]
+        rows = [{"measure": name, "of": of, **share._asdict()} for name in shares for of, share in shares[name].items()]
         write_csv(rows, stem.with_suffix(".csv"))
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
         notes = NOTES.strip().format(folds=folds, kind=kind)
         return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
-
-
-def _row(of: str, share: Share) -> dict[str, Any]:
-    low, high = share.interval
-    wrong = share.total - share.correct
-    return {"of": of, "share": share.share, "low": low, "high": high, "wrong": wrong, "total": share.total}
 
 
 def _scans(recordings: Sequence[Recording]) -> list[Scans]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,25 +60,22 @@ class LabelledClusters:
     visibility: Array  # share of the cone's beams that no nearer cone blocks
 
 
-@dataclass(frozen=True)
-class Share:
-    """A share, with a 95 % interval (Wilson) that assumes independent clusters."""
+class Share(NamedTuple):
+    """A share of clusters, with a 95 % interval (Wilson) that assumes independent ones; NaN without any cluster."""
 
-    correct: int
+    share: float
+    low: float
+    high: float
+    wrong: int
     total: int
 
-    @property
-    def share(self) -> float:
-        """Correct over total, NaN without any."""
-        return self.correct / self.total if self.total else float("nan")
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Lower and upper end of the interval."""
-        if not self.total:
-            return float("nan"), float("nan")
-        low, high = binomtest(self.correct, self.total).proportion_ci(method="wilson")
-        return float(low), float(high)
+def share_of(correct: int, total: int) -> Share:
+    """Return the share that was classified correctly."""
+    if not total:
+        return Share(np.nan, np.nan, np.nan, 0, 0)
+    low, high = binomtest(correct, total).proportion_ci(method="wilson")
+    return Share(correct / total, float(low), float(high), total - correct, total)
 
 
 def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS) -> Training:
@@ -246,9 +244,9 @@ def majority(label: Integers, cone: Integers, cones: int) -> Integers:
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
-    shares = {"all": Share(int(correct.sum()), len(correct))}
+    shares = {"all": share_of(int(correct.sum()), len(correct))}
     for name, value, bins in (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS)):
         for low, high in pairwise(bins):
             rows = (value > low) & (value <= high)
-            shares[f"{low:g}-{high:g} {name}"] = Share(int(correct[rows].sum()), int(rows.sum()))
+            shares[f"{low:g}-{high:g} {name}"] = share_of(int(correct[rows].sum()), int(rows.sum()))
     return shares
