@@ -1,5 +1,6 @@
 """`coil-distill`: train a network that imitates each guide, and print how well it does."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,10 +63,7 @@ def check(config: DictConfig) -> None:
     make_folder(Path(config.proxy.folder))
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(distill, "distill", check)
-
+main = partial(app.run, distill, "distill", check)
 
 if __name__ == "__main__":
     main()

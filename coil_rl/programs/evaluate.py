@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -90,10 +91,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(evaluate, "evaluate", check)
-
+main = partial(app.run, evaluate, "evaluate", check)
 
 if __name__ == "__main__":
     main()

@@ -1,5 +1,6 @@
 """`coil-listen`: how much a trained agent uses the advice of each guide, and where."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -100,10 +101,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(listen, "listen", check)
-
+main = partial(app.run, listen, "listen", check)
 
 if __name__ == "__main__":
     main()

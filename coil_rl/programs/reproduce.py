@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -118,10 +119,7 @@ def _key(name: str) -> str:
     return f"{kind}={rest}" if kind in KINDS and rest else f"claim={name}"
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(reproduce, "reproduce", check)
-
+main = partial(app.run, reproduce, "reproduce", check)
 
 if __name__ == "__main__":
     main()
