@@ -7,13 +7,14 @@ steps and write `agent_acts` [*batch, 1] with the observation; on-policy learner
 loss, learners with replay learn from the executed action where the agent could have chosen it.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
 
@@ -53,10 +54,16 @@ class CombinedAction(GuideTransform):
                 f"{type(self).__name__} needs continuous actions, but this env has {self.action_space.size} discrete "
                 "ones; use Takeover, which replaces the agent's action in some steps"
             )
-        observation_spec = super().transform_observation_spec(observation_spec)
+        return super().transform_observation_spec(observation_spec).update(self._specs())
+
+    def _specs(self) -> dict[str, TensorSpec]:
+        """Return the specs of what it writes."""
         spec = self.action_space.spec  # not its own spec, as 0 need not be an action
-        observation_spec[EXECUTED] = Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)
-        return observation_spec
+        return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
+
+    def _spec_of_rows(self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype) -> TensorSpec:
+        """Return the spec of one number a row, [*batch, 1]."""
+        return kind(*bounds, shape=(*self.parent.batch_size, 1), device=self.parent.device, dtype=dtype)
 
 
 class ResidualAction(CombinedAction):
@@ -158,12 +165,9 @@ class AdaptiveMixedAction(CombinedAction):
         weight = self.advice(tensordict_reset).new_full((*tensordict_reset.batch_size, 1), self.low)
         return super()._reset(tensordict, tensordict_reset).set("agent_weight", weight)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action` and `agent_weight`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        shape, dtype = (*self.parent.batch_size, 1), self.action_space.dtype
-        observation_spec["agent_weight"] = Bounded(self.low, self.high, shape, device=self.parent.device, dtype=dtype)
-        return observation_spec
+    def _specs(self) -> dict[str, TensorSpec]:
+        weight = self._spec_of_rows(Bounded, self.low, self.high, dtype=self.action_space.dtype)
+        return super()._specs() | {"agent_weight": weight}
 
 
 class _ActionSwitch(CombinedAction):
@@ -204,12 +208,8 @@ class _ActionSwitch(CombinedAction):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return super()._reset(tensordict, tensordict_reset).set("agent_acts", self._agent_acts(tensordict_reset))
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action` and `agent_acts`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        observation_spec["agent_acts"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
-        return observation_spec
+    def _specs(self) -> dict[str, TensorSpec]:
+        return super()._specs() | {"agent_acts": self._spec_of_rows(Binary, 1, dtype=torch.bool)}
 
 
 class Takeover(_ActionSwitch):
@@ -291,8 +291,5 @@ class JumpStart(_ActionSwitch):
         next_tensordict.set("guide_steps", (tensordict["guide_steps"] - 1).clamp(0))
         return super()._step(tensordict, next_tensordict)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action`, `agent_acts` and `guide_steps`."""
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        observation_spec["guide_steps"] = Unbounded(shape, device=device, dtype=torch.int64)
-        return super().transform_observation_spec(observation_spec)
+    def _specs(self) -> dict[str, TensorSpec]:
+        return super()._specs() | {"guide_steps": self._spec_of_rows(Unbounded, dtype=torch.int64)}

@@ -94,8 +94,8 @@ class Guides(TensorDictModuleBase):
         rows = []
         for name, guide in self.guides.items():
             data = tensordict.select(*self._in_keys_of[name], strict=False)
-            if name in self._input_dtype:
-                data = data.apply(self._cast(name))
+            if dtype := self._input_dtype.get(name):
+                data = data.apply(lambda value, to=dtype: value.to(to) if value.is_floating_point() else value)
             if memory is not None and name in self.memories:
                 data = guide(data.update(memory[name]))
                 memory.set(name, data["next"].select(*self.memories[name].specs))
@@ -112,10 +112,6 @@ class Guides(TensorDictModuleBase):
             read = tensordict.select(*self._in_keys_of[name], strict=False).values(True, True)
             if len(dtypes) == 1 and any(value.is_floating_point() and value.dtype not in dtypes for value in read):
                 self._input_dtype[name] = dtypes.pop()
-
-    def _cast(self, name: str) -> Callable[[Tensor], Tensor]:
-        dtype = self._input_dtype[name]
-        return lambda value: value.to(dtype) if value.is_floating_point() else value
 
 
 class GuideCache:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -63,29 +64,27 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
     return section
 
 
+@dataclass(eq=False)
 class TrackSections:
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
     The env writes `info` with the index of the `track` and the `pose` of each car, as `ConeTrackEnv` does.
-
-    Args:
-        tracks: of the env, in its order.
-        turn_radius: as for `classify`, in m.
-        approach: as for `classify`, in m.
-        bin: m of track per value of the maps, rounded so that their number on a track is whole.
     """
 
-    names = SECTIONS
+    names: ClassVar[tuple[str, ...]] = SECTIONS
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
+    tracks: Sequence[Track]  # of the env, in its order
+    _: KW_ONLY
+    turn_radius: float = 10.0  # as for `classify`, m, as the next one
+    approach: float = 4.0
+    bin: float = 1.0  # m of track per value of the maps, rounded so that their number on a track is whole
 
-    def __init__(
-        self, tracks: Sequence[Track], *, turn_radius: float = 10.0, approach: float = 4.0, bin: float = 1.0
-    ) -> None:
-        check_range(0.5, 1000, turn_radius=turn_radius)
-        check_range(0.1, 100, approach=approach, bin=bin)
-        self.tracks, self.bin = list(tracks), bin
-        self.lines = [smooth_line(track) for track in tracks]  # [P, 2] m each
-        self.sections = [classify(line, turn_radius, approach) for line in self.lines]  # [P] each, indices in SECTIONS
+    def __post_init__(self) -> None:
+        check_range(0.5, 1000, turn_radius=self.turn_radius)
+        check_range(0.1, 100, approach=self.approach, bin=self.bin)
+        self.lines = [smooth_line(track) for track in self.tracks]  # [P, 2] m each
+        # Indices in SECTIONS, [P] each.
+        self.sections = [classify(line, self.turn_radius, self.approach) for line in self.lines]
         points = [torch.as_tensor(line, dtype=torch.float32) for line in self.lines]
         self._points = pad_sequence(points, batch_first=True, padding_value=1e6)  # padded with points far away
         self._section = pad_sequence([torch.as_tensor(of_line) for of_line in self.sections], batch_first=True)

@@ -1,6 +1,7 @@
 """Figure 25 of the paper: features of thin and thick cones, and the accuracy of their classifier."""
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -43,59 +44,49 @@ wrong. Recall: cones within 1 m and hit by a beam, detected and classified corre
 independent clusters; those of neighbouring scans are correlated. The picture shows clusters of {kind} drives."""
 
 
+@dataclass(eq=False)
 class Figure25(Result):
     """Cone classifier, trained on recordings past cones of one side and tested on recordings past both sides.
 
     The classifier is saved as `cones.json` next to the picture. Without recordings, drives are simulated.
-
-    Args:
-        left: recordings past thin cones only, on the left; at least two.
-        right: recordings past thick cones only.
-        both: recordings past both sides with the cones' positions in their notes, for testing; without any, there is
-            only the cross-validation.
-        pairs: number of left and of right drives to simulate.
-        tests: number of drives past both sides to simulate.
-        scan: topic of the LiDAR.
-        odometry: topic of the odometry.
 
     Raises:
         ValueError: for numbers out of range, or recordings of one side only.
         RecordingError: for an unusable recording.
     """
 
-    def __init__(
-        self,
-        left: Sequence[str] = (),
-        right: Sequence[str] = (),
-        both: Sequence[str] = (),
-        *,
-        pairs: int = 5,
-        tests: int = 3,
-        scan: str = "/scan",
-        odometry: str | None = "/odom",
-    ) -> None:
-        if pairs < 2 or tests < 1:
-            raise ValueError(f"pairs={pairs} must be at least 2 and tests={tests} at least 1")
-        if bool(left) != bool(right) or (both and not left):
-            raise ValueError(f"left={list(left)} and right={list(right)} must both be given, or neither and no both")
-        self.pairs, self.tests, self.scan, self.odometry = pairs, tests, scan, odometry
-        self._read(left, right, both)
+    left: Sequence[str] = ()  # recordings past thin cones only, on the left; at least two
+    right: Sequence[str] = ()  # recordings past thick cones only
+    # Recordings past both sides with the cones' positions in their notes, for testing; without any, there is only the
+    # cross-validation.
+    both: Sequence[str] = ()
+    _: KW_ONLY
+    pairs: int = 5  # left and right drives to simulate
+    tests: int = 3  # drives past both sides to simulate
+    scan: str = "/scan"  # topic of the LiDAR
+    odometry: str | None = "/odom"  # topic of the odometry
 
-    def _read(self, left: Sequence[str], right: Sequence[str], both: Sequence[str]) -> None:
-        self.left, self.right, self.both = (
-            [read_recording(path, self.scan, self.odometry, None) for path in paths] for paths in (left, right, both)
-        )
-        self.test_drives = [labelled_drive(recording) for recording in self.both]
+    def __post_init__(self) -> None:
+        if self.pairs < 2 or self.tests < 1:
+            raise ValueError(f"pairs={self.pairs} must be at least 2 and tests={self.tests} at least 1")
+        if bool(self.left) != bool(self.right) or (self.both and not self.left):
+            given = f"left={list(self.left)} and right={list(self.right)}"
+            raise ValueError(f"{given} must both be given, or neither and no both")
+        self._read([self.left, self.right, self.both])
+
+    def _read(self, sides: Sequence[Sequence[str]]) -> None:
+        self.recordings = [[read_recording(path, self.scan, self.odometry, None) for path in side] for side in sides]
+        self.test_drives = [labelled_drive(recording) for recording in self.recordings[2]]
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         if not self.left:
             with tqdm(total=2 * self.pairs + self.tests, desc="record", unit="drive", leave=False) as bar:
                 made = record_labelling_drives(stem.with_name("labelling"), self.pairs, self.tests, bar.update)
-            self._read(made["left"], made["right"], made["both"])
-        simulated = any("simulated" in recording.notes for recording in (*self.left, *self.right, *self.both))
+            self._read([made["left"], made["right"], made["both"]])
+        simulated = any(recording.simulated for side in self.recordings for recording in side)
         suffix = " (simulated)" if simulated else ""
-        left, right = _scans(self.left), _scans(self.right)
+        left, right = map(_scans, self.recordings[:2])
         training = train_on_drives(left, right)
         save_classifier(training.classifier, stem.with_name("cones.json"))
         classifier = training.classifier

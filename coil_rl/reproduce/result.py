@@ -28,17 +28,12 @@ class Result(ABC):
 class WorldsResult(Result):
     """A result about runs in the main world and in variants of it.
 
-    Args:
-        experiments: experiments in the main world.
-        worlds: experiment by the name of each variant.
-        against: label of the runs to compare the others with.
+    `experiments` are in the main world, and `worlds` has an experiment by the name of each variant. The other runs are
+    compared with those of the label `against`.
     """
 
     def __init__(
-        self,
-        experiments: Sequence[str],
-        worlds: Mapping[str, str] | None = None,
-        against: str = "ppo",
+        self, experiments: Sequence[str], worlds: Mapping[str, str] | None = None, against: str = "ppo"
     ) -> None:
         # The main world has no name.
         self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}

@@ -98,9 +98,12 @@ def evaluate_run(
 
     for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
         add(result, driver)
+    # The kinds of advice, each with the number of sampled episodes a case.
+    plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)] if agent is not None else []
+    plan += [(advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms]
     torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
-        for advice, repeats in [] if agent is None else _plan(config, agent):
+        for advice, repeats in plan:
             bar.set_postfix_str(", ".join(filter(None, (config.label, advice))))
             # Deterministic and sampling rows in one batch: the time of a step hardly depends on its size.
             rows = torch.arange((1 + repeats) * count, device=config.device)
@@ -150,14 +153,6 @@ def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) 
     update()
     for picture in pictures:
         picture.watch(env)
-
-
-def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, int]]:
-    """Return the kinds of advice, each with the number of sampled episodes a case."""
-    plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)]
-    if config.method.transforms:
-        plan += [(advice, 0) for advice in config.evaluation.advice]
-    return plan
 
 
 def report_outcome(folder: Path) -> float:

@@ -228,7 +228,10 @@ def _records(
                 contents.cut_off = True
                 return
             summary = _summary(stream)
-            places = _places(summary)
+            # Places of all chunks, metadata records and attachments.
+            places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+            places += [metadata.offset for metadata in summary.metadata_indexes]
+            places += [attachment.offset for attachment in summary.attachment_indexes]
             following = [place for place in places if place > start] + ([end] if record else [])
             # A wrong checksum of the whole file does not tell where the damage is.
             whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
@@ -255,13 +258,6 @@ def _summary(stream: BinaryIO) -> Summary:
         return SeekingReader(stream).get_summary() or Summary()
     except Exception:  # its bytes may be anything
         return Summary()
-
-
-def _places(summary: Summary) -> list[int]:
-    """Return the places of all chunks, metadata records and attachments in a file."""
-    places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
-    places += [metadata.offset for metadata in summary.metadata_indexes]
-    return places + [attachment.offset for attachment in summary.attachment_indexes]
 
 
 def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:
