@@ -111,7 +111,8 @@ class AdaptiveMixedAction(CombinedAction):
 
     The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low` in the first step of
     an episode, then a linear function of `("next", "uncertainty")` [*batch, 1], which the policy wrote in the step
-    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none.
+    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none. Weights that are not in
+    order within [0, 1], or uncertainties not in order, are a `ValueError`.
 
     Args:
         low: smallest weight of the agent.
@@ -123,9 +124,6 @@ class AdaptiveMixedAction(CombinedAction):
         warm_up_high: see `warm_up`.
         seed: of the draws.
         options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
-
-    Raises:
-        ValueError: if the weights are not in order within [0, 1], or the uncertainties not in order.
     """
 
     written = (EXECUTED, "agent_weight")

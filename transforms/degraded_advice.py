@@ -193,15 +193,12 @@ class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
     At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
-    advice of another row.
+    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`.
 
     Args:
         seed: seed of the draws.
         key: entry of the advice.
         memory_key: entry for the original advice, [*batch, 1, n_guides, A].
-
-    Raises:
-        ValueError: for a batch of one row, when the env builds its specs.
     """
 
     def __init__(

@@ -13,12 +13,8 @@ SUPPLIED = ("is_init", "row", "last_action")  # what a guide may read besides th
 class GuideMemory:
     """What a guide reads as `k` and writes as `("next", k)`, declared by its `make_tensordict_primer()`.
 
-    Args:
-        name: of the guide, for messages.
-        guide: without a declaration it has no memory.
-
-    Raises:
-        ValueError: for an entry that is not declared, or one without a fixed value at the start of an episode.
+    The `name` of the guide is for messages; a guide without a declaration has no memory. An entry that is not declared,
+    or one without a fixed value at the start of an episode, is a `ValueError`.
     """
 
     def __init__(self, name: str, guide: TensorDictModuleBase) -> None:

@@ -20,11 +20,9 @@ class RewardCoupling(GuideTransform):
 
     Args:
         beta: weight of the distance, a number or a schedule over the run.
-        norm: norm of the distance. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
+        norm: of the distance; another is a `ValueError`. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the
+            root of 2.
         options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
-
-    Raises:
-        ValueError: for an unknown norm.
 
     Example:
         >>> from torchrl.envs import TransformedEnv

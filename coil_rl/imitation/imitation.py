@@ -114,10 +114,7 @@ class Imitation:
         Returns:
             The number of `samples`; `target_variance`, the mean squared error of predicting the mean; `mse_ahead` and
             `r2_ahead`, on this batch before the fit; `mse_training` and `r2_training`, on the data set after the fit;
-            with `validate`, the metrics of `cross_validate`.
-
-        Raises:
-            UserError: if there are too few samples or tracks to validate.
+            with `validate`, the metrics (and errors) of `cross_validate`.
         """
         pairs = self._pairs(batch)
         dataset: TensorDictBase = pairs if self.dataset is None else torch.cat([self.dataset, pairs])

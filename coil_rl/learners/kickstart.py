@@ -22,7 +22,9 @@ EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fracti
 
 
 class KickstartLoss:
-    """Auxiliary loss of a policy: its distance from the action g of a guide.
+    """Auxiliary loss of a policy: its distance from the action g of a guide. The metric is `loss_NAME`.
+
+    An unknown kind, or a scale that is not positive, is a `ValueError`.
 
     Args:
         coefficient: of the loss, a number or a schedule.
@@ -31,12 +33,6 @@ class KickstartLoss:
         scale: standard deviation of the guide for the divergence, before squashing.
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].
-
-    Attributes:
-        name: the metric is `loss_NAME`.
-
-    Raises:
-        ValueError: for an unknown kind, or a scale that is not positive.
     """
 
     name = "guide"

@@ -16,7 +16,7 @@ from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.envs.robot.clusters import FEATURES, Array
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.robot.classifier import (
     Scans,
     accuracy,
@@ -28,7 +28,7 @@ from coil_rl.robot.classifier import (
     train_on_drives,
 )
 
-PAPER_ACCURACY = share_of(240, 243)
+PAPER_ACCURACY = share_of(*PAGES["figure_25"]["paper"])
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
@@ -36,12 +36,6 @@ COLUMNS = {
     "measure": ("measure", ""), "of": ("of", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"),
     "high": ("to", ".4f"), "wrong": ("wrong", "d"), "total": ("total", "d"),
 }  # fmt: skip
-
-NOTES = """
-Shares of clusters within 1 m. Cross-validation leaves out pairs of drives ({folds}) and only tells thin cones from
-thick ones. Accuracy: on drives past both sides, not used in training; a cone classified as another object counts as
-wrong. Recall: cones within 1 m and hit by a beam, detected and classified correctly. The intervals (Wilson) assume
-independent clusters; those of neighbouring scans are correlated. The picture shows clusters of {kind} drives."""
 
 
 @dataclass(eq=False)
@@ -110,7 +104,7 @@ class Figure25(Result):
         rows = [{"measure": name, "of": of, **share._asdict()} for name in shares for of, share in shares[name].items()]
         write_csv(rows, stem.with_suffix(".csv"))
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
-        notes = NOTES.strip().format(folds=folds, kind=kind)
+        notes = PAGES["figure_25"]["notes"].format(folds=folds, kind=kind)
         return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
 
 

@@ -2,14 +2,20 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
+
+import yaml
 
 from coil_rl.errors import UserError
 from coil_rl.report.runs import Run
 
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
+# By result: the paper's numbers and claims, and notes on the tables.
+PAGES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "result_pages.yaml").read_text("utf-8"))
 
 
 class Result(ABC):

@@ -21,18 +21,13 @@ from coil_rl.report.runs import Run, read_runs
 from coil_rl.report.statistics import count_of_seeds, estimate
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, record, smoothness
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, runs_by_label
 from coil_rl.train.build import build_guides
 from coil_rl.train.evaluate_run import driver_names
 from coil_rl.train.load import load_policy_in_env, weights_file
 from coil_rl.train.run_folder import read_config
 
-PAPER_ROBOT: dict[str, dict[str, Any]] = {
-    "guide": {"smoothness": 0.265, "lap_time": 43.67, "remark": "sways, stays central"},
-    "oil": {"smoothness": 0.104, "lap_time": 43.32, "remark": "smoother, less central"},
-    "ppo": {"smoothness": 0.102, "lap_time": 40.14, "remark": "nearer the boundary"},
-    "coil": {"smoothness": 0.082, "lap_time": 39.53, "remark": "cuts corners most"},
-}
+PAPER_ROBOT = PAGES["table_6"]["paper"]
 TABLE_6 = {
     "method": ("method", ""), "seeds": ("seeds", "d"), "drives": ("drives", "d"), "laps": ("laps", "d"),
     "crashes": ("crashes", "d"), "smoothness": ("smoothness", ".3f"), "paper smoothness": ("paper", ".3f"),
@@ -43,28 +38,6 @@ TABLE_7 = {
     "clearance": ("smallest clearance (m)", ".3f"), "corner_cut": ("path / centre line", ".3f"),
     "paper remark": ("paper", ""),
 }  # fmt: skip
-# The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
-CLAIMS = (
-    ("PPO steers more smoothly than the guide", "smoothness", "ppo", "guide", -1),
-    ("COIL steers more smoothly than its guide", "smoothness", "coil", "guide", -1),
-    ("COIL steers more smoothly than PPO", "smoothness", "coil", "ppo", -1),
-    ("PPO's laps take less time than the guide's", "lap_time", "ppo", "guide", -1),
-    ("COIL's laps take less time than PPO's", "lap_time", "coil", "ppo", -1),
-    ("OIL steers more smoothly than the guide", "smoothness", "oil", "guide", -1),
-    ("OIL is less central than the guide", "off_centre", "oil", "guide", 1),
-    ("PPO drives nearer to the boundary than the guide", "clearance", "ppo", "guide", -1),
-    ("COIL cuts corners more than PPO", "corner_cut", "coil", "ppo", -1),
-)
-NOTES = """
-smoothness: mean of |a - weighted mean of the last 20 actions|, a the commanded steering as a fraction of
-{max_steering:g} degrees. laps: from the start back to the start, by odometry, and their mean time. crashes and the
-measures of Table 7 need the cones' positions, the `track` of a recording: the robot crashed if its outline touched a
-cone or its centre crossed the line between two. The paper's robot drove on another track, so its lap times compare only
-with each other. Each drive is a row of the CSV."""
-CLAIM_NOTES = """
-Differences are of the same seed, each the mean over its drives (the minimum of the clearance); seeds: how many of them,
-as drivers without a complete lap are compared by clearance only. Intervals: t over seeds, of seeds with a crash
-Clopper-Pearson; a single seed has none and decides nothing."""
 
 
 @dataclass(eq=False)
@@ -176,9 +149,9 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
         table.append(line | {f"paper {key}": value for key, value in paper.items()})
     parts = [f"## Table 6: the robot{suffix}", markdown_table(table, TABLE_6)]
     parts += [f"### Table 7, measured{suffix}", markdown_table(table, TABLE_7)]
-    notes = NOTES.format(max_steering=max_steering).strip()
+    notes = PAGES["table_6"]["notes"].format(max_steering=max_steering)
     of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
-    verdicts = [_claim(of_seeds, *claim) for claim in CLAIMS]
+    verdicts = [_claim(of_seeds, *claim) for claim in PAGES["table_6"]["claims"]]
     claims = [claim for claim in verdicts if claim is not None]
     if not claims:
         return "\n\n".join([*parts, notes])
@@ -187,7 +160,7 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
     claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
     section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
-    return "\n\n".join([*parts, notes + CLAIM_NOTES, section])
+    return "\n\n".join([*parts, f"{notes}\n{PAGES['table_6']['claim_notes']}", section])
 
 
 def _claim(

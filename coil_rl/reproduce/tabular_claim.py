@@ -22,7 +22,7 @@ from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.tabular import (
     MDP,
     garnet,
@@ -41,12 +41,6 @@ ROUNDING = 1e-9  # scores of equal policies differ by less
 LOWEST_SCORE = -0.2  # in the picture
 LINE_OFFSET = 1.6  # points between coinciding lines
 PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": style.SECOND_ROUND}
-
-NOTES = """
-Scores: 0 for the random policy, 1 for the optimal policy of each world; means over {worlds} random worlds, one seed
-each, after the last step. ≥ guide: the share of worlds in which the greedy policy's value is at least the guide's,
-exactly, with the 95 % (Wilson) interval of the last share. The paper: at least as good as the guide, guaranteed, which
-would be 100 %. Plain: Q-learning without advice."""
 
 
 @dataclass(eq=False)
@@ -98,8 +92,8 @@ class TabularCoil(Result):
         ours = pages.certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
         claims = [{"claim": "COIL ends at least as good as its guide, guaranteed", "ours": ours}]
         section = pages.claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
-        notes = NOTES.format(worlds=self.worlds)
-        return f"## COIL at least as good as its guide\n\n{table}\n{notes}\n\n{section}"
+        notes = PAGES["tabular_coil"]["notes"].format(worlds=self.worlds)
+        return f"## COIL at least as good as its guide\n\n{table}\n\n{notes}\n\n{section}"
 
     def _world(self, seed: int) -> Iterator[dict[str, Any]]:
         """Yield the scores in one world, a row for each view, guide and number of steps."""

@@ -10,39 +10,13 @@ from coil_rl.report.comparison import Comparison, Group, compare, paired
 from coil_rl.report.page import cases_table, with_cells
 from coil_rl.report.runs import GUIDE, TERM, Run
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult
 
 Row = Mapping[str, Any]
 
 ACTIONS = ("sampled", "deterministic")
-# Means over three unseen tracks, lap time in s; no driver crashed.
-PAPER_UNSEEN = {
-    "guide": {"lap_time": 48.81, "smoothness": 0.121, "reward": 609.4},
-    "oil": {"lap_time": 48.82, "smoothness": 0.061, "reward": 620.8},
-    "ppo": {"lap_time": 48.58, "smoothness": 0.557, "reward": 614.5},
-    "coil": {"lap_time": 48.48, "smoothness": 0.606, "reward": 632.9},
-}
+PAPER_UNSEEN = PAGES["table_5"]["paper"]
 MEASURE_COLUMNS = {"lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"), "reward": ("reward", ".1f")}
-
-# The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
-CLAIMS = (
-    ("COIL earns more than its guide", "reward", "coil", "guide", 1),
-    ("COIL earns more than PPO", "reward", "coil", "ppo", 1),
-    ("COIL earns more than imitation (OIL)", "reward", "coil", "oil", 1),
-    ("PPO earns more than the guide", "reward", "ppo", "guide", 1),
-    ("COIL's laps take less time than PPO's", "lap_time", "coil", "ppo", -1),
-    ("COIL steers less smoothly than its guide", "smoothness", "coil", "guide", 1),
-    ("COIL earns more with its guide's advice than with another car's", "reward", "coil", "coil_shuffled", 1),
-)
-
-NOTES = """
-Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. Reward /
-guide's: each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean
-over the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks
-of different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
-seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track: they
-also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions, as
-imitations and the guide, are in both tables."""
 
 
 class Table5(WorldsResult):
@@ -69,7 +43,7 @@ class Table5(WorldsResult):
                 parts += [f"**{actions.capitalize()} actions**", table]
                 parts += [] if world else [cases_table(compared[actions].groups, f"{stem.name}.csv")]
         write_csv(episodes, stem.with_suffix(".csv"))
-        notes = NOTES.strip().format(against=self.against)
+        notes = PAGES["table_5"]["notes"].format(against=self.against)
         return "\n\n".join([*parts, notes, self._claims(worlds)])
 
     def _compare(self, runs: Sequence[Run], actions: str) -> Comparison:
@@ -105,7 +79,7 @@ class Table5(WorldsResult):
         """Return the verdicts in all worlds; in variants of the main world only those on the reward."""
         rows: list[dict[str, Any]] = []
         for world, by_actions in worlds.items():
-            for claim, measure, driver, other, sign in CLAIMS:
+            for claim, measure, driver, other, sign in PAGES["table_5"]["claims"]:
                 cells = {}
                 for actions, comparison in by_actions.items():
                     by_name = {group.name: group for group in comparison.groups}

@@ -82,16 +82,13 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001) with a small share of
-    exceptions tells cones from other objects.
+    exceptions tells cones from other objects. Fewer groups than folds, or only one kind of cone, are a `UserError`.
 
     Args:
         features: [N, 3] m, width, depth and girth of each cluster.
         thick: [N] whether the cone is thick.
         drives: [N] group of each cluster; a group is held out as a whole and should have both kinds of cone.
         folds: number of folds.
-
-    Raises:
-        UserError: if there are fewer groups than folds, or only one kind of cone.
     """
     groups = len(np.unique(drives))
     if groups < max(2, folds):

@@ -20,14 +20,13 @@ from coil_rl.transforms.action_space import nested_key
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
     """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
 
+    A target that does not exist, refuses an argument, or returns another type is a `UserError`.
+
     Args:
         node: with a `_target_`.
         name: key of the node, for the message.
         expected: type of the result.
         arguments: added by the program.
-
-    Raises:
-        UserError: if the target does not exist, refuses an argument, or returns another type.
     """
     node = check_node(node, name, arguments)
     try:

@@ -77,14 +77,12 @@ class Contents:
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
     """Read a recording from start to end, with its checksums verified.
 
-    One that ends early is read as far as it goes, and damaged chunks are skipped.
+    One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of file, or damage
+    outside of the chunks, is a `RecordingError`.
 
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
         topics: topics to read; None for all. A missing one has no messages.
-
-    Raises:
-        RecordingError: if this is not a recording, or one with damage outside of its chunks.
     """
     contents = Contents({topic: [] for topic in topics or ()})
     for file in _files(Path(path)):

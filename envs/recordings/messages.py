@@ -28,14 +28,11 @@ def definition(message_type: str) -> bytes:
 
 
 def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
-    """Return a message as little-endian CDR.
+    """Return a message as little-endian CDR; an unknown type or field is a `ValueError`.
 
     Args:
         message_type: such as "geometry_msgs/msg/Twist".
         fields: number, text, sequence or nested mapping by field; a missing one is zero or empty.
-
-    Raises:
-        ValueError: for an unknown type or field.
     """
     return bytes(ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True))
 

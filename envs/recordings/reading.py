@@ -120,7 +120,8 @@ def read_recording(
 ) -> Recording:
     """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
 
-    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners.
+    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners. What
+    cannot be read is a `RecordingError`, in one sentence with its remedy.
 
     Args:
         path: of the file or folder.
@@ -129,9 +130,6 @@ def read_recording(
         command: likewise, for the commands, Twist or TwistStamped.
         frame: of the scanner, if several send scans on one topic; None for the first one.
         strict: raise for a recording that is cut off or damaged, instead of a warning with the number of scans.
-
-    Raises:
-        RecordingError: in one sentence, the problem and its remedy.
 
     Example:
         >>> import tempfile
