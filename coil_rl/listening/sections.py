@@ -1,4 +1,4 @@
-"""Sections of a track: straight, left turn, right turn, turn entry and turn exit; and maps of advice."""
+"""Where the states of a survey are: in sections of a track (straight, turns, entry, exit), or along the steps."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
+from matplotlib.artist import Artist
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 from tensordict import NestedKey, TensorDictBase
@@ -18,7 +20,7 @@ from torch.nn.utils.rnn import pad_sequence
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.track import AS_COMPLEX, Array, Track, resample
 from coil_rl.listening.measures import drawn
-from coil_rl.report import draw_listening_map, write_csv
+from coil_rl.report import draw_listening_map, style, write_csv
 
 if TYPE_CHECKING:
     from coil_rl.listening.survey import Survey
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 SECTIONS = ("straight", "left", "right", "entry", "exit")
 STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(SECTIONS))
 SMOOTHING = 1.0  # m
+POINTS = 100  # of a curve, at most
 
 
 def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
@@ -114,27 +117,20 @@ class TrackSections:
             Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m), `curvature` (1/m) and
             `section` of the bin's middle, number of `states`, and means of `agreement`, `intervention` and `gradient`.
         """
+        bins = [self._bins(line) for line in self.lines]
+        track, point = data.place["track"], data.place["point"]
+        bin_of_state = np.array([bins[index][p] for index, p in zip(track.tolist(), point.tolist(), strict=True)])
         rows = []
-        for index, track in enumerate(self.tracks):
-            line, on_track = self.lines[index], data.place["track"] == index
-            bins = self._bins(line)
-            _, first, lengths = np.unique(bins, return_index=True, return_counts=True)
-            middle = first + lengths // 2
-            step, bend = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1), curvature(line)
-            bin_of_state = bins[data.place["point"][on_track]]
-            states = np.bincount(bin_of_state, minlength=len(first))
-            for slot, guide in enumerate(data.guides):
-                sums = {
-                    name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in data.measures.items()
-                }
-                for k in np.flatnonzero(states).tolist():
-                    x, y = line[middle[k]].tolist()
-                    rows.append({
-                        "track": track.name, "guide": guide, "bin": k, "from": float(step[: first[k]].sum()),
-                        "x": x, "y": y, "curvature": float(bend[middle[k]]),
-                        "section": SECTIONS[self.sections[index][middle[k]]], "states": int(states[k]),
-                        **{name: float(of_bins[k] / states[k]) for name, of_bins in sums.items()},
-                    })  # fmt: skip
+        for row in data.means(track=track, bin=bin_of_state):
+            index, line = row["track"], self.lines[row["track"]]
+            within = np.flatnonzero(bins[index] == row["bin"])
+            middle = within[len(within) // 2]
+            step = np.linalg.norm(np.diff(line[: within[0] + 1], axis=0), axis=1)
+            rows.append(row | {
+                "track": self.tracks[index].name, "from": float(step.sum()), "x": float(line[middle, 0]),
+                "y": float(line[middle, 1]), "curvature": float(curvature(line)[middle]),
+                "section": SECTIONS[self.sections[index][middle]],
+            })  # fmt: skip
         return rows
 
     def measure_on_lines(
@@ -163,3 +159,36 @@ class TrackSections:
         total = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
         count = min(len(line), max(1, round(total / self.bin)))
         return np.arange(len(line)) * count // len(line)
+
+
+class WholeEpisode:
+    """No sections; the pictures show each measure along the steps of the episodes."""
+
+    names: tuple[str, ...] = ()
+    record: ClassVar[Mapping[str, NestedKey]] = {}
+
+    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
+        """Return nothing: the step is known."""
+        return {}
+
+    def section(self, place: TensorDictBase) -> Tensor:
+        """Return 0 for each place."""
+        return torch.zeros(place.batch_size, dtype=torch.int64, device=place.device)
+
+    def draw(self, data: Survey, folder: Path) -> None:
+        """Draw the mean of each measure against the step, and write the numbers as `listening.csv`."""
+        size = max(1, -(-int(data.step.max() + 1) // POINTS))
+        rows = data.means(**{"from": data.step // size * size})
+        strokes = style.strong_strokes(data.guides)
+        handles: list[Artist] = [
+            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide) for guide, stroke in strokes.items()
+        ]
+        for measure, title, label, name in drawn(data.measures):
+            with style.picture(folder / name, title, handles, 3.6) as figure:
+                axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
+                style.lighten(axes)
+                for guide, stroke in strokes.items():
+                    own = [row for row in rows if row["guide"] == guide]
+                    x, y = [row["from"] for row in own], [row[measure] for row in own]
+                    axes.plot(x, y, color=stroke.colour, ls=stroke.linestyle, lw=1.5)
+        write_csv(rows, folder / "listening.csv")
