@@ -47,10 +47,7 @@ class PerRow(TensorDictModuleBase):
     """
 
     def __init__(
-        self,
-        make: Callable[[], Any],
-        in_keys: Sequence[NestedKey] = ("observation",),
-        out_key: NestedKey = "action",
+        self, make: Callable[[], Any], in_keys: Sequence[NestedKey] = ("observation",), out_key: NestedKey = "action"
     ) -> None:
         self.read = [nested_key(key) for key in in_keys]
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]

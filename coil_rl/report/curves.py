@@ -93,10 +93,7 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
 
 
 def draw_curve_grid(
-    runs: Mapping[str, Sequence[Rows]],
-    path: str | os.PathLike[str],
-    *,
-    guides: Mapping[str, float] | None = None,
+    runs: Mapping[str, Sequence[Rows]], path: str | os.PathLike[str], *, guides: Mapping[str, float] | None = None
 ) -> None:
     """Draw one small learning curve per label, at least one, with the other labels faint behind it.
 

@@ -126,12 +126,7 @@ def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def draw_cone_features(
-    features: ArrayLike,
-    thick: ArrayLike,
-    path: Path,
-    *,
-    wrong: ArrayLike | None = None,
-    title: str | None = None,
+    features: ArrayLike, thick: ArrayLike, path: Path, *, wrong: ArrayLike | None = None, title: str | None = None
 ) -> None:
     """Draw clusters [N] by the two principal components of their features [N, 3]; `wrong` ones get a ring.
 

@@ -68,11 +68,7 @@ def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
 
 
 def evaluate_run(
-    config: DictConfig,
-    agent: TensorDictModuleBase | None,
-    folder: Path,
-    seed: int,
-    fallback: Fallback | None = None,
+    config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int, fallback: Fallback | None = None
 ) -> None:
     """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 

@@ -13,16 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, read_messages
-from coil_rl.envs.recordings.messages import (
-    ODOMETRY,
-    SCAN,
-    TWIST,
-    TWIST_STAMPED,
-    decode,
-    pose_of,
-    stamp_of,
-    twist_of,
-)
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, TWIST_STAMPED, decode, pose_of, stamp_of, twist_of
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 LARGEST = 1e7  # of poses, commands and angles
