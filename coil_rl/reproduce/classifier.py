@@ -17,18 +17,9 @@ from coil_rl.envs.robot.clusters import FEATURES, Array
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
-from coil_rl.robot.classifier import (
-    Scans,
-    accuracy,
-    clusters_in_range,
-    label_clusters,
-    recall,
-    save_classifier,
-    share_of,
-    train_on_drives,
-)
+from coil_rl.robot import classifier as cones
 
-PAPER_ACCURACY = share_of(*PAGES["figure_25"]["paper"])
+PAPER_ACCURACY = cones.share_of(*PAGES["figure_25"]["paper"])
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
@@ -81,19 +72,19 @@ class Figure25(Result):
         simulated = any(recording.simulated for side in self.recordings for recording in side)
         suffix = " (simulated)" if simulated else ""
         left, right = map(_scans, self.recordings[:2])
-        training = train_on_drives(left, right)
-        save_classifier(training.classifier, stem.with_name("cones.json"))
+        training = cones.train_on_drives(left, right)
+        cones.save_classifier(training.classifier, stem.with_name("cones.json"))
         classifier = training.classifier
         shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
-        shares["cross-validation"] = {"all": share_of(training.correct, training.total)}
+        shares["cross-validation"] = {"all": cones.share_of(training.correct, training.total)}
         if self.test_drives:
-            labelled = label_clusters(self.test_drives)
-            shares["accuracy"] = accuracy(classifier, labelled)
-            shares |= {f"recall of {kind} cones": of for kind, of in recall(classifier, self.test_drives).items()}
+            labelled = cones.label_clusters(self.test_drives)
+            shares["accuracy"] = cones.accuracy(classifier, labelled)
+            shares |= {f"recall of {kind} cones": of for kind, of in cones.recall(classifier, self.test_drives).items()}
             drawn = labelled.scan % DRAW_EVERY == 0
             features, thick = labelled.features[drawn], labelled.thick[drawn]
         else:
-            thin_features, thick_features = (clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
+            thin_features, thick_features = (cones.clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
             features = np.concatenate([thin_features, thick_features])
             thick = np.arange(len(features)) >= len(thin_features)
         kind = "test" if self.test_drives else "training"
@@ -108,7 +99,7 @@ class Figure25(Result):
         return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
 
 
-def _scans(recordings: Sequence[Recording]) -> list[Scans]:
+def _scans(recordings: Sequence[Recording]) -> list[cones.Scans]:
     return [(recording.ranges, recording.angles(slice(None))) for recording in recordings]
 
 

@@ -18,21 +18,12 @@ from matplotlib.transforms import ScaledTranslation
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+from coil_rl import tabular
 from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
-from coil_rl.tabular import (
-    MDP,
-    garnet,
-    observations_with_advice,
-    q_learning,
-    solve,
-    toymaker,
-    value_iteration,
-    with_advice,
-)
 from coil_rl.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
 from coil_rl.tabular.mdp import Array, Integers
 
@@ -65,9 +56,11 @@ class TabularCoil(Result):
         self.steps = tuple(self.steps)
         if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
             raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")
-        self.learn = partial(q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps)
-        self.learn(toymaker(), 0, np.random.default_rng(0))  # checks its options
-        self.guides: Mapping[str, Callable[[MDP], Array]] = {
+        self.learn = partial(
+            tabular.q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps
+        )
+        self.learn(tabular.toymaker(), 0, np.random.default_rng(0))  # checks its options
+        self.guides: Mapping[str, Callable[[tabular.MDP], Array]] = {
             "optimal": optimal_guide,
             f"noisy ({self.noise:.0%})": partial(noisy_guide, noise=self.noise),
             "random": random_guide,
@@ -98,15 +91,15 @@ class TabularCoil(Result):
     def _world(self, seed: int) -> Iterator[dict[str, Any]]:
         """Yield the scores in one world, a row for each view, guide and number of steps."""
         rng = np.random.default_rng(seed)
-        mdp = garnet(self.states, self.actions, rng)
+        mdp = tabular.garnet(self.states, self.actions, rng)
         views = {"state": np.arange(self.states), "class": rng.permutation(self.states) % self.classes}
-        random, best = _value(mdp, random_guide(mdp)), _value(mdp, value_iteration(mdp).policy)
+        random, best = _value(mdp, random_guide(mdp)), _value(mdp, tabular.value_iteration(mdp).policy)
         for view, observations in views.items():
             plain = self._learned_values(mdp, observations, seed)
             for name, guide in self.guides.items():
                 policy = guide(mdp)
-                advised = observations_with_advice(observations, self.actions)
-                coil = self._learned_values(with_advice(mdp, policy), advised, seed)
+                advised = tabular.observations_with_advice(observations, self.actions)
+                coil = self._learned_values(tabular.with_advice(mdp, policy), advised, seed)
                 own = np.full(len(self.steps), _value(mdp, policy))
                 scores = (np.stack([own, coil, plain], axis=1) - random) / (best - random)
                 for n, of_step in zip(self.steps, scores.tolist(), strict=True):
@@ -114,7 +107,7 @@ class TabularCoil(Result):
                     row = {"view": view, "guide": name, "world": seed, "steps": n}
                     yield row | dict(zip(names, of_step, strict=True))
 
-    def _learned_values(self, mdp: MDP, observations: Integers, seed: int) -> Array:
+    def _learned_values(self, mdp: tabular.MDP, observations: Integers, seed: int) -> Array:
         """Return the value of the greedy policy after each number of steps."""
         rng = np.random.default_rng(seed)
         learned = self.learn(mdp, self.steps[-1], rng, observations=observations, snapshots=self.steps)
@@ -143,9 +136,9 @@ class TabularCoil(Result):
         }  # fmt: skip
 
 
-def _value(mdp: MDP, policy: Array | Integers) -> float:
+def _value(mdp: tabular.MDP, policy: Array | Integers) -> float:
     """Return the expected return of a policy from the start."""
-    return float(mdp.start @ solve(mdp, policy))
+    return float(mdp.start @ tabular.solve(mdp, policy))
 
 
 def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path) -> None:
