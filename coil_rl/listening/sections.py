@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
@@ -180,7 +179,7 @@ class WholeEpisode:
         size = max(1, -(-int(data.step.max() + 1) // POINTS))
         rows = data.means(**{"from": data.step // size * size})
         strokes = style.strong_strokes(data.guides)
-        handles: list[Artist] = [
+        handles = [
             Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide) for guide, stroke in strokes.items()
         ]
         for measure, title, label, name in drawn(data.measures):

@@ -5,7 +5,6 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
@@ -127,7 +126,7 @@ def draw_cone_features(
     is_thick = np.asarray(thick, dtype=bool)
     is_wrong = np.zeros(len(xy), dtype=bool) if wrong is None else np.asarray(wrong, dtype=bool)
     kinds = (("thin (left)", ~is_thick, style.LEFT_CONE, "o"), ("thick (right)", is_thick, style.RIGHT_CONE, "s"))
-    handles: list[Artist] = [
+    handles = [
         Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"{name}, {int(rows.sum())} clusters")
         for name, rows, colour, marker in kinds
     ]

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.lines import Line2D
@@ -23,7 +22,6 @@ from coil_rl.envs.robot.drives import SPEED, record_drives, track_of
 from coil_rl.envs.track import Array, Track
 from coil_rl.replay.open_loop import recorded_steering
 from coil_rl.report import style
-from coil_rl.report.style import picture
 
 Row = Mapping[str, Any]
 
@@ -117,13 +115,13 @@ def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None
     """Draw the lines of each driver in a panel, with the cones of known tracks."""
     methods = list(dict.fromkeys(drive.method for drive in drives))
     strokes = style.strokes(methods)
-    handles: list[Artist] = []
+    handles: list[Line2D] = []
     if any(drive.track is not None for drive in drives):
         handles += [_dot("o", style.LEFT_CONE, "thin cones"), _dot("o", style.RIGHT_CONE, "thick cones")]
     if any(drive.row["crashed"] for drive in drives):
         handles.append(_dot("X", style.INK, "crash"))
     rows = -(-len(methods) // 2)
-    with picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
+    with style.picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
         panels = list(figure.subplots(rows, 2, squeeze=False).flat)
         for axes, method in zip(panels, methods, strict=False):
             _draw_panel(axes, [drive for drive in drives if drive.method == method], strokes[method].colour)

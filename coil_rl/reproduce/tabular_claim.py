@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 from scipy.stats import binomtest
@@ -21,7 +20,6 @@ from tqdm import tqdm
 from coil_rl import tabular
 from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
@@ -148,10 +146,10 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
         name: {"color": colour, "lw": 2, "marker": "o", "ms": 4}
         for name, colour in zip(guides, style.AGENTS, strict=False)
     }
-    handles: list[Artist] = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
+    handles = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
     handles.append(Line2D([], [], label="plain Q-learning", **PLAIN))
     handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=style.DASHED, label="guide alone (its colour)"))
-    with picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
+    with style.picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
         grid = figure.subplots(2, len(views), sharex=True, sharey="row", squeeze=False)
         for (share, score), view in zip(grid.T, views, strict=True):
             of_view = [group for group in groups if group["view"] == view]
@@ -169,7 +167,7 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
             share.set_title(f"the agent observes {view}", size=9, loc="left", color=style.QUIET)
             score.set_xlabel("steps of experience")
         for axes in grid.flat:
-            lighten(axes)
+            style.lighten(axes)
             axes.set_xscale("log")
             axes.set_xticks(steps, [f"{n:,}" for n in steps])
             axes.minorticks_off()
