@@ -9,37 +9,12 @@ from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import markdown_table
+from coil_rl.report.table import TABLES, markdown_table
 
 MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 
-COLUMNS = {
-    "driver": ("driver", ""),
-    "advice": ("advice", ""),
-    "seeds": ("seeds", ""),
-    "completed": ("completed", ".0%"),
-    "crashes": ("seeds with a crash (95 %)", ""),
-    "score cell": ("{score} (95 %)", ""),
-    "difference cell": ("difference to {other} (95 %)", ""),
-    "p": ("p", ".3f"),
-    "better": ("better than {other}", ".0%"),
-    "reward": ("reward", ".1f"),
-}
 NEEDS_GUIDE = {"needs_guide": ("guide at test time", "")}
-LEARNING_COLUMNS = {
-    "label": ("return in the cases of the evaluation", ""),
-    "seeds": ("seeds", ""),
-    "frames": ("frames", ",.0f"),
-    "guide": ("guide", ".1f"),
-    "first": ("first policy", ".1f"),
-    "until_90 cell": ("frames until 90 % of the guide", ""),
-    "until_100 cell": ("until 100 %", ""),
-    "area": ("area under the curve / frames", ".1f"),
-    "best": ("best policy", ".1f"),
-    "final": ("last policy", ".1f"),
-    "seconds": ("training (s)", ".0f"),
-}
 
 
 def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
@@ -51,7 +26,11 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
     hidden |= set() if comparison.normalised else {"reward"}
     hidden |= {key for key in ("completed", "crashes") if all(row[key] is None for row in rows)}
     measures = {name: each for group in comparison.groups for name, each in group.measures.items()}
-    columns = {key: (text.format(**names), spec) for key, (text, spec) in COLUMNS.items() if key not in hidden}
+    columns = {
+        key: (text.format(**names), spec)
+        for key, (text, spec) in TABLES["drivers"]["columns"].items()
+        if key not in hidden
+    }
     columns |= {
         name: (measure.title, measure.format)
         for name, measure in measures.items()
@@ -107,27 +86,14 @@ def training(runs: Sequence[Run]) -> list[str]:
             row[f"{key} cell"] = f"{mean(reached):,.0f}{some}" if reached else None
         rows += [row] if not math.isnan(row["area"]) else []
     rows.sort(key=lambda row: -float(row["area"]))
-    return [markdown_table(rows, LEARNING_COLUMNS)] if rows else []
+    return [markdown_table(rows, TABLES["learning"]["columns"])] if rows else []
 
 
 def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     """Return an explanation of the tables."""
-    text = (
-        "Drivers are ordered by the completed share, then by the mean. Intervals: t over seeds, of seeds with a crash "
-        "Clopper-Pearson."
-    )
-    if normalised:
-        text += (
-            " Reward / guide's: each reward is divided by the best guide's in the same case (where it crashes or "
-            "earns nothing, by its mean over the others)."
-        )
-    if against is not None:
-        text += (
-            f" Difference to {_other(against)}: of the same seed, p after Holm's correction for all rows (of sign "
-            f"flips from {SIGN_FLIP_SEEDS} seeds on, of a t test with fewer); better: the share of seeds and cases "
-            "with more."
-        )
-    return text + " Sampled actions also measure the noise of exploration." * sampled
+    used = {"order": True, "normalised": normalised, "against": against is not None, "sampled": sampled}
+    text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
+    return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
 
 
 def progress(finished: int, started: int) -> str:

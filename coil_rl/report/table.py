@@ -3,17 +3,22 @@
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from numbers import Real
+from typing import Any
 
 import pandas as pd
 import tabulate
+import yaml
 
 from coil_rl.files import whole_file
 
 tabulate.MIN_PADDING = 0  # extra width of headings
+# Columns and notes by table.
+TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
 
-def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, tuple[str, str]]) -> str:
+def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, Sequence[str]]) -> str:
     """Return a Markdown table; columns of numbers are right-aligned.
 
     A column that no row has, or a number that does not fit its format, is a `ValueError`.
