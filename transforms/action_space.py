@@ -20,14 +20,11 @@ def nested_key(key: Key) -> Key:
 
 
 class ActionSpace:
-    """Actions of an env as vectors [*batch, *agents, A]; a discrete action is one-hot, A is the number of choices.
+    """Actions of an env as vectors [*batch, *agents, A], by its action spec and number of batch dimensions.
 
-    Several discrete actions (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side. A single
-    action without a dimension of its own, or one of whole numbers that are no choices, is a `ValueError`.
-
-    Args:
-        spec: action spec of the env.
-        batch_dims: number of batch dimensions of the env.
+    A discrete action is one-hot, A is the number of choices. Several discrete actions (MultiCategorical, MultiOneHot,
+    Binary) are their one-hot vectors side by side. A single action without a dimension of its own, or one of whole
+    numbers that are no choices, is a `ValueError`.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:

@@ -22,7 +22,10 @@ EXECUTED = "executed_action"
 
 
 class CombinedAction(GuideTransform):
-    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset."""
+    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset.
+
+    The options of all subclasses are `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    """
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
@@ -69,9 +72,7 @@ class CombinedAction(GuideTransform):
 class ResidualAction(CombinedAction):
     """Residual policy: the env action is g + scale * a, clamped (Johannink et al. 2019).
 
-    Args:
-        scale: factor of the agent's action, a number or a schedule over the run. With 0 the guide acts alone.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    The scale is a number or a schedule over the run. With 0 the guide acts alone.
     """
 
     mdp_parameter = "scale"
@@ -89,9 +90,7 @@ class ResidualAction(CombinedAction):
 class MixedAction(CombinedAction):
     """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
-    Args:
-        weight: weight of the agent, a number or a schedule over the run. With 1 the agent acts alone.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    The weight is a number or a schedule over the run. With 1 the agent acts alone.
     """
 
     mdp_parameter = "weight"
@@ -123,7 +122,6 @@ class AdaptiveMixedAction(CombinedAction):
             `warm_up_high` instead.
         warm_up_high: see `warm_up`.
         seed: of the draws.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
     """
 
     written = (EXECUTED, "agent_weight")
@@ -219,7 +217,7 @@ class Takeover(_ActionSwitch):
         probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always acts, as in RLPD
             and WSRL; None: no limit.
-        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+        options: `seed` of the draws, and those of `CombinedAction`.
     """
 
     def __init__(self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any) -> None:
@@ -238,11 +236,8 @@ class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 
     The env action is g with a probability that decreases over the run, else g + scale * a, clamped; in evaluation
-    always the latter.
-
-    Args:
-        scale: factor of the agent's action, a number or a schedule over the run.
-        options: `probability` of g alone and other arguments as for `Takeover`.
+    always the latter. The scale is a number or a schedule over the run; the `probability` of g alone and the other
+    arguments are those of `Takeover`.
     """
 
     mdp_parameter = "scale"
@@ -265,7 +260,7 @@ class JumpStart(_ActionSwitch):
     Args:
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+        options: `seed` of the draws, and those of `CombinedAction`.
     """
 
     written = (EXECUTED, "agent_acts", "guide_steps")

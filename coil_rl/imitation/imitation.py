@@ -41,7 +41,6 @@ class Imitation:
         seed: of the random split of the validation.
 
     Attributes:
-        kind: as for `PPO`.
         policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
         keys: entries that a batch must have.
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
@@ -105,11 +104,7 @@ class Imitation:
             self.dataset = self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Add the guide's actions in a batch to the data set, and fit the regressor to it.
-
-        Args:
-            batch: [*B, T] with `keys`.
-            progress: not used.
+        """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
 
         Returns:
             The number of `samples`; `target_variance`, the mean squared error of predicting the mean; `mse_ahead` and

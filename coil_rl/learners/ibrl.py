@@ -120,9 +120,7 @@ class Proposals(Critics):
 class ProposalLoss(SACLoss):
     """TorchRL's loss of SAC with the target of IBRL, and the loss of the second policy if there is one.
 
-    Args:
-        choice: makes `Proposals` of a policy and this loss, with the keyword `editor`.
-        arguments: as for `SACLoss`.
+    `choice` makes `Proposals` of a policy and this loss, with the keyword `editor`.
     """
 
     def __init__(self, choice: partial[Proposals], **arguments: Any) -> None:

@@ -87,11 +87,7 @@ class FilteredKickstartLoss(KickstartLoss):
 
     The weight of a state is 1 where the critics' mean value of g is larger than that of the policy's action, else 0
     (Q-filter, Nair et al. 2018); or `soft`, the probability of this by the spread of the critics (SPReD, 2025):
-    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)).
-
-    Args:
-        soft: see above.
-        options: as for `KickstartLoss`.
+    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)). Other arguments are those of `KickstartLoss`.
     """
 
     def __init__(self, *, soft: bool = False, **options: Any) -> None:

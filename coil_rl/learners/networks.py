@@ -92,11 +92,9 @@ class ChoicesHead(nn.Module):
 
 
 class Choices(Independent):
-    """Distribution of several independent choices: that of each given by logits [*batch, *event, n].
+    """Distribution of several independent choices, of each by the logits of its options [*batch, *event, n].
 
-    Args:
-        logits: of the options.
-        event_dims: number of dimensions of an action, one index for each choice.
+    An action, one index for each choice, has `event_dims` dimensions.
     """
 
     def __init__(self, logits: Tensor, event_dims: int) -> None:

@@ -81,12 +81,7 @@ class Table4(WorldsResult):
 
 
 class Figure22(Result):
-    """Learning curves, with the guide's return as a line.
-
-    Args:
-        experiments: experiments in one world.
-        labels: labels of the runs to draw; the guide is that of the first.
-    """
+    """Learning curves of the runs with some labels in one world, with the return of the first one's guide as a line."""
 
     def __init__(self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo")) -> None:
         if not labels:

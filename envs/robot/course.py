@@ -108,11 +108,9 @@ class Laps:
 
 
 def laps(poses: Array, seconds: Array) -> Laps:
-    """Return the laps of a drive. A lap ends where the drive crosses, forwards, the line across its start.
+    """Return the laps of a drive with poses [N, 3] m, m, radians at times [N] s.
 
-    Args:
-        poses: [N, 3] m, m, radians, ordered by time.
-        seconds: [N].
+    A lap ends where the drive crosses, forwards, the line across its start.
     """
     x, y, heading = poses[0]
     forward = (poses[:, 0] - x) * np.cos(heading) + (poses[:, 1] - y) * np.sin(heading) - LINE_OFFSET
