@@ -18,14 +18,10 @@ from coil_rl.report import markdown_table, style, write_csv
 from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.robot import classifier as cones
 
-PAPER_ACCURACY = cones.share_of(*PAGES["figure_25"]["paper"])
+PAGE = PAGES["figure_25"]
+PAPER_ACCURACY = cones.share_of(*PAGE["paper"])
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
-
-COLUMNS = {
-    "measure": ("measure", ""), "of": ("of", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"),
-    "high": ("to", ".4f"), "wrong": ("wrong", "d"), "total": ("total", "d"),
-}  # fmt: skip
 
 
 @dataclass(eq=False)
@@ -94,8 +90,8 @@ class Figure25(Result):
         rows = [{"measure": name, "of": of, **share._asdict()} for name in shares for of, share in shares[name].items()]
         write_csv(rows, stem.with_suffix(".csv"))
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
-        notes = PAGES["figure_25"]["notes"].format(folds=folds, kind=kind)
-        return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
+        notes = PAGE["notes"].format(folds=folds, kind=kind)
+        return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, PAGE['columns'])}\n\n{notes}"
 
 
 def _scans(recordings: Sequence[Recording]) -> list[cones.Scans]:

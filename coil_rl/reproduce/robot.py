@@ -27,17 +27,8 @@ from coil_rl.train.evaluate_run import driver_names
 from coil_rl.train.load import load_policy_in_env, weights_file
 from coil_rl.train.run_folder import read_config
 
-PAPER_ROBOT = PAGES["table_6"]["paper"]
-TABLE_6 = {
-    "method": ("method", ""), "seeds": ("seeds", "d"), "drives": ("drives", "d"), "laps": ("laps", "d"),
-    "crashes": ("crashes", "d"), "smoothness": ("smoothness", ".3f"), "paper smoothness": ("paper", ".3f"),
-    "lap_time": ("lap (s)", ".2f"), "paper lap_time": ("paper (s)", ".2f"),
-}  # fmt: skip
-TABLE_7 = {
-    "method": ("method", ""), "off_centre": ("from the centre (m)", ".3f"),
-    "clearance": ("smallest clearance (m)", ".3f"), "corner_cut": ("path / centre line", ".3f"),
-    "paper remark": ("paper", ""),
-}  # fmt: skip
+PAGE = PAGES["table_6"]
+PAPER_ROBOT = PAGE["paper"]
 
 
 @dataclass(eq=False)
@@ -147,11 +138,11 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
         line = means([row for drives in by_seed.values() for row in drives])
         line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
         table.append(line | {f"paper {key}": value for key, value in paper.items()})
-    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, TABLE_6)]
-    parts += [f"### Table 7, measured{suffix}", markdown_table(table, TABLE_7)]
-    notes = PAGES["table_6"]["notes"].format(max_steering=max_steering)
+    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, PAGE["columns"])]
+    parts += [f"### Table 7, measured{suffix}", markdown_table(table, PAGE["columns_of_table_7"])]
+    notes = PAGE["notes"].format(max_steering=max_steering)
     of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
-    verdicts = [_claim(of_seeds, *claim) for claim in PAGES["table_6"]["claims"]]
+    verdicts = [_claim(of_seeds, *claim) for claim in PAGE["claims"]]
     claims = [claim for claim in verdicts if claim is not None]
     if not claims:
         return "\n\n".join([*parts, notes])
@@ -160,7 +151,7 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
     claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
     section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
-    return "\n\n".join([*parts, f"{notes}\n{PAGES['table_6']['claim_notes']}", section])
+    return "\n\n".join([*parts, f"{notes}\n{PAGE['claim_notes']}", section])
 
 
 def _claim(
