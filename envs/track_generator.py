@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
-from coil_rl.envs.track import Track, TrackError
+from coil_rl.envs.track import Array, Track, TrackError
 
-Array = NDArray[np.float64]
 Line = NDArray[np.complex128]
 
 # Requirements.

@@ -83,7 +83,7 @@ USES = {  # of a run
     "distil": f"distill {TRACKS} {SHORT} {CURVE} {PROXY} guide=learned guide.learned.run=RUN",
     "report": "report folder=RUN",
     "reports": "report folder=runs actions=both",
-    "robot": f"robot {SHORT} steps=[drive] runs=[RUN]",
+    "robot": "reproduce table=6 results.table_6.repeats=1 results.table_6.laps=1 results.table_6.runs=[RUN]",
 }
 POLICY, LOGS = ["config.yaml", "policy_last.pt"], ["config.yaml", "metrics.csv", "guide_return.json"]
 READ = {  # files by use; others are damaged now and then
@@ -94,16 +94,15 @@ ON_TRACKS = [f"train {TRAIN} {ONCE}", f"evaluate {SHORT}", "evaluate evaluation.
 OF_RECORDINGS = [
     "replay recording=drive.mcap",
     "replay recording=[drive.mcap,other.mcap] runs=[runs/coil]",
-    "robot steps=[table] recordings=[drive.mcap]",
-    "robot steps=[train] figure_25.left=[drive.mcap,other.mcap] figure_25.right=[drive.mcap,other.mcap]"
-    " figure_25.both=[drive.mcap]",
+    "reproduce figure=25 results.figure_25.left=[drive.mcap,other.mcap]"
+    " results.figure_25.right=[drive.mcap,other.mcap] results.figure_25.both=[drive.mcap]",
     "reproduce table=6 budget=smoke results.table_6.recordings=[drive.mcap]",
 ]
 CLASSIFIER = (
     "env.perception.classifier._target_=coil_rl.robot.classifier.load_classifier"
     " +env.perception.classifier.path=cones.json"
 )
-OF_CLASSIFIER = [f"robot {SHORT} steps=[drive] {CLASSIFIER}", f"replay recording=drive.mcap {CLASSIFIER}"]
+OF_CLASSIFIER = [f"evaluate {SHORT} env=simulated_robot {CLASSIFIER}", f"replay recording=drive.mcap {CLASSIFIER}"]
 COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "train": [f"train {TRACKS} {TRAIN} {ONCE} method=coil"],
     "distill": [f"distill {TRACKS} {SHORT} {CURVE} {PROXY}"],
@@ -111,7 +110,6 @@ COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "listen": [USES["listen"]],
     "replay": [USES["replay"]],
     "report": [USES["report"], USES["reports"]],
-    "robot": [f"robot {SHORT} steps=[drive]", "robot steps=[table] recordings=[drive.mcap]"],
     "reproduce": [
         *(f"reproduce budget=smoke {result}" for result in ("table=1", "figure=6", "table=[1,7]", "all=maybe")),
         "reproduce claim=tabular_coil results.tabular_coil.worlds=1 results.tabular_coil.steps=[100]",
@@ -431,7 +429,7 @@ def _half_written(case: Case, place: Path, changed: set[str], status: int) -> se
     if status != 2 or "resume=" in case.command:
         return half
     left = {name for name in changed if not HYDRA.search(name) and (place / name).exists()}
-    if case.words[0] in ("train", "distill", "robot", "reproduce") or case.file_limit < FILE:
+    if case.words[0] in ("train", "distill", "reproduce") or case.file_limit < FILE:
         files = {name for name in left if not (place / name).is_dir()}
         left = {name for name in left - files if not any(file.startswith(f"{name}/") for file in files)}
         left = {name for name in left if Path(name).name not in ("policies", "proxies")}  # the run can be resumed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TypeVar
 
 import torch
-from tensordict.utils import NestedKey, unravel_key
+from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
@@ -20,16 +20,11 @@ def nested_key(key: Key) -> Key:
 
 
 class ActionSpace:
-    """Actions of an env as vectors [*batch, *agents, A]; a discrete action is one-hot, A is the number of choices.
+    """Actions of an env as vectors [*batch, *agents, A], by its action spec and number of batch dimensions.
 
-    Several discrete actions (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side.
-
-    Args:
-        spec: action spec of the env.
-        batch_dims: number of batch dimensions of the env.
-
-    Raises:
-        ValueError: for a single action without a dimension of its own, or one of whole numbers that are no choices.
+    A discrete action is one-hot, A is the number of choices. Several discrete actions (MultiCategorical, MultiOneHot,
+    Binary) are their one-hot vectors side by side. A single action without a dimension of its own, or one of whole
+    numbers that are no choices, is a `ValueError`.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
@@ -51,11 +46,7 @@ class ActionSpace:
 
     @classmethod
     def of_parent(cls, transform: Transform, action_key: NestedKey) -> ActionSpace:
-        """Return the action space of the env of a transform. Slow: `Transform.parent` rebuilds the env.
-
-        Raises:
-            RuntimeError: outside an env.
-        """
+        """Return the action space of the env of a transform, RuntimeError outside one; slow, it rebuilds the env."""
         if transform.parent is None:
             raise RuntimeError(
                 f"{type(transform).__name__} needs the action spec of an env: use it in a TransformedEnv"

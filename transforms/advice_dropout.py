@@ -16,13 +16,10 @@ class AdviceDropout(GuideTransform):
     One run then gives a policy with its guide and one without: see `in_evaluation`.
 
     Args:
-        probability: of an episode without advice, in training.
+        probability: of an episode without advice, in training; from 0 to 1, else a `ValueError`.
         in_evaluation: whether there is advice in evaluation.
         seed: of the draws.
         options: `action_key` and `advice_key`, as for `GuideTransform`.
-
-    Raises:
-        ValueError: for a probability that is not from 0 to 1.
     """
 
     written = ("advice_given",)

@@ -7,13 +7,14 @@ steps and write `agent_acts` [*batch, 1] with the observation; on-policy learner
 loss, learners with replay learn from the executed action where the agent could have chosen it.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
 
@@ -21,7 +22,10 @@ EXECUTED = "executed_action"
 
 
 class CombinedAction(GuideTransform):
-    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset."""
+    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset.
+
+    The options of all subclasses are `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    """
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
@@ -53,18 +57,22 @@ class CombinedAction(GuideTransform):
                 f"{type(self).__name__} needs continuous actions, but this env has {self.action_space.size} discrete "
                 "ones; use Takeover, which replaces the agent's action in some steps"
             )
-        observation_spec = super().transform_observation_spec(observation_spec)
+        return super().transform_observation_spec(observation_spec).update(self._specs())
+
+    def _specs(self) -> dict[str, TensorSpec]:
+        """Return the specs of what it writes."""
         spec = self.action_space.spec  # not its own spec, as 0 need not be an action
-        observation_spec[EXECUTED] = Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)
-        return observation_spec
+        return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
+
+    def _spec_of_rows(self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype) -> TensorSpec:
+        """Return the spec of one number a row, [*batch, 1]."""
+        return kind(*bounds, shape=(*self.parent.batch_size, 1), device=self.parent.device, dtype=dtype)
 
 
 class ResidualAction(CombinedAction):
     """Residual policy: the env action is g + scale * a, clamped (Johannink et al. 2019).
 
-    Args:
-        scale: factor of the agent's action, a number or a schedule over the run. With 0 the guide acts alone.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    The scale is a number or a schedule over the run. With 0 the guide acts alone.
     """
 
     mdp_parameter = "scale"
@@ -82,9 +90,7 @@ class ResidualAction(CombinedAction):
 class MixedAction(CombinedAction):
     """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
-    Args:
-        weight: weight of the agent, a number or a schedule over the run. With 1 the agent acts alone.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    The weight is a number or a schedule over the run. With 1 the agent acts alone.
     """
 
     mdp_parameter = "weight"
@@ -104,7 +110,8 @@ class AdaptiveMixedAction(CombinedAction):
 
     The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low` in the first step of
     an episode, then a linear function of `("next", "uncertainty")` [*batch, 1], which the policy wrote in the step
-    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none.
+    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none. Weights that are not in
+    order within [0, 1], or uncertainties not in order, are a `ValueError`.
 
     Args:
         low: smallest weight of the agent.
@@ -115,10 +122,6 @@ class AdaptiveMixedAction(CombinedAction):
             `warm_up_high` instead.
         warm_up_high: see `warm_up`.
         seed: of the draws.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
-
-    Raises:
-        ValueError: if the weights are not in order within [0, 1], or the uncertainties not in order.
     """
 
     written = (EXECUTED, "agent_weight")
@@ -158,12 +161,9 @@ class AdaptiveMixedAction(CombinedAction):
         weight = self.advice(tensordict_reset).new_full((*tensordict_reset.batch_size, 1), self.low)
         return super()._reset(tensordict, tensordict_reset).set("agent_weight", weight)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action` and `agent_weight`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        shape, dtype = (*self.parent.batch_size, 1), self.action_space.dtype
-        observation_spec["agent_weight"] = Bounded(self.low, self.high, shape, device=self.parent.device, dtype=dtype)
-        return observation_spec
+    def _specs(self) -> dict[str, TensorSpec]:
+        weight = self._spec_of_rows(Bounded, self.low, self.high, dtype=self.action_space.dtype)
+        return super()._specs() | {"agent_weight": weight}
 
 
 class _ActionSwitch(CombinedAction):
@@ -204,12 +204,8 @@ class _ActionSwitch(CombinedAction):
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         return super()._reset(tensordict, tensordict_reset).set("agent_acts", self._agent_acts(tensordict_reset))
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action` and `agent_acts`."""
-        observation_spec = super().transform_observation_spec(observation_spec)
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        observation_spec["agent_acts"] = Binary(1, shape=shape, device=device, dtype=torch.bool)
-        return observation_spec
+    def _specs(self) -> dict[str, TensorSpec]:
+        return super()._specs() | {"agent_acts": self._spec_of_rows(Binary, 1, dtype=torch.bool)}
 
 
 class Takeover(_ActionSwitch):
@@ -221,7 +217,7 @@ class Takeover(_ActionSwitch):
         probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always acts, as in RLPD
             and WSRL; None: no limit.
-        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+        options: `seed` of the draws, and those of `CombinedAction`.
     """
 
     def __init__(self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any) -> None:
@@ -240,11 +236,8 @@ class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 
     The env action is g with a probability that decreases over the run, else g + scale * a, clamped; in evaluation
-    always the latter.
-
-    Args:
-        scale: factor of the agent's action, a number or a schedule over the run.
-        options: `probability` of g alone and other arguments as for `Takeover`.
+    always the latter. The scale is a number or a schedule over the run; the `probability` of g alone and the other
+    arguments are those of `Takeover`.
     """
 
     mdp_parameter = "scale"
@@ -267,7 +260,7 @@ class JumpStart(_ActionSwitch):
     Args:
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        options: `seed` of the draws, `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+        options: `seed` of the draws, and those of `CombinedAction`.
     """
 
     written = (EXECUTED, "agent_acts", "guide_steps")
@@ -291,8 +284,5 @@ class JumpStart(_ActionSwitch):
         next_tensordict.set("guide_steps", (tensordict["guide_steps"] - 1).clamp(0))
         return super()._step(tensordict, next_tensordict)
 
-    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add `executed_action`, `agent_acts` and `guide_steps`."""
-        shape, device = (*self.parent.batch_size, 1), self.parent.device
-        observation_spec["guide_steps"] = Unbounded(shape, device=device, dtype=torch.int64)
-        return super().transform_observation_spec(observation_spec)
+    def _specs(self) -> dict[str, TensorSpec]:
+        return super()._specs() | {"guide_steps": self._spec_of_rows(Unbounded, dtype=torch.int64)}

@@ -10,8 +10,7 @@ from functools import cached_property
 from typing import Literal
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
@@ -26,7 +25,7 @@ class DegradedAdvice(Transform):
     `transform(tensordict)` does the same for stored data; outside an env there are no bounds.
 
     Args:
-        key: entry of the advice, [*batch, n_guides, A] in action units.
+        key: (of all subclasses) entry of the advice, [*batch, n_guides, A] in action units.
         memory_key: entry for advice of the past, [*batch, slots, n_guides, A].
         slots: length of the memory; 0 for none.
     """
@@ -89,12 +88,7 @@ class DegradedAdvice(Transform):
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice with a constant offset.
-
-    Args:
-        offset: in action units, finite.
-        key: entry of the advice.
-    """
+    """Advice with a constant, finite offset in action units."""
 
     def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -106,12 +100,7 @@ class BiasedAdvice(DegradedAdvice):
 
 
 class ScaledAdvice(DegradedAdvice):
-    """Advice multiplied by a constant.
-
-    Args:
-        gain: 0.5 for an undertuned guide, 0 for no advice, -1 for an adversary; finite.
-        key: entry of the advice.
-    """
+    """Advice multiplied by a finite constant: 0.5 for an undertuned guide, 0 for no advice, -1 for an adversary."""
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -123,12 +112,7 @@ class ScaledAdvice(DegradedAdvice):
 
 
 class PartialAdvice(DegradedAdvice):
-    """Advice to one side only; 0 for the other side.
-
-    Args:
-        side: "left" keeps positive values, "right" negative values.
-        key: entry of the advice.
-    """
+    """Advice to one side only, 0 for the other side: "left" keeps positive values, "right" negative values."""
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -147,7 +131,6 @@ class NoisyAdvice(DegradedAdvice):
     Args:
         sigma: standard deviation in action units.
         seed: seed of the noise.
-        key: entry of the advice.
     """
 
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
@@ -172,7 +155,6 @@ class RandomAdvice(DegradedAdvice):
         low: lower bound in action units.
         high: upper bound.
         seed: seed of the draws.
-        key: entry of the advice.
     """
 
     def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
@@ -194,15 +176,11 @@ class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
     At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
-    advice of another row.
+    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`.
 
     Args:
         seed: seed of the draws.
-        key: entry of the advice.
         memory_key: entry for the original advice, [*batch, 1, n_guides, A].
-
-    Raises:
-        ValueError: for a batch of one row, when the env builds its specs.
     """
 
     def __init__(
@@ -243,7 +221,6 @@ class DelayedAdvice(DegradedAdvice):
 
     Args:
         steps: delay; 0 for none.
-        key: entry of the advice.
         memory_key: entry for the advice of the last `steps` steps, [*batch, steps, n_guides, A], oldest first.
     """
 
@@ -273,9 +250,7 @@ class DelayedAdvice(DegradedAdvice):
 class RemovedAdvice(DegradedAdvice):
     """Placebo: the agent's previous action in place of the advice; zeros at the start of an episode.
 
-    Args:
-        key: entry of the advice.
-        action_key: entry of the action; a discrete action becomes one-hot.
+    `action_key` is the entry of the action; a discrete action becomes one-hot.
     """
 
     needs_past = True

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Bounded, Categorical, Composite

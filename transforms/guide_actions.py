@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 from functools import cached_property
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
@@ -95,8 +94,8 @@ class Guides(TensorDictModuleBase):
         rows = []
         for name, guide in self.guides.items():
             data = tensordict.select(*self._in_keys_of[name], strict=False)
-            if name in self._input_dtype:
-                data = data.apply(self._cast(name))
+            if dtype := self._input_dtype.get(name):
+                data = data.apply(lambda value, to=dtype: value.to(to) if value.is_floating_point() else value)
             if memory is not None and name in self.memories:
                 data = guide(data.update(memory[name]))
                 memory.set(name, data["next"].select(*self.memories[name].specs))
@@ -113,10 +112,6 @@ class Guides(TensorDictModuleBase):
             read = tensordict.select(*self._in_keys_of[name], strict=False).values(True, True)
             if len(dtypes) == 1 and any(value.is_floating_point() and value.dtype not in dtypes for value in read):
                 self._input_dtype[name] = dtypes.pop()
-
-    def _cast(self, name: str) -> Callable[[Tensor], Tensor]:
-        dtype = self._input_dtype[name]
-        return lambda value: value.to(dtype) if value.is_floating_point() else value
 
 
 class GuideCache:
@@ -330,8 +325,7 @@ class GuideActions(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the advice and the memory.
 
-        Raises:
-            ValueError: if another GuideActions has a guide of the same name with a memory, or rows are reset in part.
+        Two guides of one name with a memory, or one in an env that resets its agents one by one, are a `ValueError`.
         """
         observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
             self.parent.batch_size, len(self.guides.names)

@@ -1,9 +1,8 @@
 """Memory of guides by TorchRL's convention, carried from step to step by the env's data."""
 
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import unravel_key
 from torchrl.data import Composite
 from torchrl.envs import Compose
 from torchrl.modules.utils import get_primers_from_module
@@ -14,12 +13,8 @@ SUPPLIED = ("is_init", "row", "last_action")  # what a guide may read besides th
 class GuideMemory:
     """What a guide reads as `k` and writes as `("next", k)`, declared by its `make_tensordict_primer()`.
 
-    Args:
-        name: of the guide, for messages.
-        guide: without a declaration it has no memory.
-
-    Raises:
-        ValueError: for an entry that is not declared, or one without a fixed value at the start of an episode.
+    The `name` of the guide is for messages; a guide without a declaration has no memory. An entry that is not declared,
+    or one without a fixed value at the start of an episode, is a `ValueError`.
     """
 
     def __init__(self, name: str, guide: TensorDictModuleBase) -> None:

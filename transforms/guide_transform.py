@@ -6,8 +6,7 @@ from collections.abc import Callable
 from functools import cached_property
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
@@ -55,11 +54,7 @@ class GuideTransform(Transform):
 
     @property
     def learns(self) -> bool:
-        """Whether the env is used for training.
-
-        Raises:
-            RuntimeError: if neither `env.train()` nor `env.eval()` has been called since the transform is in the env.
-        """
+        """Whether the env is used for training; RuntimeError before `env.train()` or `env.eval()`."""
         if not self._mode_is_set:
             raise RuntimeError(
                 f"{type(self).__name__} acts in training only: call env.train() or env.eval() first, on the env that "
@@ -68,11 +63,7 @@ class GuideTransform(Transform):
         return self.training
 
     def current(self, value: float | Schedule) -> float:
-        """Return the current value of a number or a schedule.
-
-        Raises:
-            RuntimeError: in training, if nobody has set the progress of a schedule.
-        """
+        """Return the current value of a number or a schedule; RuntimeError in training before `set_progress`."""
         if not callable(value):
             return value
         if not self.learns:

@@ -4,8 +4,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torchrl.data import Composite, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule
@@ -21,11 +20,9 @@ class RewardCoupling(GuideTransform):
 
     Args:
         beta: weight of the distance, a number or a schedule over the run.
-        norm: norm of the distance. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
+        norm: of the distance; another is a `ValueError`. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the
+            root of 2.
         options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
-
-    Raises:
-        ValueError: for an unknown norm.
 
     Example:
         >>> from torchrl.envs import TransformedEnv

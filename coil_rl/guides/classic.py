@@ -18,11 +18,9 @@ from coil_rl.envs.limits import check_choice
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
-    """Land as `gymnasium.envs.box2d.lunar_lander.heuristic` does, many rows at once.
+    """Land as `gymnasium.envs.box2d.lunar_lander.heuristic` does: [*batch, 8] of LunarLander-v3 to an index [*batch].
 
-    Args:
-        observation: [*batch, 8] of LunarLander-v3.
-        continuous: whether the env takes the power of both engines, [*batch, 2], or an index, [*batch].
+    With `continuous` the action is the power of both engines, [*batch, 2].
     """
     x, y, speed, climb_rate, angle, spin, left_leg, right_leg = observation.unbind(-1)
     touches = (left_leg != 0) | (right_leg != 0)
@@ -59,11 +57,9 @@ def linear_feedback(observation: Tensor, weights: Sequence[float] = (0.1, 0.3, 1
 
 
 class ClassicGuide(TensorDictModule):
-    """Guide that acts by one of the functions above.
+    """Guide that acts by one of the functions above: lander, energy_pump, swing_up or linear_feedback.
 
-    Args:
-        controller: lander, energy_pump, swing_up or linear_feedback.
-        options: arguments of the function after the observation.
+    The `options` are arguments of the function after the observation.
     """
 
     pure = True

@@ -47,10 +47,7 @@ class PerRow(TensorDictModuleBase):
     """
 
     def __init__(
-        self,
-        make: Callable[[], Any],
-        in_keys: Sequence[NestedKey] = ("observation",),
-        out_key: NestedKey = "action",
+        self, make: Callable[[], Any], in_keys: Sequence[NestedKey] = ("observation",), out_key: NestedKey = "action"
     ) -> None:
         self.read = [nested_key(key) for key in in_keys]
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
@@ -110,6 +107,8 @@ class PerRow(TensorDictModuleBase):
 class ControllerGuide(TensorDictModuleBase):
     """A controller that is named by `MODULE:NAME`. What is found there decides how it is used.
 
+    What cannot be imported, is nothing of the following, or takes other arguments, is a `ValueError`.
+
     | it is | it becomes |
     | --- | --- |
     | a class of TensorDictModules | the guide itself, with its own `in_keys` |
@@ -121,9 +120,6 @@ class ControllerGuide(TensorDictModuleBase):
         of: such as `my_package.control:MyPID`.
         in_keys: entries to read; None for `observation`, or for those of a TensorDictModule.
         options: arguments of the class, or further ones of the function, by name.
-
-    Raises:
-        ValueError: if it cannot be imported, is nothing of the above, or takes other arguments.
     """
 
     def __init__(
@@ -171,11 +167,8 @@ class EntryGuide(TensorDictModule):
 class RecordedGuide(TensorDictModuleBase):
     """Actions of a recording, from the first step of every episode; the last one is held after the end.
 
-    Args:
-        file: CSV of numbers, [T, A] action units, one line for each step; a first line with names is left out.
-
-    Raises:
-        ValueError: for a file that cannot be read, or without finite numbers.
+    The `file` is a CSV of numbers, [T, A] action units, one line for each step; a first line with names is left out. A
+    file that cannot be read, or without finite numbers, is a `ValueError`.
     """
 
     in_keys, out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]

@@ -27,21 +27,9 @@ from sklearn.tree import DecisionTreeRegressor
 from sklearn.tree._tree import Tree
 
 from coil_rl.errors import UserError
-from coil_rl.train.trust import ESTIMATORS
+from coil_rl.train.trust import ESTIMATORS, PARTS
 
-# Types inside fitted regressors that skops does not trust by default.
-TYPES = frozenset(
-    ["sklearn.tree._tree.Tree", "sklearn.ensemble._hist_gradient_boosting.predictor.TreePredictor",
-     "sklearn.neighbors._kd_tree.KDTree", "sklearn.neighbors._ball_tree.BallTree",
-     "sklearn._loss.loss.HalfTweedieLoss", "sklearn._loss.loss.HalfTweedieLossIdentity",
-     "sklearn.utils._bunch.Bunch"]
-    + [f"sklearn.metrics._dist_metrics.{name}Distance64"
-       for name in ("Chebyshev", "Euclidean", "Manhattan", "Minkowski")]
-    + [f"sklearn.neural_network._stochastic_optimizers.{name}Optimizer" for name in ("Adam", "SGD")]
-    + [f"sklearn.gaussian_process.kernels.{name}" for name in ("ConstantKernel", "DotProduct", "Exponentiation",
-       "ExpSineSquared", "Matern", "Product", "RationalQuadratic", "RBF", "Sum", "WhiteKernel")]
-)  # fmt: skip
-CLASSES = {*" ".join(ESTIMATORS.values()).split(), "FunctionTransformer", "LabelBinarizer", "_BinMapper"}
+CLASSES = {*(name.rpartition(".")[2] for name in ESTIMATORS), "FunctionTransformer", "LabelBinarizer", "_BinMapper"}
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, partial)
 
 
@@ -71,7 +59,7 @@ def load(content: bytes) -> BaseEstimator:
 def _types(content: bytes) -> list[str]:
     """Return the types that skops does not trust by default, all of which must be known here."""
     found: list[str] = skops.io.get_untrusted_types(data=content)
-    if unknown := sorted(set(found) - TYPES):
+    if unknown := sorted(set(found) - PARTS):
         raise UserError(f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor")
     return found
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -42,7 +41,6 @@ class Imitation:
         seed: of the random split of the validation.
 
     Attributes:
-        kind: as for `PPO`.
         policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
         keys: entries that a batch must have.
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
@@ -106,19 +104,12 @@ class Imitation:
             self.dataset = self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Add the guide's actions in a batch to the data set, and fit the regressor to it.
-
-        Args:
-            batch: [*B, T] with `keys`.
-            progress: not used.
+        """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
 
         Returns:
             The number of `samples`; `target_variance`, the mean squared error of predicting the mean; `mse_ahead` and
             `r2_ahead`, on this batch before the fit; `mse_training` and `r2_training`, on the data set after the fit;
-            with `validate`, the metrics of `cross_validate`.
-
-        Raises:
-            UserError: if there are too few samples or tracks to validate.
+            with `validate`, the metrics (and errors) of `cross_validate`.
         """
         pairs = self._pairs(batch)
         dataset: TensorDictBase = pairs if self.dataset is None else torch.cat([self.dataset, pairs])

@@ -45,15 +45,14 @@ class Regressor(nn.Module, ABC):
 class NetworkRegressor(Regressor):
     """A tanh network, fitted to standardised inputs and outputs by least squares with Adam.
 
+    A value out of range is a `ValueError`.
+
     Args:
         hidden: widths of the hidden layers.
         epochs: passes over the data.
         minibatch: samples in a minibatch.
         learning_rate: of Adam, a number or a schedule over the fit.
         seed: of the initial weights and of the order of minibatches.
-
-    Raises:
-        ValueError: for a value out of range.
     """
 
     layers: MLP
@@ -121,13 +120,8 @@ class NetworkRegressor(Regressor):
 class SklearnRegressor(Regressor):
     """A regressor of scikit-learn, which may be a pipeline or a search.
 
-    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to 0.
-
-    Args:
-        estimator: the regressor; only its parameters are used.
-
-    Raises:
-        ValueError: if it is not a regressor of scikit-learn.
+    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to 0. Any other
+    `estimator`, of which only the parameters are used, is a `ValueError`.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression

@@ -26,7 +26,8 @@ def cross_validate(
     """Return the errors of fresh regressors on a random fifth of the samples and on left-out tracks.
 
     The paper tests on random samples. Consecutive states are nearly equal, so most of these have a near copy among the
-    training samples. The error on left-out tracks is an estimate of the error on a new track.
+    training samples. The error on left-out tracks is an estimate of the error on a new track. Too few samples, or only
+    one track, are a `UserError`.
 
     Args:
         regressor: its `fresh` copies are fitted.
@@ -37,9 +38,6 @@ def cross_validate(
 
     Returns:
         `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`: see `scores`.
-
-    Raises:
-        UserError: if there are too few samples, or only one track.
     """
     if len(x) < MIN_SAMPLES:
         raise UserError(
@@ -68,8 +66,7 @@ def cross_validate(
 def group_splits(groups: Tensor) -> list[Split]:
     """Return at most ten splits of rows with group numbers [N]; each row is tested once, no group is on both sides.
 
-    Raises:
-        UserError: if there is only one group.
+    A single group is a `UserError`.
     """
     labels = groups.cpu().numpy()
     count = len(np.unique(labels))

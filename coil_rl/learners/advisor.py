@@ -12,9 +12,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -26,7 +25,7 @@ from coil_rl.learners.ppo import PPO, standardise
 
 
 class Advisor(PPO):
-    """The ADVISOR learner.
+    """The ADVISOR learner; errors are those of `PPO`.
 
     Args:
         env: the env, with advice.
@@ -34,9 +33,6 @@ class Advisor(PPO):
         alpha: the larger, the better a step must be imitated to be learned by imitation.
         guide: row of the advice.
         options: as for `PPO`.
-
-    Raises:
-        ValueError: as `PPO`.
     """
 
     with_memory = False

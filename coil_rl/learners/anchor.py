@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
+from tensordict import NestedKey
 from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict.utils import NestedKey
+from tensordict import NestedKey
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torchrl.data import Binary, Categorical, MultiCategorical, TensorSpec, Unbounded

@@ -14,13 +14,12 @@ from functools import cached_property, partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict.utils import expand_as_right
 from torch import Tensor
 from torch.distributions import Categorical
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_exploration_type
 from torchrl.objectives import SACLoss
 
 from coil_rl.envs.limits import check_range
@@ -123,9 +122,7 @@ class Proposals(Critics):
 class ProposalLoss(SACLoss):
     """TorchRL's loss of SAC with the target of IBRL, and the loss of the second policy if there is one.
 
-    Args:
-        choice: makes `Proposals` of a policy and this loss, with the keyword `editor`.
-        arguments: as for `SACLoss`.
+    `choice` makes `Proposals` of a policy and this loss, with the keyword `editor`.
     """
 
     def __init__(self, choice: partial[Proposals], **arguments: Any) -> None:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Literal
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torch.distributions import Categorical, Normal, kl_divergence
 from torchrl.modules import TanhNormal
@@ -23,7 +22,9 @@ EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fracti
 
 
 class KickstartLoss:
-    """Auxiliary loss of a policy: its distance from the action g of a guide.
+    """Auxiliary loss of a policy: its distance from the action g of a guide. The metric is `loss_NAME`.
+
+    An unknown kind, or a scale that is not positive, is a `ValueError`.
 
     Args:
         coefficient: of the loss, a number or a schedule.
@@ -32,12 +33,6 @@ class KickstartLoss:
         scale: standard deviation of the guide for the divergence, before squashing.
         guide: index of the guide in the advice.
         advice_key: entry with the advice, [N, n_guides, A].
-
-    Attributes:
-        name: the metric is `loss_NAME`.
-
-    Raises:
-        ValueError: for an unknown kind, or a scale that is not positive.
     """
 
     name = "guide"
@@ -92,11 +87,7 @@ class FilteredKickstartLoss(KickstartLoss):
 
     The weight of a state is 1 where the critics' mean value of g is larger than that of the policy's action, else 0
     (Q-filter, Nair et al. 2018); or `soft`, the probability of this by the spread of the critics (SPReD, 2025):
-    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)).
-
-    Args:
-        soft: see above.
-        options: as for `KickstartLoss`.
+    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)). Other arguments are those of `KickstartLoss`.
     """
 
     def __init__(self, *, soft: bool = False, **options: Any) -> None:

@@ -6,14 +6,13 @@ from functools import partial
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
     NormalParamExtractor,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
     TensorDictSequential,
 )
-from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
 from torch.distributions import Independent
@@ -93,11 +92,9 @@ class ChoicesHead(nn.Module):
 
 
 class Choices(Independent):
-    """Distribution of several independent choices: that of each given by logits [*batch, *event, n].
+    """Distribution of several independent choices, of each by the logits of its options [*batch, *event, n].
 
-    Args:
-        logits: of the options.
-        event_dims: number of dimensions of an action, one index for each choice.
+    An action, one index for each choice, has `event_dims` dimensions.
     """
 
     def __init__(self, logits: Tensor, event_dims: int) -> None:
@@ -156,11 +153,7 @@ class ClippedNormal(SafeProbabilisticModule):
 
 
 def action_spec(env: EnvBase) -> TensorSpec:
-    """Return the spec of the action of an env.
-
-    Raises:
-        ValueError: if the env has several entries for actions, or none that a policy can choose.
-    """
+    """Return the spec of the action of an env; several actions, or one no policy can choose, are a `ValueError`."""
     if len(env.action_keys) != 1:
         names = ", ".join(map(str, env.action_keys))
         raise ValueError(f"this env has the actions {names}, but a policy chooses one; take another env")
@@ -259,10 +252,8 @@ def memory(
 ) -> list[TensorDictModuleBase]:
     """Return the modules of a policy that remember the entries of an episode; they write `remembered` [*batch, H].
 
-    `read` are the keys under which the modules read the entries `in_keys` of the env.
-
-    Raises:
-        ValueError: if the env does not carry the state.
+    `read` are the keys under which the modules read the entries `in_keys` of the env. An env that does not carry the
+    state is a `ValueError`.
     """
     carried = {key: spec.shape[len(env.batch_size) :] for key, spec in env.observation_spec.items(True, True)}
     if IS_INIT not in carried or carried.get(STATE) != (1, network.state):

@@ -3,46 +3,38 @@
 import math
 from collections import deque
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners.networks import GlobalScaleHead
+from coil_rl.transforms.action_space import nested_key
 
 
+@dataclass(eq=False)
 class NoiseDecay:
     """Upper limit of the standard deviation of a policy, which decays exponentially once episodes no longer fail.
 
-    The agent needs the noise until it can do its task. Later it only makes the actions rough.
-
-    Args:
-        end: limit at the end of the run, before squashing.
-        failure: entry after a step that is true where an episode fails.
-        tolerance: share of failures among the last episodes up to which the failures have stopped.
-        episodes: the number of these episodes.
-
-    Raises:
-        ValueError: for a value out of range.
+    The agent needs the noise until it can do its task. Later it only makes the actions rough. A value out of range is a
+    `ValueError`.
     """
 
-    def __init__(
-        self,
-        end: float = 0.05,
-        *,
-        failure: NestedKey | Sequence[str] = "terminated",
-        tolerance: float = 0.01,
-        episodes: int = 200,
-    ) -> None:
-        check_range(0, above=True, end=end)
-        check_range(0, 1, tolerance=tolerance)
-        check_range(1, episodes=episodes)
-        self.end, self.tolerance = end, tolerance
-        self.key: NestedKey = ("next", failure) if isinstance(failure, str) else ("next", *failure)
-        self.failures: deque[bool] = deque(maxlen=episodes)
+    end: float = 0.05  # limit at the end of the run, before squashing
+    _: KW_ONLY
+    failure: NestedKey | Sequence[str] = "terminated"  # entry after a step that is true where an episode fails
+    tolerance: float = 0.01  # share of failures among the last episodes up to which the failures have stopped
+    episodes: int = 200  # number of these episodes
+
+    def __post_init__(self) -> None:
+        check_range(0, above=True, end=self.end)
+        check_range(0, 1, tolerance=self.tolerance)
+        check_range(1, episodes=self.episodes)
+        self.key: NestedKey = unravel_key(("next", nested_key(self.failure)))
+        self.failures: deque[bool] = deque(maxlen=self.episodes)
         self.begin: tuple[float, float] | None = None  # progress and standard deviation
         self.scales: list[Tensor] = []  # logarithms of the standard deviations
 

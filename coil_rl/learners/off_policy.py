@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, Literal
 
 import torch
-from tensordict import TensorDict, TensorDictBase, unravel_key
-from tensordict.utils import NestedKey, expand_as_right
+from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
+from tensordict.utils import expand_as_right
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate

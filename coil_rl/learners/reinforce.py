@@ -28,9 +28,7 @@ from coil_rl.schedules import Linear, Schedule
 class Reinforce(A2C):
     """The REINFORCE learner: A2C with the whole return, lambda = 1; `standardise` then concerns G - b.
 
-    Args:
-        env, in_keys, learning_rate, options: as for `A2C`.
-        baseline: "critic", a network trained on the returns, or "none".
+    The `baseline` is "critic", a network trained on the returns, or "none"; other arguments are those of `A2C`.
     """
 
     def __init__(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
 from torch import Tensor
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import ExplorationType, set_exploration_type
 
 ADVICE = "guide_action"
 
@@ -96,8 +96,7 @@ def _act(act: Act, states: TensorDictBase, advice: Tensor) -> Tensor:
 def split_policy(policy: TensorDictModuleBase) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
     """Split a policy into its first module if that writes `guide_action`, else None, and modules that read it.
 
-    Raises:
-        ValueError: if the policy does not read advice.
+    A policy that does not read advice is a `ValueError`.
     """
     advising, acting = None, policy
     if isinstance(policy, TensorDictSequential) and ADVICE in policy.module[0].out_keys:

@@ -1,33 +1,33 @@
-"""Sections of a track: straight, left turn, right turn, turn entry and turn exit; and maps of advice."""
+"""Where the states of a survey are: in sections of a track (straight, turns, entry, exit), or along the steps."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
+from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
-from tensordict import TensorDictBase
-from tensordict.utils import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.limits import check_range
-from coil_rl.envs.track import AS_COMPLEX, Track, resample
+from coil_rl.envs.track import AS_COMPLEX, Array, Track, resample
 from coil_rl.listening.measures import drawn
-from coil_rl.report import draw_listening_map, write_csv
+from coil_rl.report import draw_listening_map, style, write_csv
 
 if TYPE_CHECKING:
     from coil_rl.listening.survey import Survey
 
-Array = NDArray[np.float64]
-
 SECTIONS = ("straight", "left", "right", "entry", "exit")
 STRAIGHT, LEFT, RIGHT, ENTRY, EXIT = range(len(SECTIONS))
 SMOOTHING = 1.0  # m
+POINTS = 100  # of a curve, at most
 
 
 def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
@@ -66,29 +66,27 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
     return section
 
 
+@dataclass(eq=False)
 class TrackSections:
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
     The env writes `info` with the index of the `track` and the `pose` of each car, as `ConeTrackEnv` does.
-
-    Args:
-        tracks: of the env, in its order.
-        turn_radius: as for `classify`, in m.
-        approach: as for `classify`, in m.
-        bin: m of track per value of the maps, rounded so that their number on a track is whole.
     """
 
-    names = SECTIONS
+    names: ClassVar[tuple[str, ...]] = SECTIONS
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
+    tracks: Sequence[Track]  # of the env, in its order
+    _: KW_ONLY
+    turn_radius: float = 10.0  # as for `classify`, m, as the next one
+    approach: float = 4.0
+    bin: float = 1.0  # m of track per value of the maps, rounded so that their number on a track is whole
 
-    def __init__(
-        self, tracks: Sequence[Track], *, turn_radius: float = 10.0, approach: float = 4.0, bin: float = 1.0
-    ) -> None:
-        check_range(0.5, 1000, turn_radius=turn_radius)
-        check_range(0.1, 100, approach=approach, bin=bin)
-        self.tracks, self.bin = list(tracks), bin
-        self.lines = [smooth_line(track) for track in tracks]  # [P, 2] m each
-        self.sections = [classify(line, turn_radius, approach) for line in self.lines]  # [P] each, indices in SECTIONS
+    def __post_init__(self) -> None:
+        check_range(0.5, 1000, turn_radius=self.turn_radius)
+        check_range(0.1, 100, approach=self.approach, bin=self.bin)
+        self.lines = [smooth_line(track) for track in self.tracks]  # [P, 2] m each
+        # Indices in SECTIONS, [P] each.
+        self.sections = [classify(line, self.turn_radius, self.approach) for line in self.lines]
         points = [torch.as_tensor(line, dtype=torch.float32) for line in self.lines]
         self._points = pad_sequence(points, batch_first=True, padding_value=1e6)  # padded with points far away
         self._section = pad_sequence([torch.as_tensor(of_line) for of_line in self.sections], batch_first=True)
@@ -118,27 +116,20 @@ class TrackSections:
             Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m), `curvature` (1/m) and
             `section` of the bin's middle, number of `states`, and means of `agreement`, `intervention` and `gradient`.
         """
+        bins = [self._bins(line) for line in self.lines]
+        track, point = data.place["track"], data.place["point"]
+        bin_of_state = np.array([bins[index][p] for index, p in zip(track.tolist(), point.tolist(), strict=True)])
         rows = []
-        for index, track in enumerate(self.tracks):
-            line, on_track = self.lines[index], data.place["track"] == index
-            bins = self._bins(line)
-            _, first, lengths = np.unique(bins, return_index=True, return_counts=True)
-            middle = first + lengths // 2
-            step, bend = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1), curvature(line)
-            bin_of_state = bins[data.place["point"][on_track]]
-            states = np.bincount(bin_of_state, minlength=len(first))
-            for slot, guide in enumerate(data.guides):
-                sums = {
-                    name: np.bincount(bin_of_state, values[on_track, slot]) for name, values in data.measures.items()
-                }
-                for k in np.flatnonzero(states).tolist():
-                    x, y = line[middle[k]].tolist()
-                    rows.append({
-                        "track": track.name, "guide": guide, "bin": k, "from": float(step[: first[k]].sum()),
-                        "x": x, "y": y, "curvature": float(bend[middle[k]]),
-                        "section": SECTIONS[self.sections[index][middle[k]]], "states": int(states[k]),
-                        **{name: float(of_bins[k] / states[k]) for name, of_bins in sums.items()},
-                    })  # fmt: skip
+        for row in data.means(track=track, bin=bin_of_state):
+            index, line = row["track"], self.lines[row["track"]]
+            within = np.flatnonzero(bins[index] == row["bin"])
+            middle = within[len(within) // 2]
+            step = np.linalg.norm(np.diff(line[: within[0] + 1], axis=0), axis=1)
+            rows.append(row | {
+                "track": self.tracks[index].name, "from": float(step.sum()), "x": float(line[middle, 0]),
+                "y": float(line[middle, 1]), "curvature": float(curvature(line)[middle]),
+                "section": SECTIONS[self.sections[index][middle]],
+            })  # fmt: skip
         return rows
 
     def measure_on_lines(
@@ -167,3 +158,36 @@ class TrackSections:
         total = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
         count = min(len(line), max(1, round(total / self.bin)))
         return np.arange(len(line)) * count // len(line)
+
+
+class WholeEpisode:
+    """No sections; the pictures show each measure along the steps of the episodes."""
+
+    names: tuple[str, ...] = ()
+    record: ClassVar[Mapping[str, NestedKey]] = {}
+
+    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
+        """Return nothing: the step is known."""
+        return {}
+
+    def section(self, place: TensorDictBase) -> Tensor:
+        """Return 0 for each place."""
+        return torch.zeros(place.batch_size, dtype=torch.int64, device=place.device)
+
+    def draw(self, data: Survey, folder: Path) -> None:
+        """Draw the mean of each measure against the step, and write the numbers as `listening.csv`."""
+        size = max(1, -(-int(data.step.max() + 1) // POINTS))
+        rows = data.means(**{"from": data.step // size * size})
+        strokes = style.strong_strokes(data.guides)
+        handles = [
+            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide) for guide, stroke in strokes.items()
+        ]
+        for measure, title, label, name in drawn(data.measures):
+            with style.picture(folder / name, title, handles, 3.6) as figure:
+                axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
+                style.lighten(axes)
+                for guide, stroke in strokes.items():
+                    own = [row for row in rows if row["guide"] == guide]
+                    x, y = [row["from"] for row in own], [row[measure] for row in own]
+                    axes.plot(x, y, color=stroke.colour, ls=stroke.linestyle, lw=1.5)
+        write_csv(rows, folder / "listening.csv")

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import EnvBase
 
@@ -55,6 +55,19 @@ class Survey:
     section: NDArray[np.int64]  # [N], index of the section
     advice: Tensor  # [N, n_guides, A]
     measures: dict[str, Array]  # agreement, intervention and gradient, [N, n_guides] each
+
+    def means(self, **groups: NDArray[np.int64]) -> list[dict[str, Any]]:
+        """Return a row for each guide and group of states, given its numbers [N] by name.
+
+        Rows have `guide`, the groups, the number of `states`, and the means of the measures.
+        """
+        rows = []
+        for slot, guide in enumerate(self.guides):
+            table = pd.DataFrame({**groups, **{name: values[:, slot] for name, values in self.measures.items()}})
+            grouped = table.groupby(list(groups))
+            means = grouped.size().rename("states").to_frame().join(grouped.mean()).reset_index()
+            rows += [{"guide": guide} | row for row in means.to_dict("records")]
+        return rows
 
 
 def survey(

@@ -1,5 +1,6 @@
 """`coil-distill`: train a network that imitates each guide, and print how well it does."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -7,22 +8,10 @@ from omegaconf import DictConfig
 
 from coil_rl.programs import app
 
-COLUMNS = {
-    "guide": ("guide", ""),
-    "samples": ("samples", ".0f"),
-    "r2_training": ("R^2, training data", ".3f"),
-    "r2_ahead": ("R^2, on its own drives", ".3f"),
-    "mse_ahead": ("squared error there", ".5f"),
-    "guide_reward": ("guide's reward", ".1f"),
-    "reward": ("proxy's reward", ".1f"),
-    "completed": ("completed", ".0%"),
-    "folder": ("folder", ""),
-}
-
 
 def distill(config: DictConfig) -> float:
     """Train the missing proxies of all guides, and return the lowest mean test reward of a proxy."""
-    from coil_rl.report import markdown_table
+    from coil_rl.report.table import TABLES, markdown_table
     from coil_rl.train import distillation
     from coil_rl.train.build import build_guides
     from coil_rl.train.run import run
@@ -32,7 +21,7 @@ def distill(config: DictConfig) -> float:
         proxy_config = distillation.proxy_config(config, name)
         reward = run(proxy_config, wait=True)
         table.append({"guide": name, "reward": reward, **_measures(Path(proxy_config.run_dir))})
-    print(markdown_table(table, COLUMNS))
+    print(markdown_table(table, TABLES["proxies"]["columns"]))
     worst = min(table, key=lambda row: float(row["reward"]))
     print(
         f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:.1f}, "
@@ -45,7 +34,7 @@ def _measures(folder: Path) -> dict[str, Any]:
     from coil_rl.report.runs import read_runs
 
     (run,) = read_runs([folder])
-    learned = {name: run.curve[-1][f"learner/{name}"] for name in COLUMNS if f"learner/{name}" in run.curve[-1]}
+    learned = {name.removeprefix("learner/"): value for name, value in run.curve[-1].items()}
     means = run.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
     rewards = {"guide_reward": float(means["reward"].iloc[0]), "completed": float(means["completed"].iloc[-1])}
     return learned | rewards | {"folder": str(folder)}
@@ -62,10 +51,7 @@ def check(config: DictConfig) -> None:
     make_folder(Path(config.proxy.folder))
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(distill, "distill", check)
-
+main = partial(app.run, distill, "distill", check)
 
 if __name__ == "__main__":
     main()

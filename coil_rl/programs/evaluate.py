@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,10 +47,8 @@ def evaluate(config: DictConfig) -> float:
 def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
     """Return the configuration of a run with the requested evaluation, and its policy.
 
-    Everything is as in the run but for what the command line gives.
-
-    Raises:
-        UserError: if the folder holds no complete run, or one without tracks although tracks are given.
+    Everything is as in the run but for what the command line gives. A folder without a complete run, or one without
+    tracks although tracks are given, is a `UserError`.
     """
     from coil_rl.errors import UserError
     from coil_rl.train.build import build_env
@@ -92,10 +91,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(evaluate, "evaluate", check)
-
+main = partial(app.run, evaluate, "evaluate", check)
 
 if __name__ == "__main__":
     main()

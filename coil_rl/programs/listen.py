@@ -1,5 +1,6 @@
 """`coil-listen`: how much a trained agent uses the advice of each guide, and where."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -7,23 +8,6 @@ from omegaconf import DictConfig
 
 from coil_rl.errors import UserError
 from coil_rl.programs import app
-
-COLUMNS = {
-    "guide": ("guide", ""),
-    "section": ("section", ""),
-    "share": ("of the states", ".0%"),
-    "agreement": ("|a - g|", ".3f"),
-    "intervention": ("intervention", ".4f"),
-    "gradient": ("gradient", ".3f"),
-    "lost": ("return lost", ".1f"),
-    "completed": ("completed", ".0%"),
-}
-NOTES = """
-Means over the states of deterministic episodes in all cases, in action units. intervention: change of the action when
-the guide's advice is replaced by its advice in another state. return lost and completed: with the guide's advice
-replaced by its mean in that section. """
-CONTINUOUS_NOTE = "gradient: |da/dg|."
-DISCRETE_NOTE = "Actions are discrete: |a - g| and intervention are 0\nfor the same action and 1.414 for any other."
 
 
 def listen(config: DictConfig) -> None:
@@ -39,6 +23,7 @@ def listen(config: DictConfig) -> None:
     from coil_rl.listening.measures import split_policy
     from coil_rl.programs.evaluate import restore
     from coil_rl.report import markdown_table, write_csv
+    from coil_rl.report.table import TABLES
     from coil_rl.train.build import build, build_env
     from coil_rl.train.evaluate_run import build_evaluation
 
@@ -67,15 +52,17 @@ def listen(config: DictConfig) -> None:
         mean_advice = data.advice.mean(0)
         episodes = surveys.drive_ablated(env, agent, sections, evaluation, removed, mean_advice, tick=bar.update)
     table = surveys.table_by_section(data, sections, evaluation, dict(zip(removed, episodes, strict=True)))
-    columns = {key: column for key, column in COLUMNS.items() if key in table[0]}
-    notes = NOTES + CONTINUOUS_NOTE
+    texts = TABLES["listening"]
+    columns = {key: column for key, column in texts["columns"].items() if key in table[0]}
+    kind = "continuous"
     if np.isnan(data.measures["gradient"]).all():
         del columns["gradient"]
-        notes = NOTES + DISCRETE_NOTE
+        kind = "discrete"
+    notes = f"{texts['notes']} {texts[kind]}"
     for head in (part for part in agent.modules() if isinstance(part, AnchoredHead)):
         weights = zip(data.guides, head.weight.tolist(), strict=True)
         notes += "\nWeight of the anchor: " + ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights) + "."
-    page = f"{markdown_table(table, columns)}\n{notes}"
+    page = f"{markdown_table(table, columns)}\n\n{notes}"
     write_text(folder / "listening.md", page)
     write_csv(table, folder / "listening_sections.csv")
     sections.draw(data, folder)
@@ -100,10 +87,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(listen, "listen", check)
-
+main = partial(app.run, listen, "listen", check)
 
 if __name__ == "__main__":
     main()

@@ -8,6 +8,7 @@ import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -158,10 +159,7 @@ def check(config: DictConfig) -> None:
     make_folder(Path(config.run_dir))
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(replay, "replay", check)
-
+main = partial(app.run, replay, "replay", check)
 
 if __name__ == "__main__":
     main()

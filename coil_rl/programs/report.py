@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -111,10 +112,7 @@ def check(config: DictConfig) -> None:
         raise UserError(f"folder={first} is not writable; put a writable folder first: folder=[YOURS,{first}]")
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(report, "report", check)
-
+main = partial(app.run, report, "report", check)
 
 if __name__ == "__main__":
     main()

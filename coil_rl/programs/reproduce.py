@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,11 +71,7 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 
 
 def requested(config: DictConfig) -> list[str]:
-    """Return the names in `results` of the requested results.
-
-    Raises:
-        UserError: if one does not exist, or none is requested.
-    """
+    """Return the names in `results` of the requested results, at least one; an unknown one is a `UserError`."""
     if config.all:
         return [str(name) for name in config.results]
     available = {_key(str(name)): str(name) for name in config.results}
@@ -122,10 +119,7 @@ def _key(name: str) -> str:
     return f"{kind}={rest}" if kind in KINDS and rest else f"claim={name}"
 
 
-def main() -> None:
-    """Entry point."""
-    app.run(reproduce, "reproduce", check)
-
+main = partial(app.run, reproduce, "reproduce", check)
 
 if __name__ == "__main__":
     main()

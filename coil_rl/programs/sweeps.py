@@ -24,17 +24,11 @@ from coil_rl.train.run_folder import is_evaluated
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of an experiment.
+    """The runs of an experiment."""
 
-    Attributes:
-        experiment: name of its file.
-        command: arguments of `coil-train` for the whole sweep.
-        all_folders: of the runs.
-    """
-
-    experiment: str
-    command: tuple[str, ...]
-    all_folders: tuple[Path, ...]
+    experiment: str  # name of its file
+    command: tuple[str, ...]  # arguments of `coil-train` for the whole sweep
+    all_folders: tuple[Path, ...]  # of the runs
 
     @property
     def missing(self) -> list[Path]:
@@ -45,8 +39,7 @@ class Sweep:
 def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> Sweep:
     """Return the runs of an experiment file with overrides and other seeds. Hydra must be initialised.
 
-    Raises:
-        UserError: if the file defines no sweep, or an override does not fit one of its runs.
+    A file without a sweep, or an override that does not fit one of its runs, is a `UserError`.
     """
     # Hydra also composes the overrides alone first.
     params: dict[str, Any] = dict(_composed(experiment, *overrides).hydra.sweeper.params or {})
@@ -66,11 +59,7 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
 
 
 def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
-    """Run a sweep, with overrides of Hydra's launcher, unless all its runs are finished.
-
-    Raises:
-        UserError: if it ends before all runs are finished.
-    """
+    """Run a sweep, with overrides of Hydra's launcher; its end before all runs are finished is a `UserError`."""
     if not sweep.missing:
         return
     command = [*sweep.command, *launcher]

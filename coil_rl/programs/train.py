@@ -23,8 +23,7 @@ def train(config: DictConfig) -> float:
 def resume(folder: Path) -> float:
     """Finish a run that was stopped, and return the same as `train`.
 
-    Raises:
-        UserError: if the folder holds no run, or one that cannot be resumed or would write outside of its folder.
+    A folder without a run, or one that cannot be resumed or would write outside of its folder, is a `UserError`.
     """
     from coil_rl.train.check import check
     from coil_rl.train.run import resume_run

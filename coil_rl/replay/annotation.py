@@ -48,7 +48,7 @@ def annotate(
     Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue
     right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers have the stamp
     and the frame of the scan. A boundary from the memory is faded. Metadata and attachments are copied. Equal results
-    make equal bytes.
+    make equal bytes. A recording that can no longer be read is a `RecordingError`.
 
     Args:
         result: of one recording.
@@ -59,9 +59,6 @@ def annotate(
         laser_yaw: radians, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
         about: entries of the metadata record `coil`, to which the SHA-256 of the recording is added.
         attachments: YAML files by name.
-
-    Raises:
-        RecordingError: if the recording can no longer be read.
     """
     recording = result.recording
     contents = read_messages(recording.path, [*topics, *TRANSFORMS])

@@ -9,8 +9,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
 from coil_rl.envs.recordings.reading import Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv

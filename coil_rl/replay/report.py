@@ -12,14 +12,10 @@ from matplotlib.patches import Patch
 from coil_rl.envs import Perception
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import markdown_table, style
+from coil_rl.report.table import TABLES
 
 CHECKED_SCANS = 512  # of a recording at most, evenly spread
 MOST = 0.5  # share of the clusters
-
-NOTES = """
-Actions are fractions of {max_steering:.0f} degrees. smoothness: mean |a - mean of the last 20 actions|. omega: mean
-|omega|. from X: mean |a - x|. No policy controlled the drive: each action is the policy's choice at a scan of a drive
-that went another way. recorded: the steering that the last command before the next scan means at its speed."""
 
 
 def describe(result: OpenLoop) -> str:
@@ -59,13 +55,13 @@ def caution(result: OpenLoop, perception: object) -> str:
             problems.append(f"{rejected:.0%} of the clusters in sight are unlike any cone of the training")
     if not problems:
         return ""
-    remedy = "check env.perception, or train the classifier on your own cones with coil-robot steps=[train]"
+    remedy = "check env.perception, or train the classifier on your own cones with coil-reproduce figure=25"
     return f"{recording.path}: {' and '.join(problems)}, so the actions mean little; {remedy}"
 
 
 def notes(max_steering: float) -> str:
     """Return the explanation of the table; `max_steering` in radians."""
-    return NOTES.format(max_steering=np.degrees(max_steering)).strip()
+    return str(TABLES["replay"]["notes"].format(max_steering=np.degrees(max_steering)))
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:

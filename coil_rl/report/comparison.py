@@ -9,14 +9,11 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from coil_rl.errors import UserError
 from coil_rl.report.runs import DRIVER, GUIDE, Run
-from coil_rl.report.statistics import Estimate, count_of_seeds, estimate, holm, wins
+from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 from coil_rl.train.measures import Measure
-
-Array = NDArray[np.float64]
 
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
@@ -163,8 +160,7 @@ class Comparison:
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
     """Group the finished runs, at least one, by label; `actions` of the agents are "deterministic" or "sampled".
 
-    Raises:
-        UserError: if two runs have the same label and seed, or runs of one label differ in cases.
+    Two runs with the same label and seed, or with the same label and other cases, are a `UserError`.
     """
     finished = [run for run in runs if run.finished]
     names = dict.fromkeys(run.label for run in finished)

@@ -13,13 +13,11 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import EngFormatter
-from numpy.typing import NDArray
 
 from coil_rl.report import style
 from coil_rl.report.runs import CHOICE, RETURN, Run
-from coil_rl.report.statistics import mean_interval
+from coil_rl.report.statistics import Array, mean_interval
 
-Array = NDArray[np.float64]
 Rows = Sequence[Mapping[str, object]]
 
 RETURNS = "return from the cases of the evaluation"
@@ -95,10 +93,7 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
 
 
 def draw_curve_grid(
-    runs: Mapping[str, Sequence[Rows]],
-    path: str | os.PathLike[str],
-    *,
-    guides: Mapping[str, float] | None = None,
+    runs: Mapping[str, Sequence[Rows]], path: str | os.PathLike[str], *, guides: Mapping[str, float] | None = None
 ) -> None:
     """Draw one small learning curve per label, at least one, with the other labels faint behind it.
 

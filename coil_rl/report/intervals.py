@@ -51,11 +51,7 @@ def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
 
 
 def draw_intervals(
-    panels: Mapping[str, Sequence[Interval]],
-    path: str | os.PathLike[str],
-    *,
-    measure: str,
-    title: str | None = None,
+    panels: Mapping[str, Sequence[Interval]], path: str | os.PathLike[str], *, measure: str, title: str | None = None
 ) -> None:
     """Draw one panel, or several side by side that share their rows; `panels` are at least one row by heading."""
     rows = [row for panel in panels.values() for row in panel]

@@ -18,18 +18,16 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal
 from matplotlib.patheffects import Stroke as StrokeEffect
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image
 from tqdm import tqdm
 
 from coil_rl.files import whole_file
 from coil_rl.report import style
-from coil_rl.report.track_plot import TrackPlot
+from coil_rl.report.track_plot import Array, TrackPlot
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track
-
-Array = NDArray[np.float64]
 
 GIF_RESOLUTION = 100  # dpi
 TAIL = 0.6  # seconds of the animation

@@ -5,41 +5,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import mean
 from typing import Any
 
-from coil_rl.report.comparison import Comparison
+from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import markdown_table
+from coil_rl.report.table import TABLES, markdown_table
 
 MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 
-COLUMNS = {
-    "driver": ("driver", ""),
-    "advice": ("advice", ""),
-    "seeds": ("seeds", ""),
-    "completed": ("completed", ".0%"),
-    "crashes": ("seeds with a crash (95 %)", ""),
-    "score cell": ("{score} (95 %)", ""),
-    "difference cell": ("difference to {other} (95 %)", ""),
-    "p": ("p", ".3f"),
-    "better": ("better than {other}", ".0%"),
-    "reward": ("reward", ".1f"),
-}
 NEEDS_GUIDE = {"needs_guide": ("guide at test time", "")}
-LEARNING_COLUMNS = {
-    "label": ("return in the cases of the evaluation", ""),
-    "seeds": ("seeds", ""),
-    "frames": ("frames", ",.0f"),
-    "guide": ("guide", ".1f"),
-    "first": ("first policy", ".1f"),
-    "until_90 cell": ("frames until 90 % of the guide", ""),
-    "until_100 cell": ("until 100 %", ""),
-    "area": ("area under the curve / frames", ".1f"),
-    "best": ("best policy", ".1f"),
-    "final": ("last policy", ".1f"),
-    "seconds": ("training (s)", ".0f"),
-}
 
 
 def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
@@ -51,7 +26,11 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
     hidden |= set() if comparison.normalised else {"reward"}
     hidden |= {key for key in ("completed", "crashes") if all(row[key] is None for row in rows)}
     measures = {name: each for group in comparison.groups for name, each in group.measures.items()}
-    columns = {key: (text.format(**names), spec) for key, (text, spec) in COLUMNS.items() if key not in hidden}
+    columns = {
+        key: (text.format(**names), spec)
+        for key, (text, spec) in TABLES["drivers"]["columns"].items()
+        if key not in hidden
+    }
     columns |= {
         name: (measure.title, measure.format)
         for name, measure in measures.items()
@@ -63,7 +42,7 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
         *_parts(comparison, TERM, "term of the reward", ".1f"),
         *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
     ]
-    return "\n\n".join([f"## {heading}", table, *parts, _cases(comparison)])
+    return "\n\n".join([f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")])
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
@@ -107,27 +86,14 @@ def training(runs: Sequence[Run]) -> list[str]:
             row[f"{key} cell"] = f"{mean(reached):,.0f}{some}" if reached else None
         rows += [row] if not math.isnan(row["area"]) else []
     rows.sort(key=lambda row: -float(row["area"]))
-    return [markdown_table(rows, LEARNING_COLUMNS)] if rows else []
+    return [markdown_table(rows, TABLES["learning"]["columns"])] if rows else []
 
 
 def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     """Return an explanation of the tables."""
-    text = (
-        "Drivers are ordered by the completed share, then by the mean. Intervals: t over seeds, of seeds with a crash "
-        "Clopper-Pearson."
-    )
-    if normalised:
-        text += (
-            " Reward / guide's: each reward is divided by the best guide's in the same case (where it crashes or "
-            "earns nothing, by its mean over the others)."
-        )
-    if against is not None:
-        text += (
-            f" Difference to {_other(against)}: of the same seed, p after Holm's correction for all rows (of sign "
-            f"flips from {SIGN_FLIP_SEEDS} seeds on, of a t test with fewer); better: the share of seeds and cases "
-            "with more."
-        )
-    return text + " Sampled actions also measure the noise of exploration." * sampled
+    used = {"order": True, "normalised": normalised, "against": against is not None, "sampled": sampled}
+    text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
+    return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
 
 
 def progress(finished: int, started: int) -> str:
@@ -156,9 +122,17 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
     return [markdown_table(rows, columns)] if rows else []
 
 
-def _cases(comparison: Comparison) -> str:
-    names = list(dict.fromkeys(case for group in comparison.groups for case in group.cases))
+def cases_table(groups: Sequence[Group], file: str) -> str:
+    """Return the mean reward by driver and case, with the completed share below 1; a hint at a file for many cases."""
+    names = dict.fromkeys(case for group in groups for case in group.cases)
     if len(names) > MAX_CASES:
-        return f"The rewards in each of the {len(names)} cases are in report_cases.csv."
-    rows = [{"driver": group.title} | group.by_seed("reward").mean().to_dict() for group in comparison.groups]
+        return f"The rewards in each of the {len(names)} cases are in {file}."
+    rows = []
+    for group in groups:
+        row: dict[str, Any] = {"driver": group.title}
+        for index, case in enumerate(group.cases):
+            means = group.means(index)
+            reward, completed = means["reward"], means.get("completed", 1.0)
+            row[case] = f"{reward:.1f} ({completed:.0%} completed)" if completed < 1 else reward
+        rows.append(row)
     return markdown_table(rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names})

@@ -17,7 +17,7 @@ from coil_rl.report import style
 from coil_rl.report.lines import animate_lines, draw_lines
 
 if TYPE_CHECKING:
-    from tensordict.utils import NestedKey
+    from tensordict import NestedKey
     from torchrl.envs import EnvBase
 
     from coil_rl.envs.track import Track
@@ -37,18 +37,13 @@ class Picture:
         raise NotImplementedError
 
 
+@dataclass(eq=False)
 class DrivenLines(Picture):
-    """Driven lines on the tracks as `lines.png`, and as an animation, `lines.gif`.
-
-    Args:
-        tracks: one for each case.
-        gif: whether to make the animation, for an env that has a `rate`.
-    """
+    """Driven lines on the tracks as `lines.png`, and as an animation, `lines.gif`."""
 
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
-
-    def __init__(self, tracks: Sequence[Track], gif: bool = True) -> None:
-        self.tracks, self.gif = tracks, gif
+    tracks: Sequence[Track]  # one for each case
+    gif: bool = True  # whether to make the animation, for an env that has a `rate`
 
     def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the lines."""

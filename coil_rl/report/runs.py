@@ -50,8 +50,7 @@ class Run:
 def read_runs(folders: Sequence[Path]) -> list[Run]:
     """Return all runs in some folders, at any depth, sorted by folder.
 
-    Raises:
-        UserError: if a folder is missing or holds no run, or a file of a run is damaged.
+    A folder that is missing or holds no run, and a damaged file of a run, are a `UserError`.
     """
     runs: dict[Path, Run] = {}
     for folder in folders:
@@ -98,7 +97,8 @@ def _read_run(folder: Path) -> Run:
     numbers = {}
     for name in ("guide_return", "training_time"):
         with file_of_a_run(path := folder / f"{name}.json", remedy):
-            numbers[name] = _read_numbers(path)
+            saved = json.loads(path.read_text()) if path.exists() else {}
+            numbers[name] = {key: float(value) for key, value in saved.items()}
     guide_returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
     return replace(
         run, evaluation=evaluation, measures=measures, curve=curve, guide_returns=guide_returns, seconds=seconds
@@ -134,7 +134,3 @@ def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("a row with more values than columns")
     return frame
-
-
-def _read_numbers(path: Path) -> dict[str, float]:
-    return {key: float(value) for key, value in json.loads(path.read_text()).items()} if path.exists() else {}

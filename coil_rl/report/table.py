@@ -3,26 +3,30 @@
 import csv
 import os
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from numbers import Real
+from typing import Any
 
 import pandas as pd
 import tabulate
+import yaml
 
 from coil_rl.files import whole_file
 
 tabulate.MIN_PADDING = 0  # extra width of headings
+# Columns and notes by table.
+TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
 
-def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, tuple[str, str]]) -> str:
+def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, Sequence[str]]) -> str:
     """Return a Markdown table; columns of numbers are right-aligned.
+
+    A column that no row has, or a number that does not fit its format, is a `ValueError`.
 
     Args:
         rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text stays as it is,
             so a cell may be a formatted "31.2 ± 0.4".
         columns: heading (with unit) and number format by key, in the order of the table.
-
-    Raises:
-        ValueError: if no row has a key of `columns`, or a number does not fit the format of its column.
 
     Example:
         >>> rows = [{"driver": "guide", "lap": 31.25, "crash": False}, {"driver": "agent", "lap": None, "crash": True}]

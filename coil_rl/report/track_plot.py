@@ -13,14 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
-from numpy.typing import NDArray
 
 from coil_rl.report import style
+from coil_rl.report.statistics import Array
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track
-
-Array = NDArray[np.float64]
 
 GAP = 0.22  # inches, as the next two
 NAME_HEIGHT = 0.26

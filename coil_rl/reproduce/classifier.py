@@ -1,117 +1,85 @@
 """Figure 25 of the paper: features of thin and thick cones, and the accuracy of their classifier."""
 
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sklearn.decomposition import PCA
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
 from coil_rl.envs.recordings.reading import Recording, read_recording
-from coil_rl.envs.robot.clusters import FEATURES
+from coil_rl.envs.robot.clusters import FEATURES, Array
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
-from coil_rl.robot.classifier import (
-    Scans,
-    Share,
-    accuracy,
-    clusters_in_range,
-    label_clusters,
-    recall,
-    save_classifier,
-    train_on_drives,
-)
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
+from coil_rl.robot import classifier as cones
 
-Array = NDArray[np.float64]
-
-PAPER_ACCURACY = Share(240, 243)
+PAGE = PAGES["figure_25"]
+PAPER_ACCURACY = cones.share_of(*PAGE["paper"])
 DRAW_EVERY = 4  # scans
 ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the plot
 
-COLUMNS = {
-    "measure": ("measure", ""), "of": ("of", ""), "share": ("share", ".4f"), "low": ("95 % from", ".4f"),
-    "high": ("to", ".4f"), "wrong": ("wrong", "d"), "total": ("total", "d"),
-}  # fmt: skip
 
-NOTES = """
-Shares of clusters within 1 m. Cross-validation leaves out pairs of drives ({folds}) and only tells thin cones from
-thick ones. Accuracy: on drives past both sides, not used in training; a cone classified as another object counts as
-wrong. Recall: cones within 1 m and hit by a beam, detected and classified correctly. The intervals (Wilson) assume
-independent clusters; those of neighbouring scans are correlated. The picture shows clusters of {kind} drives."""
-
-
+@dataclass(eq=False)
 class Figure25(Result):
     """Cone classifier, trained on recordings past cones of one side and tested on recordings past both sides.
 
     The classifier is saved as `cones.json` next to the picture. Without recordings, drives are simulated.
-
-    Args:
-        left: recordings past thin cones only, on the left; at least two.
-        right: recordings past thick cones only.
-        both: recordings past both sides with the cones' positions in their notes, for testing; without any, there is
-            only the cross-validation.
-        pairs: number of left and of right drives to simulate.
-        tests: number of drives past both sides to simulate.
-        scan: topic of the LiDAR.
-        odometry: topic of the odometry.
 
     Raises:
         ValueError: for numbers out of range, or recordings of one side only.
         RecordingError: for an unusable recording.
     """
 
-    def __init__(
-        self,
-        left: Sequence[str] = (),
-        right: Sequence[str] = (),
-        both: Sequence[str] = (),
-        *,
-        pairs: int = 5,
-        tests: int = 3,
-        scan: str = "/scan",
-        odometry: str | None = "/odom",
-    ) -> None:
-        if pairs < 2 or tests < 1:
-            raise ValueError(f"pairs={pairs} must be at least 2 and tests={tests} at least 1")
-        if bool(left) != bool(right) or (both and not left):
-            raise ValueError(f"left={list(left)} and right={list(right)} must both be given, or neither and no both")
-        self.pairs, self.tests, self.scan, self.odometry = pairs, tests, scan, odometry
-        self._read(left, right, both)
+    left: Sequence[str] = ()  # recordings past thin cones only, on the left; at least two
+    right: Sequence[str] = ()  # recordings past thick cones only
+    # Recordings past both sides with the cones' positions in their notes, for testing; without any, there is only the
+    # cross-validation.
+    both: Sequence[str] = ()
+    _: KW_ONLY
+    pairs: int = 5  # left and right drives to simulate
+    tests: int = 3  # drives past both sides to simulate
+    scan: str = "/scan"  # topic of the LiDAR
+    odometry: str | None = "/odom"  # topic of the odometry
 
-    def _read(self, left: Sequence[str], right: Sequence[str], both: Sequence[str]) -> None:
-        self.left, self.right, self.both = (
-            [read_recording(path, self.scan, self.odometry, None) for path in paths] for paths in (left, right, both)
-        )
-        self.test_drives = [labelled_drive(recording) for recording in self.both]
+    def __post_init__(self) -> None:
+        if self.pairs < 2 or self.tests < 1:
+            raise ValueError(f"pairs={self.pairs} must be at least 2 and tests={self.tests} at least 1")
+        if bool(self.left) != bool(self.right) or (self.both and not self.left):
+            given = f"left={list(self.left)} and right={list(self.right)}"
+            raise ValueError(f"{given} must both be given, or neither and no both")
+        self._read([self.left, self.right, self.both])
+
+    def _read(self, sides: Sequence[Sequence[str]]) -> None:
+        self.recordings = [[read_recording(path, self.scan, self.odometry, None) for path in side] for side in sides]
+        self.test_drives = [labelled_drive(recording) for recording in self.recordings[2]]
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
         if not self.left:
             with tqdm(total=2 * self.pairs + self.tests, desc="record", unit="drive", leave=False) as bar:
                 made = record_labelling_drives(stem.with_name("labelling"), self.pairs, self.tests, bar.update)
-            self._read(made["left"], made["right"], made["both"])
-        simulated = any("simulated" in recording.notes for recording in (*self.left, *self.right, *self.both))
+            self._read([made["left"], made["right"], made["both"]])
+        simulated = any(recording.simulated for side in self.recordings for recording in side)
         suffix = " (simulated)" if simulated else ""
-        left, right = _scans(self.left), _scans(self.right)
-        training = train_on_drives(left, right)
-        save_classifier(training.classifier, stem.with_name("cones.json"))
+        left, right = map(_scans, self.recordings[:2])
+        training = cones.train_on_drives(left, right)
+        cones.save_classifier(training.classifier, stem.with_name("cones.json"))
         classifier = training.classifier
         shares = {"paper, its own robot": {"all": PAPER_ACCURACY}}
-        shares["cross-validation"] = {"all": Share(training.correct, training.total)}
+        shares["cross-validation"] = {"all": cones.share_of(training.correct, training.total)}
         if self.test_drives:
-            labelled = label_clusters(self.test_drives)
-            shares["accuracy"] = accuracy(classifier, labelled)
-            shares |= {f"recall of {kind} cones": of for kind, of in recall(classifier, self.test_drives).items()}
+            labelled = cones.label_clusters(self.test_drives)
+            shares["accuracy"] = cones.accuracy(classifier, labelled)
+            shares |= {f"recall of {kind} cones": of for kind, of in cones.recall(classifier, self.test_drives).items()}
             drawn = labelled.scan % DRAW_EVERY == 0
             features, thick = labelled.features[drawn], labelled.thick[drawn]
         else:
-            thin_features, thick_features = (clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
+            thin_features, thick_features = (cones.clusters_in_range(side, DRAW_EVERY)[0] for side in (left, right))
             features = np.concatenate([thin_features, thick_features])
             thick = np.arange(len(features)) >= len(thin_features)
         kind = "test" if self.test_drives else "training"
@@ -119,20 +87,14 @@ class Figure25(Result):
             features, thick, stem.with_suffix(".png"), wrong=classifier.classify(features) != thick,
             title=f"Figure 25: clusters of the classifier's {kind} drives{suffix}",
         )  # fmt: skip
-        rows = [{"measure": name, **_row(of, share)} for name in shares for of, share in shares[name].items()]
+        rows = [{"measure": name, "of": of, **share._asdict()} for name in shares for of, share in shares[name].items()]
         write_csv(rows, stem.with_suffix(".csv"))
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
-        notes = NOTES.strip().format(folds=folds, kind=kind)
-        return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, COLUMNS)}\n\n{notes}"
+        notes = PAGE["notes"].format(folds=folds, kind=kind)
+        return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, PAGE['columns'])}\n\n{notes}"
 
 
-def _row(of: str, share: Share) -> dict[str, Any]:
-    low, high = share.interval
-    wrong = share.total - share.correct
-    return {"of": of, "share": share.share, "low": low, "high": high, "wrong": wrong, "total": share.total}
-
-
-def _scans(recordings: Sequence[Recording]) -> list[Scans]:
+def _scans(recordings: Sequence[Recording]) -> list[cones.Scans]:
     return [(recording.ranges, recording.angles(slice(None))) for recording in recordings]
 
 
@@ -150,12 +112,7 @@ def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:
 
 
 def draw_cone_features(
-    features: ArrayLike,
-    thick: ArrayLike,
-    path: Path,
-    *,
-    wrong: ArrayLike | None = None,
-    title: str | None = None,
+    features: ArrayLike, thick: ArrayLike, path: Path, *, wrong: ArrayLike | None = None, title: str | None = None
 ) -> None:
     """Draw clusters [N] by the two principal components of their features [N, 3]; `wrong` ones get a ring.
 
@@ -165,7 +122,7 @@ def draw_cone_features(
     is_thick = np.asarray(thick, dtype=bool)
     is_wrong = np.zeros(len(xy), dtype=bool) if wrong is None else np.asarray(wrong, dtype=bool)
     kinds = (("thin (left)", ~is_thick, style.LEFT_CONE, "o"), ("thick (right)", is_thick, style.RIGHT_CONE, "s"))
-    handles: list[Artist] = [
+    handles = [
         Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"{name}, {int(rows.sum())} clusters")
         for name, rows, colour, marker in kinds
     ]

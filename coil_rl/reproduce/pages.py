@@ -9,21 +9,11 @@ from typing import Any, NamedTuple
 from coil_rl.report import markdown_table
 from coil_rl.report.runs import Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate, holm
+from coil_rl.reproduce.result import PAGES
 
 CLAIMS_HEADING = "### What held up"
 SIGNIFICANT = 0.05
 FOOTER = "<sub>"  # begins the origin of a page
-
-INTRODUCTION = """
-`{command}` writes this file; do not edit it. Below each result stand the command that makes it alone, and the commits
-of the code. The paper's numbers are beside ours; its tracks and its robot are not part of this project, so compare the
-order of the methods and the distances between them."""
-
-VERDICTS = """
-Each claim of the paper with our number, its 95 % t interval over seeds, and p after Holm's correction for all verdicts
-of its page: held up, or did not hold up, if p is below 0.05 and the number is on the paper's side, or on the other;
-undecided otherwise. p is that of sign flips from {seeds} seeds on, and of a t test with fewer. Of crashes, the number
-of seeds and the Clopper-Pearson interval of its share."""
 
 
 class Claim(NamedTuple):
@@ -112,9 +102,13 @@ def all_results(
 ) -> str:
     """Return RESULTS.md, given the page (None if missing) and the command of each result, and the command of all."""
     split = [_split_claims(text) for text in pages.values() if text is not None]
-    parts = ["# Results", *_warning(note), INTRODUCTION.strip().format(command=command)]
+    parts = ["# Results", *_warning(note), PAGES["results"]["introduction"].format(command=command)]
     if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:
-        parts += ["## What held up, and what did not", VERDICTS.strip().format(seeds=SIGN_FLIP_SEEDS), *claims]
+        parts += [
+            "## What held up, and what did not",
+            PAGES["results"]["verdicts"].format(seeds=SIGN_FLIP_SEEDS),
+            *claims,
+        ]
     parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
     if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(missing)]

@@ -1,30 +1,28 @@
-"""Measures of a robot's recorded drives: smoothness, laps, crashes and the driven line."""
+"""Recorded drives of a robot: the reuse of existing recordings, and measures of smoothness, laps, crashes and lines."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
 
-from coil_rl.envs.recordings.reading import SIMULATED, Recording
+from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError, read_recording
 from coil_rl.envs.robot.course import THICK, THIN, RobotCourse, laps, middle_line
-from coil_rl.envs.robot.drives import SPEED, track_of
-from coil_rl.envs.track import Track
+from coil_rl.envs.robot.drives import SPEED, record_drives, track_of
+from coil_rl.envs.track import Array, Track
 from coil_rl.replay.open_loop import recorded_steering
 from coil_rl.report import style
-from coil_rl.report.style import picture
 
-Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 MIDDLE_SPACING = 0.002  # m
@@ -41,13 +39,32 @@ class RecordedDrive:
     track: Track | None  # None if the recording has none
 
 
+def record(
+    make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]],
+    paths: Sequence[Path],
+    notes: Mapping[str, str],
+    tick: Callable[[], Any] | None = None,
+) -> list[Recording]:
+    """Return recordings of a deterministic episode of each robot of an env; complete ones with equal notes are reused.
+
+    The arguments are those of `record_drives`. The notes tell a driver and its robots from others. A policy that cannot
+    drive the robots is a `UserError`.
+    """
+    try:
+        recordings = [read_recording(path, strict=True) for path in paths]
+        if all(notes.items() <= recording.notes.get(SIMULATED, {}).items() for recording in recordings):
+            return recordings
+    except RecordingError:
+        pass
+    record_drives(*make_env_and_policy(), paths, notes, tick)
+    return [read_recording(path) for path in paths]
+
+
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     """Measure a recorded drive, except for its smoothness.
 
-    `method` is the driver's display name; by default the `policy` in the recording's notes, or the file name.
-
-    Raises:
-        RecordingError: if the recording's notes contain an invalid track.
+    `method` is the driver's display name; by default the `policy` in the recording's notes, or the file name. An
+    invalid track in the notes is a `RecordingError`.
     """
     notes = recording.notes.get(SIMULATED, {})
     poses, seconds = _timed_poses(recording)
@@ -98,13 +115,13 @@ def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None
     """Draw the lines of each driver in a panel, with the cones of known tracks."""
     methods = list(dict.fromkeys(drive.method for drive in drives))
     strokes = style.strokes(methods)
-    handles: list[Artist] = []
+    handles: list[Line2D] = []
     if any(drive.track is not None for drive in drives):
         handles += [_dot("o", style.LEFT_CONE, "thin cones"), _dot("o", style.RIGHT_CONE, "thick cones")]
     if any(drive.row["crashed"] for drive in drives):
         handles.append(_dot("X", style.INK, "crash"))
     rows = -(-len(methods) // 2)
-    with picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
+    with style.picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
         panels = list(figure.subplots(rows, 2, squeeze=False).flat)
         for axes, method in zip(panels, methods, strict=False):
             _draw_panel(axes, [drive for drive in drives if drive.method == method], strokes[method].colour)

@@ -2,14 +2,20 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
+
+import yaml
 
 from coil_rl.errors import UserError
 from coil_rl.report.runs import Run
 
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
+# By result: the paper's numbers and claims, and notes on the tables.
+PAGES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "result_pages.yaml").read_text("utf-8"))
 
 
 class Result(ABC):
@@ -28,17 +34,12 @@ class Result(ABC):
 class WorldsResult(Result):
     """A result about runs in the main world and in variants of it.
 
-    Args:
-        experiments: experiments in the main world.
-        worlds: experiment by the name of each variant.
-        against: label of the runs to compare the others with.
+    `experiments` are in the main world, and `worlds` has an experiment by the name of each variant. The other runs are
+    compared with those of the label `against`.
     """
 
     def __init__(
-        self,
-        experiments: Sequence[str],
-        worlds: Mapping[str, str] | None = None,
-        against: str = "ppo",
+        self, experiments: Sequence[str], worlds: Mapping[str, str] | None = None, against: str = "ppo"
     ) -> None:
         # The main world has no name.
         self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}

@@ -1,5 +1,6 @@
 """Tables 6 and 7 of the paper: drives of a robot, measured from recordings."""
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass
@@ -9,78 +10,46 @@ from typing import Any
 
 import numpy as np
 from omegaconf import OmegaConf
+from tqdm import tqdm
 
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.runs import Run, read_runs
 from coil_rl.report.statistics import count_of_seeds, estimate
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, smoothness
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, runs_by_label
-from coil_rl.robot.drivers import Driver, agent_driver, record
+from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, record, smoothness
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, runs_by_label
 from coil_rl.train.build import build_guides
 from coil_rl.train.evaluate_run import driver_names
+from coil_rl.train.load import load_policy_in_env, weights_file
 from coil_rl.train.run_folder import read_config
 
-PAPER_ROBOT: dict[str, dict[str, Any]] = {
-    "guide": {"smoothness": 0.265, "lap_time": 43.67, "remark": "sways, stays central"},
-    "oil": {"smoothness": 0.104, "lap_time": 43.32, "remark": "smoother, less central"},
-    "ppo": {"smoothness": 0.102, "lap_time": 40.14, "remark": "nearer the boundary"},
-    "coil": {"smoothness": 0.082, "lap_time": 39.53, "remark": "cuts corners most"},
-}
-TABLE_6 = {
-    "method": ("method", ""), "seeds": ("seeds", "d"), "drives": ("drives", "d"), "laps": ("laps", "d"),
-    "crashes": ("crashes", "d"), "smoothness": ("smoothness", ".3f"), "paper smoothness": ("paper", ".3f"),
-    "lap_time": ("lap (s)", ".2f"), "paper lap_time": ("paper (s)", ".2f"),
-}  # fmt: skip
-TABLE_7 = {
-    "method": ("method", ""), "off_centre": ("from the centre (m)", ".3f"),
-    "clearance": ("smallest clearance (m)", ".3f"), "corner_cut": ("path / centre line", ".3f"),
-    "paper remark": ("paper", ""),
-}  # fmt: skip
-# The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
-CLAIMS = (
-    ("PPO steers more smoothly than the guide", "smoothness", "ppo", "guide", -1),
-    ("COIL steers more smoothly than its guide", "smoothness", "coil", "guide", -1),
-    ("COIL steers more smoothly than PPO", "smoothness", "coil", "ppo", -1),
-    ("PPO's laps take less time than the guide's", "lap_time", "ppo", "guide", -1),
-    ("COIL's laps take less time than PPO's", "lap_time", "coil", "ppo", -1),
-    ("OIL steers more smoothly than the guide", "smoothness", "oil", "guide", -1),
-    ("OIL is less central than the guide", "off_centre", "oil", "guide", 1),
-    ("PPO drives nearer to the boundary than the guide", "clearance", "ppo", "guide", -1),
-    ("COIL cuts corners more than PPO", "corner_cut", "coil", "ppo", -1),
-)
-NOTES = """
-smoothness: mean of |a - weighted mean of the last 20 actions|, a the commanded steering as a fraction of
-{max_steering:g} degrees. laps: from the start back to the start, by odometry, and their mean time. crashes and the
-measures of Table 7 need the cones' positions, the `track` of a recording: the robot crashed if its outline touched a
-cone or its centre crossed the line between two. The paper's robot drove on another track, so its lap times compare only
-with each other. Each drive is a row of the CSV."""
-CLAIM_NOTES = """
-Differences are of the same seed, each the mean over its drives (the minimum of the clearance); seeds: how many of them,
-as drivers without a complete lap are compared by clearance only. Intervals: t over seeds, of seeds with a crash
-Clopper-Pearson; a single seed has none and decides nothing."""
+PAGE = PAGES["table_6"]
+PAPER_ROBOT = PAGE["paper"]
 
 
 @dataclass(eq=False)
 class Table6(Result):
     """Smoothness, laps, crashes and lines of several drivers, from recordings.
 
-    A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide and
-    the agents of runs drive the simulated robot and are recorded next to the page; existing recordings are reused.
+    A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide of
+    the first run and the agents of all runs drive the simulated robot and are recorded next to the page; existing
+    recordings are reused.
 
     Raises:
-        UserError: if there are neither recordings nor experiments.
+        UserError: if there are no recordings, runs or experiments.
         RecordingError: for an unusable recording.
     """
 
-    experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings
+    experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings and runs
     # MCAP files, rosbag2 directories or folders of MCAP files; or lists of them by driver name.
     recordings: Sequence[str] | Mapping[str, Sequence[str]] = ()
     _: KW_ONLY
-    labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs that drive, with the guide of the first of them
+    runs: Sequence[str] = ()  # folders of runs whose agents drive if there are no recordings
+    labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs of the experiments that drive
     repeats: int = 3  # drives of each driver, which differ by the LiDAR noise
     laps: int = 3  # laps of a drive
     scan: str = "/scan"  # topic of the LiDAR
@@ -101,15 +70,19 @@ class Table6(Result):
         self.drives = [measure(found, name) for (name, _), found in zip(files, self.read, strict=True)]
         if self.recordings and not files:
             raise UserError(f"recordings={self.recordings} has no MCAP file; give some, or none to let the runs drive")
-        if not files and not self.experiments:
-            raise UserError("recordings=[] and experiments=[] give no driver; give one of them")
-        self.experiments = [] if files else list(self.experiments)
+        if not files and not self.runs and not self.experiments:
+            raise UserError("recordings=[], runs=[] and experiments=[] give no driver; give one of them")
+        self.own = read_runs(list(map(Path, self.runs))) if self.runs and not files else []
+        self.experiments = [] if files or self.own else list(self.experiments)
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
-        if self.experiments:
-            own = {experiment: runs[experiment] for experiment in self.experiments}
-            self.read = self._record(own, stem.with_name(f"{stem.name}_drives"))
+        if self.experiments or self.own:
+            trained = {experiment: runs[experiment] for experiment in self.experiments}
+            selected = self.own or [
+                run for of_label in runs_by_label(self.labels, trained).values() for run in of_label
+            ]
+            self.read = self._record(selected, stem.with_name(f"{stem.name}_drives"))
             self.drives = [measure(recording) for recording in self.read]
         rows = [
             {**drive.row, "smoothness": smoothness(recording, self.car_length, self.max_steering)}
@@ -120,26 +93,38 @@ class Table6(Result):
         draw_drives(self.drives, stem.with_suffix(".png"), f"The driven lines{suffix}")
         return robot_page(rows, suffix, self.max_steering)
 
-    def _record(self, runs: Runs, folder: Path) -> list[Recording]:
+    def _record(self, runs: Sequence[Run], folder: Path) -> list[Recording]:
         robot = f"{self.car_length:g} m, {self.max_steering:g} degrees"
-        about = {"robots": f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"}
-        return record(self._drivers(runs), folder, self.repeats, about)
+        robots = f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"
+        recordings: list[Recording] = []
+        with tqdm(desc="drive", unit="step", leave=False, mininterval=0.5) as bar:
+            for name, notes, make_env_and_policy in self._drivers(runs):
+                bar.set_postfix_str(name)
+                paths = [folder / f"{name}_{robot}.mcap" for robot in range(self.repeats)]
+                recordings += record(make_env_and_policy, paths, {**notes, "robots": robots}, bar.update)
+        return recordings
 
-    def _drivers(self, runs: Runs) -> Iterator[Driver]:
-        """Yield the guide of the first run, and the agent of each run."""
+    def _drivers(self, runs: Sequence[Run]) -> Iterator[tuple[str, dict[str, str], Any]]:
+        """Yield name, notes and the maker of env and policy for the guide of the first run and for each agent."""
         make_env = partial(
             SimulatedRobotEnv, num_envs=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
             max_steering=self.max_steering, seed=self.seed,
         )  # fmt: skip
-        selected = [run for of_label in runs_by_label(self.labels, runs).values() for run in of_label]
-        first = read_config(selected[0].folder, "run", {"device": "cpu"})
-        guides = build_guides(first)
+        configs = [read_config(run.folder, "run", {"device": "cpu"}) for run in runs]
+        guides = build_guides(configs[0])
         for display_name, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
-            config = json.dumps(OmegaConf.to_container(first.guide[name], resolve=True))
+            config = json.dumps(OmegaConf.to_container(configs[0].guide[name], resolve=True))
             about = {"policy": display_name, "guide": config}
-            yield Driver(display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide))
-        for run in selected:
-            yield agent_driver(run.folder, read_config(run.folder, "run", {"device": "cpu"}), make_env)
+            yield display_name.replace(" ", "_"), about, partial(lambda policy: (make_env(), policy), guide)
+        for run, own in zip(runs, configs, strict=True):
+            about = {"policy": str(own.label), "seed": str(own.seed), "run": run.folder.name}
+            if (weights := weights_file(run.folder)).is_file():  # a missing file is reported when the policy is loaded
+                about["policy_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
+            yield (
+                run.folder.name,
+                about,
+                partial(lambda run, own: load_policy_in_env(run, own, make_env()), run.folder, own),
+            )
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
@@ -153,11 +138,11 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
         line = means([row for drives in by_seed.values() for row in drives])
         line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
         table.append(line | {f"paper {key}": value for key, value in paper.items()})
-    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, TABLE_6)]
-    parts += [f"### Table 7, measured{suffix}", markdown_table(table, TABLE_7)]
-    notes = NOTES.format(max_steering=max_steering).strip()
+    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, PAGE["columns"])]
+    parts += [f"### Table 7, measured{suffix}", markdown_table(table, PAGE["columns_of_table_7"])]
+    notes = PAGE["notes"].format(max_steering=max_steering)
     of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
-    verdicts = [_claim(of_seeds, *claim) for claim in CLAIMS]
+    verdicts = [_claim(of_seeds, *claim) for claim in PAGE["claims"]]
     claims = [claim for claim in verdicts if claim is not None]
     if not claims:
         return "\n\n".join([*parts, notes])
@@ -166,7 +151,7 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
     claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
     section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
-    return "\n\n".join([*parts, notes + CLAIM_NOTES, section])
+    return "\n\n".join([*parts, f"{notes}\n{PAGE['claim_notes']}", section])
 
 
 def _claim(

@@ -12,27 +12,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 from scipy.stats import binomtest
 from tqdm import tqdm
 
+from coil_rl import tabular
 from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
-from coil_rl.tabular import (
-    MDP,
-    garnet,
-    observations_with_advice,
-    q_learning,
-    solve,
-    toymaker,
-    value_iteration,
-    with_advice,
-)
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.tabular.coil import noisy_guide, optimal_guide, random_guide, worst_guide
 from coil_rl.tabular.mdp import Array, Integers
 
@@ -41,12 +30,6 @@ ROUNDING = 1e-9  # scores of equal policies differ by less
 LOWEST_SCORE = -0.2  # in the picture
 LINE_OFFSET = 1.6  # points between coinciding lines
 PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": style.SECOND_ROUND}
-
-NOTES = """
-Scores: 0 for the random policy, 1 for the optimal policy of each world; means over {worlds} random worlds, one seed
-each, after the last step. ≥ guide: the share of worlds in which the greedy policy's value is at least the guide's,
-exactly, with the 95 % (Wilson) interval of the last share. The paper: at least as good as the guide, guaranteed, which
-would be 100 %. Plain: Q-learning without advice."""
 
 
 @dataclass(eq=False)
@@ -71,9 +54,11 @@ class TabularCoil(Result):
         self.steps = tuple(self.steps)
         if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
             raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")
-        self.learn = partial(q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps)
-        self.learn(toymaker(), 0, np.random.default_rng(0))  # checks its options
-        self.guides: Mapping[str, Callable[[MDP], Array]] = {
+        self.learn = partial(
+            tabular.q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps
+        )
+        self.learn(tabular.toymaker(), 0, np.random.default_rng(0))  # checks its options
+        self.guides: Mapping[str, Callable[[tabular.MDP], Array]] = {
             "optimal": optimal_guide,
             f"noisy ({self.noise:.0%})": partial(noisy_guide, noise=self.noise),
             "random": random_guide,
@@ -98,21 +83,21 @@ class TabularCoil(Result):
         ours = pages.certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
         claims = [{"claim": "COIL ends at least as good as its guide, guaranteed", "ours": ours}]
         section = pages.claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
-        notes = NOTES.format(worlds=self.worlds)
-        return f"## COIL at least as good as its guide\n\n{table}\n{notes}\n\n{section}"
+        notes = PAGES["tabular_coil"]["notes"].format(worlds=self.worlds)
+        return f"## COIL at least as good as its guide\n\n{table}\n\n{notes}\n\n{section}"
 
     def _world(self, seed: int) -> Iterator[dict[str, Any]]:
         """Yield the scores in one world, a row for each view, guide and number of steps."""
         rng = np.random.default_rng(seed)
-        mdp = garnet(self.states, self.actions, rng)
+        mdp = tabular.garnet(self.states, self.actions, rng)
         views = {"state": np.arange(self.states), "class": rng.permutation(self.states) % self.classes}
-        random, best = _value(mdp, random_guide(mdp)), _value(mdp, value_iteration(mdp).policy)
+        random, best = _value(mdp, random_guide(mdp)), _value(mdp, tabular.value_iteration(mdp).policy)
         for view, observations in views.items():
             plain = self._learned_values(mdp, observations, seed)
             for name, guide in self.guides.items():
                 policy = guide(mdp)
-                advised = observations_with_advice(observations, self.actions)
-                coil = self._learned_values(with_advice(mdp, policy), advised, seed)
+                advised = tabular.observations_with_advice(observations, self.actions)
+                coil = self._learned_values(tabular.with_advice(mdp, policy), advised, seed)
                 own = np.full(len(self.steps), _value(mdp, policy))
                 scores = (np.stack([own, coil, plain], axis=1) - random) / (best - random)
                 for n, of_step in zip(self.steps, scores.tolist(), strict=True):
@@ -120,7 +105,7 @@ class TabularCoil(Result):
                     row = {"view": view, "guide": name, "world": seed, "steps": n}
                     yield row | dict(zip(names, of_step, strict=True))
 
-    def _learned_values(self, mdp: MDP, observations: Integers, seed: int) -> Array:
+    def _learned_values(self, mdp: tabular.MDP, observations: Integers, seed: int) -> Array:
         """Return the value of the greedy policy after each number of steps."""
         rng = np.random.default_rng(seed)
         learned = self.learn(mdp, self.steps[-1], rng, observations=observations, snapshots=self.steps)
@@ -149,9 +134,9 @@ class TabularCoil(Result):
         }  # fmt: skip
 
 
-def _value(mdp: MDP, policy: Array | Integers) -> float:
+def _value(mdp: tabular.MDP, policy: Array | Integers) -> float:
     """Return the expected return of a policy from the start."""
-    return float(mdp.start @ solve(mdp, policy))
+    return float(mdp.start @ tabular.solve(mdp, policy))
 
 
 def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path) -> None:
@@ -161,10 +146,10 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
         name: {"color": colour, "lw": 2, "marker": "o", "ms": 4}
         for name, colour in zip(guides, style.AGENTS, strict=False)
     }
-    handles: list[Artist] = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
+    handles = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
     handles.append(Line2D([], [], label="plain Q-learning", **PLAIN))
     handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=style.DASHED, label="guide alone (its colour)"))
-    with picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
+    with style.picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
         grid = figure.subplots(2, len(views), sharex=True, sharey="row", squeeze=False)
         for (share, score), view in zip(grid.T, views, strict=True):
             of_view = [group for group in groups if group["view"] == view]
@@ -182,7 +167,7 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
             share.set_title(f"the agent observes {view}", size=9, loc="left", color=style.QUIET)
             score.set_xlabel("steps of experience")
         for axes in grid.flat:
-            lighten(axes)
+            style.lighten(axes)
             axes.set_xscale("log")
             axes.set_xticks(steps, [f"{n:,}" for n in steps])
             axes.minorticks_off()

@@ -10,13 +10,12 @@ from matplotlib.patches import Patch
 
 from coil_rl.envs.limits import check_range
 from coil_rl.report import markdown_table, style, write_csv
-from coil_rl.report.style import lighten, picture
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs
 from coil_rl.tabular import policy_iteration, toymaker, value_iteration
 from coil_rl.tabular.mdp import Array
 
-PAPER_Q = np.array([[41.37, 42.21], [31.42, 32.26]])
+PAPER_Q = np.array(PAGES["table_1"]["paper"])
 PAPER_ITERATIONS = 80  # "converges after about 80 iterations"
 ROUNDING = 0.005  # largest rounding error of two decimals
 SHARES = (0.1, 0.05, 0.02, 0.01, 0.001)
@@ -108,9 +107,9 @@ def _draw_differences(labels: list[str], differences: Array, path: Path) -> None
         Line2D([], [], color=style.AGENTS[0], ls="", marker="o", ms=6, label="ours - paper"),
         Patch(color=style.ASPHALT, lw=0, label="rounding to two decimals"),
     ]
-    with picture(path, "Table 1: Q of the toymaker, beside the paper's", handles, height=2.4) as figure:
+    with style.picture(path, "Table 1: Q of the toymaker, beside the paper's", handles, height=2.4) as figure:
         axes = figure.add_subplot(xlabel="difference of Q")
-        lighten(axes, grid="x")
+        style.lighten(axes, grid="x")
         axes.axvspan(-ROUNDING, ROUNDING, color=style.ASPHALT, lw=0)
         axes.axvline(0, color=style.KERB, lw=1)
         axes.plot(differences, range(len(differences)), color=style.AGENTS[0], ls="", marker="o", ms=6)
@@ -125,9 +124,9 @@ def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, pat
     colours = dict(zip(states, style.AGENTS, strict=False))
     handles: list[Artist] = [Line2D([], [], color=c, lw=2, label=f"V of {state}") for state, c in colours.items()]
     handles.append(Line2D([], [], label="limit", **dashes))
-    with picture(path, "Figure 6: value iteration on the toymaker", handles, 4.2) as figure:
+    with style.picture(path, "Figure 6: value iteration on the toymaker", handles, 4.2) as figure:
         axes = figure.add_subplot(xlabel="iteration", ylabel="V", xlim=(0, len(history) - 1))
-        lighten(axes)
+        style.lighten(axes)
         for values, final, colour in zip(history.T, limit, colours.values(), strict=True):
             axes.plot(values, color=colour, lw=2)
             axes.axhline(final, zorder=1.5, **dashes)

@@ -12,25 +12,12 @@ from coil_rl.report.curves import frames_until, learning, mean_curve
 from coil_rl.report.runs import GUIDE, RETURN
 from coil_rl.report.statistics import Estimate, estimate, wins
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Result, Runs, WorldsResult, runs_by_label
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, WorldsResult, runs_by_label
 
 Row = Mapping[str, Any]
 
-PAPER_RETURNS = {"coil": 477.6, "ppo": 414.2}  # mean over 5 runs of the highest mean reward during training
+PAPER_RETURNS = PAGES["table_4"]["paper"]
 FRACTIONS = {0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
-
-TABLE_4_NOTES = """
-The return of a policy is its mean over fixed cases on the test tracks: drives of some seconds from places spread along
-them, deterministic actions. Best: of the kept policy with the highest return in such cases on the training tracks;
-final: of the last one. The paper's is the highest mean reward of whole episodes during training, so only ratios
-compare. Differences to {against} are of the same seed; better: the share of seeds with a higher best. Intervals: t over
-the runs. Its guide: the guide alone in the same cases, degraded as the agent's was."""
-
-FIGURE_22_NOTES = """
-The return of a policy is its mean over fixed cases on the test tracks: places spread along them, deterministic actions.
-The curve is the mean of the runs, the band its 95 % t interval. The guide alone earns {guide} there. Up to the guide:
-the number of frames after which the mean of the runs first reaches that, interpolated. The paper draws three curves of
-each method and prints no numbers."""
 
 
 class Table4(WorldsResult):
@@ -59,7 +46,7 @@ class Table4(WorldsResult):
         parts = ["## Table 4: the return of the trained policies", _paper_table(tables[""])]
         for world, table in tables.items():
             parts += [*pages.world_heading(world), markdown_table(table, columns)]
-        parts += [TABLE_4_NOTES.strip().format(against=self.against)]
+        parts += [PAGES["table_4"]["notes"].format(against=self.against)]
         claims = []
         for world, table in tables.items():
             for line in table:
@@ -94,12 +81,7 @@ class Table4(WorldsResult):
 
 
 class Figure22(Result):
-    """Learning curves, with the guide's return as a line.
-
-    Args:
-        experiments: experiments in one world.
-        labels: labels of the runs to draw; the guide is that of the first.
-    """
+    """Learning curves of the runs with some labels in one world, with the return of the first one's guide as a line."""
 
     def __init__(self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo")) -> None:
         if not labels:
@@ -137,7 +119,7 @@ class Figure22(Result):
         columns = {"label": ("method", ""), "runs": ("runs", "d")}
         columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
         columns |= {"reached": ("frames up to the guide", ",.0f")}
-        notes = FIGURE_22_NOTES.strip().format(guide="an unknown return" if guide is None else f"{guide:.1f}")
+        notes = PAGES["figure_22"]["notes"].format(guide="an unknown return" if guide is None else f"{guide:.1f}")
         return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"
 
 

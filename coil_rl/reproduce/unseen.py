@@ -7,43 +7,16 @@ from typing import Any
 
 from coil_rl.report import draw_intervals, driver_intervals, markdown_table, write_csv
 from coil_rl.report.comparison import Comparison, Group, compare, paired
-from coil_rl.report.page import with_cells
+from coil_rl.report.page import cases_table, with_cells
 from coil_rl.report.runs import GUIDE, TERM, Run
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, Runs, WorldsResult
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult
 
 Row = Mapping[str, Any]
 
 ACTIONS = ("sampled", "deterministic")
-# Means over three unseen tracks, lap time in s; no driver crashed.
-PAPER_UNSEEN = {
-    "guide": {"lap_time": 48.81, "smoothness": 0.121, "reward": 609.4},
-    "oil": {"lap_time": 48.82, "smoothness": 0.061, "reward": 620.8},
-    "ppo": {"lap_time": 48.58, "smoothness": 0.557, "reward": 614.5},
-    "coil": {"lap_time": 48.48, "smoothness": 0.606, "reward": 632.9},
-}
+PAPER_UNSEEN = PAGES["table_5"]["paper"]
 MEASURE_COLUMNS = {"lap_time": ("lap (s)", ".2f"), "smoothness": ("smoothness", ".3f"), "reward": ("reward", ".1f")}
-MAX_TRACK_COLUMNS = 8
-
-# The paper's claims: text, measure, driver, driver to compare with, and 1 if the first has more of it, else -1.
-CLAIMS = (
-    ("COIL earns more than its guide", "reward", "coil", "guide", 1),
-    ("COIL earns more than PPO", "reward", "coil", "ppo", 1),
-    ("COIL earns more than imitation (OIL)", "reward", "coil", "oil", 1),
-    ("PPO earns more than the guide", "reward", "ppo", "guide", 1),
-    ("COIL's laps take less time than PPO's", "lap_time", "coil", "ppo", -1),
-    ("COIL steers less smoothly than its guide", "smoothness", "coil", "guide", 1),
-    ("COIL earns more with its guide's advice than with another car's", "reward", "coil", "coil_shuffled", 1),
-)
-
-NOTES = """
-Drivers are ordered by the share of seeds and tracks on which they completed both laps, then by the mean. Reward /
-guide's: each reward is divided by the guide's on the same track (where the guide crashes or earns nothing, by its mean
-over the others). Difference to {against}: of the same seed; better: the share of seeds and tracks with more. Networks
-of different methods begin with different weights, so pairs of seeds need not narrow an interval. Intervals: t over
-seeds, of seeds with a crash Clopper-Pearson. The paper drove with sampled actions, here several episodes a track: they
-also measure the noise of exploration. Deterministic actions are the mode. Drivers with only one kind of actions, as
-imitations and the guide, are in both tables."""
 
 
 class Table5(WorldsResult):
@@ -54,7 +27,9 @@ class Table5(WorldsResult):
         parts, episodes, worlds = ["## Table 5: unseen tracks"], [], {}
         for world, experiments in self.worlds.items():
             of_world = [run for experiment in experiments for run in runs[experiment]]
-            episodes += [{"world": world} | row for run in of_world for row in _episodes(run)]
+            for run in of_world:
+                about = {"world": world, "label": run.label, "seed": run.seed}
+                episodes += [about | row for row in run.evaluation.to_dict("records")]
             compared = worlds[world] = {actions: self._compare(of_world, actions) for actions in ACTIONS}
             rows = {actions: self._rows(compared[actions]) for actions in ACTIONS}
             parts += pages.world_heading(world)
@@ -66,9 +41,9 @@ class Table5(WorldsResult):
             for actions in ACTIONS:
                 table = self._driver_table(rows[actions], compared[actions].score[0])
                 parts += [f"**{actions.capitalize()} actions**", table]
-                parts += [] if world else [_track_table(compared[actions].groups, stem.name)]
+                parts += [] if world else [cases_table(compared[actions].groups, f"{stem.name}.csv")]
         write_csv(episodes, stem.with_suffix(".csv"))
-        notes = NOTES.strip().format(against=self.against)
+        notes = PAGES["table_5"]["notes"].format(against=self.against)
         return "\n\n".join([*parts, notes, self._claims(worlds)])
 
     def _compare(self, runs: Sequence[Run], actions: str) -> Comparison:
@@ -104,7 +79,7 @@ class Table5(WorldsResult):
         """Return the verdicts in all worlds; in variants of the main world only those on the reward."""
         rows: list[dict[str, Any]] = []
         for world, by_actions in worlds.items():
-            for claim, measure, driver, other, sign in CLAIMS:
+            for claim, measure, driver, other, sign in PAGES["table_5"]["claims"]:
                 cells = {}
                 for actions, comparison in by_actions.items():
                     by_name = {group.name: group for group in comparison.groups}
@@ -146,22 +121,6 @@ def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:
     return markdown_table(table, columns)
 
 
-def _track_table(groups: Sequence[Group], name: str) -> str:
-    """Return the mean reward by driver and track, with the completed share where it is below 1."""
-    tracks = groups[0].cases
-    if len(tracks) > MAX_TRACK_COLUMNS:
-        return f"The numbers of each of the {len(tracks)} tracks are in {name}.csv."
-    rows = []
-    for group in groups:
-        row = {"driver": group.name}
-        for index, track in enumerate(tracks):
-            means = group.means(index)
-            share = f" ({means['completed']:.0%} completed)" if means["completed"] < 1 else ""
-            row[track] = f"{means['reward']:.1f}{share}"
-        rows.append(row)
-    return markdown_table(rows, {"driver": ("mean reward", "")} | {track: (track, "") for track in tracks})
-
-
 def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> str | None:
     if driver not in PAPER_UNSEEN or other not in PAPER_UNSEEN:
         return None
@@ -169,9 +128,3 @@ def _paper_difference(measure: str, driver: str, other: str, relative: bool) -> 
     if measure == "reward" and relative:
         return f"{difference / PAPER_UNSEEN[GUIDE][measure]:+.3f}"
     return f"{difference:+{MEASURE_COLUMNS[measure][1]}}"
-
-
-def _episodes(run: Run) -> list[dict[str, Any]]:
-    """Return the CSV rows of a run, one per driver and track."""
-    rows = run.evaluation.to_dict("records")
-    return [{"label": run.label, "seed": run.seed} | row for row in rows]

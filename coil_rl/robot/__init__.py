@@ -1,1 +1,1 @@
-"""The robot's cone classifier, and recorded drives of guides and agents on the simulated robot."""
+"""The robot's cone classifier: training and evaluation."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +17,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
-from coil_rl.envs.robot.clusters import FEATURES, measure, points_of, single_linkage
+from coil_rl.envs.robot.clusters import FEATURES, Array, Integers, measure, points_of, single_linkage
 from coil_rl.envs.robot.drives import Sides, SimulatedDrive, simulated_drive
 from coil_rl.envs.robot.lidar import RANGE_MIN, SimulatedLidar
 from coil_rl.envs.robot.perception import ConeClassifier
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
-Integers = NDArray[np.int64]
 Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
 
 FOLDS = 5
@@ -61,41 +60,35 @@ class LabelledClusters:
     visibility: Array  # share of the cone's beams that no nearer cone blocks
 
 
-@dataclass(frozen=True)
-class Share:
-    """A share, with a 95 % interval (Wilson) that assumes independent clusters."""
+class Share(NamedTuple):
+    """A share of clusters, with a 95 % interval (Wilson) that assumes independent ones; NaN without any cluster."""
 
-    correct: int
+    share: float
+    low: float
+    high: float
+    wrong: int
     total: int
 
-    @property
-    def share(self) -> float:
-        """Correct over total, NaN without any."""
-        return self.correct / self.total if self.total else float("nan")
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Lower and upper end of the interval."""
-        if not self.total:
-            return float("nan"), float("nan")
-        low, high = binomtest(self.correct, self.total).proportion_ci(method="wilson")
-        return float(low), float(high)
+def share_of(correct: int, total: int) -> Share:
+    """Return the share that was classified correctly."""
+    if not total:
+        return Share(np.nan, np.nan, np.nan, 0, 0)
+    low, high = binomtest(correct, total).proportion_ci(method="wilson")
+    return Share(correct / total, float(low), float(high), total - correct, total)
 
 
 def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS) -> Training:
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001) with a small share of
-    exceptions tells cones from other objects.
+    exceptions tells cones from other objects. Fewer groups than folds, or only one kind of cone, are a `UserError`.
 
     Args:
         features: [N, 3] m, width, depth and girth of each cluster.
         thick: [N] whether the cone is thick.
         drives: [N] group of each cluster; a group is held out as a whole and should have both kinds of cone.
         folds: number of folds.
-
-    Raises:
-        UserError: if there are fewer groups than folds, or only one kind of cone.
     """
     groups = len(np.unique(drives))
     if groups < max(2, folds):
@@ -118,12 +111,9 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
 
 
 def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
-    """Train on the scans of drives past left cones alone and past right cones alone.
+    """Train on the scans of drives past left cones alone and past right cones alone; errors as `train_classifier`.
 
     The k-th drives of both are held out together.
-
-    Raises:
-        UserError: as `train_classifier`.
     """
     pairs = min(len(left), len(right))
     if pairs < 2:
@@ -176,7 +166,7 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
     except OSError as error:
         raise UserError(f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot") from None
     except (ValueError, TypeError) as error:
-        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-robot steps=[train]") from None
+        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-reproduce figure=25") from None
     if len(classifier.mean) != len(FEATURES):
         raise UserError(f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again")
     return classifier
@@ -251,9 +241,9 @@ def majority(label: Integers, cone: Integers, cones: int) -> Integers:
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
-    shares = {"all": Share(int(correct.sum()), len(correct))}
+    shares = {"all": share_of(int(correct.sum()), len(correct))}
     for name, value, bins in (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS)):
         for low, high in pairwise(bins):
             rows = (value > low) & (value <= high)
-            shares[f"{low:g}-{high:g} {name}"] = Share(int(correct[rows].sum()), int(rows.sum()))
+            shares[f"{low:g}-{high:g} {name}"] = share_of(int(correct[rows].sum()), int(rows.sum()))
     return shares

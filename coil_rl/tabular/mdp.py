@@ -13,7 +13,8 @@ Integers = NDArray[np.int64]
 class MDP:
     """A finite Markov decision process: transition probabilities, rewards and a discount factor.
 
-    A state that every action leaves unchanged, with reward 0, is terminal: it ends an episode.
+    A state that every action leaves unchanged, with reward 0, is terminal: it ends an episode. Arrays that are no
+    Markov decision process are a `ValueError` that names the entry.
 
     Args:
         P: [S, A, S], P[s, a, s'] the probability that action a leads from state s to state s'.
@@ -21,9 +22,6 @@ class MDP:
         gamma: discount factor, from 0 to less than 1.
         start: [S], start-state probabilities; uniform by default.
         states, actions: their names, for tables and messages; numbers by default.
-
-    Raises:
-        ValueError: if the arrays are no Markov decision process, naming the entry.
 
     Example:
         >>> stay, change = ([[1, 0], [0, 1]], [[0, 1], [1, 0]])

@@ -6,8 +6,8 @@ from typing import Any
 
 import hydra.utils
 from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
 from coil_rl.errors import UserError
@@ -20,14 +20,13 @@ from coil_rl.transforms.action_space import nested_key
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
     """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
 
+    A target that does not exist, refuses an argument, or returns another type is a `UserError`.
+
     Args:
         node: with a `_target_`.
         name: key of the node, for the message.
         expected: type of the result.
         arguments: added by the program.
-
-    Raises:
-        UserError: if the target does not exist, refuses an argument, or returns another type.
     """
     node = check_node(node, name, arguments)
     try:
@@ -90,10 +89,8 @@ def _target(path: Any, name: str) -> Callable[..., Any]:
 def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
     """Return the env of a configuration with all transforms; it also writes the sum of rewards, `episode_reward`.
 
-    `overrides` are of `env`; `advice` is the key in `evaluation.advice` of one more transform of the advice.
-
-    Raises:
-        UserError: as `build`, and if the transforms do not fit together.
+    `overrides` are of `env`; `advice` is the key in `evaluation.advice` of one more transform of the advice. Errors are
+    those of `build`; transforms that do not fit together are a `UserError` too.
     """
     return add_transforms(config, build_bare_env(config, overrides), advice=advice)
 
@@ -148,9 +145,6 @@ def build_guided_env(
         config: with `env`, `guide` and `degrade`.
         overrides: of `env`, with `num_envs`: the number of rows for each guide. Those of the first guide come first.
         guides: instead of those of the configuration.
-
-    Raises:
-        UserError: as `build_env`.
     """
     guides = guides or build_guides(config)
     count = overrides["num_envs"]
@@ -215,11 +209,7 @@ def what_guides_see(config: DictConfig) -> dict[str, str]:
 
 
 def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
-    """Return the guides of a configuration by name.
-
-    Raises:
-        UserError: as `build`, and if there is no guide, or one without a name.
-    """
+    """Return the guides of a configuration by name; errors as `build`, also for no guide, or one without a name."""
     if "_target_" in config.guide:
         raise UserError(
             "guide: a guide needs a name, because there may be several: begin its file with "

@@ -14,8 +14,8 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from pydantic import TypeAdapter, ValidationError
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.errors import UserError, did_you_mean

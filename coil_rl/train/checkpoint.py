@@ -27,11 +27,7 @@ def save(state: Any, path: Path) -> None:
 
 
 def load(path: Path, device: str = "cpu") -> Any:
-    """Read a state without running code from the file.
-
-    Raises:
-        UserError: if there is no such file, or it is not exactly what `save` wrote.
-    """
+    """Read a state without running code; a file that is not exactly what `save` wrote is a `UserError`."""
     if not path.is_file():
         raise UserError(f"there is no file {path}; give the folder of a run that coil-train has finished")
     content = path.read_bytes()
@@ -55,10 +51,7 @@ def save_newest(state: Any, folder: Path) -> None:
 def load_newest(folder: Path) -> Any | None:
     """Return the newest checkpoint of a run, or the previous one if it is damaged; None before the first one.
 
-    The use of the previous one is reported on standard error.
-
-    Raises:
-        UserError: if both are damaged.
+    The use of the previous one is reported on standard error. If both are damaged, that is a `UserError`.
     """
     newest, previous = folder / NEWEST, folder / PREVIOUS
     if not newest.exists() and not previous.exists():

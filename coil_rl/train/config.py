@@ -198,17 +198,6 @@ class ListenConfig(DrivingConfig):
 
 
 @dataclass
-class RobotConfig(DrivingConfig):
-    """Configuration of `coil-robot`."""
-
-    steps: list[str] = MISSING
-    runs: list[str] = field(default_factory=list)
-    recordings: Any = field(default_factory=list)
-    figure_25: dict[str, Any] = MISSING
-    table_6: dict[str, Any] = MISSING
-
-
-@dataclass
 class ReplayConfig(ProgramConfig):
     """Configuration of `coil-replay`."""
 
@@ -262,6 +251,7 @@ class ReproduceConfig(ProgramConfig):
     known_problems: list[str] = field(default_factory=list)
     not_reproduced: list[str] = field(default_factory=list)
     results: dict[str, Any] = MISSING
+    trust: list[str] = field(default_factory=list)
     run_dir: str = MISSING
 
 
@@ -300,7 +290,6 @@ SCHEMAS = {
     "report_schema": ReportConfig,
     "listen_schema": ListenConfig,
     "replay_schema": ReplayConfig,
-    "robot_schema": RobotConfig,
     "reproduce_schema": ReproduceConfig,
 }
 for _name, _schema in SCHEMAS.items():

@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -55,11 +55,7 @@ class Evaluation:
 
 
 def build_evaluation(config: DictConfig, record: Mapping[str, NestedKey] | None = None) -> Evaluation:
-    """Return the evaluation of a configuration, with entries to record by name.
-
-    Raises:
-        UserError: for cases that are neither a number nor names, or without one.
-    """
+    """Return the evaluation of a configuration, with entries to record by name; no cases are a `UserError`."""
     cases = config.evaluation.cases
     names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
     names = list(map(str, range(names))) if isinstance(names, int) else names
@@ -80,11 +76,7 @@ def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
 
 
 def evaluate_run(
-    config: DictConfig,
-    agent: TensorDictModuleBase | None,
-    folder: Path,
-    seed: int,
-    fallback: Fallback | None = None,
+    config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int, fallback: Fallback | None = None
 ) -> None:
     """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 
@@ -110,9 +102,12 @@ def evaluate_run(
 
     for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
         add(result, driver)
+    # The kinds of advice, each with the number of sampled episodes a case.
+    plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)] if agent is not None else []
+    plan += [(advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms]
     torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
-        for advice, repeats in [] if agent is None else _plan(config, agent):
+        for advice, repeats in plan:
             bar.set_postfix_str(", ".join(filter(None, (config.label, advice))))
             # Deterministic and sampling rows in one batch: the time of a step hardly depends on its size.
             rows = torch.arange((1 + repeats) * count, device=config.device)
@@ -163,14 +158,6 @@ def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) 
     update()
     for picture in pictures:
         picture.watch(env)
-
-
-def _plan(config: DictConfig, agent: TensorDictModuleBase) -> list[tuple[str, int]]:
-    """Return the kinds of advice, each with the number of sampled episodes a case."""
-    plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)]
-    if config.method.transforms:
-        plan += [(advice, 0) for advice in config.evaluation.advice]
-    return plan
 
 
 def report_outcome(folder: Path) -> float:

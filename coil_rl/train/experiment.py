@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
@@ -131,8 +130,7 @@ class Experiment:
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
         """Train to the end and return the rows of `metrics.csv`; `guide_return` is shown beside the agent's.
 
-        Raises:
-            UserError: if a number of the env, the losses or the weights is NaN.
+        NaN from the env, in the losses or in the weights is a `UserError`.
         """
         updates, frames = math.ceil(self.frames / self.rollout.frames), self.rollout.frames
         with tqdm(

@@ -76,10 +76,8 @@ def values_of(critic: TensorDictModuleBase, states: TensorDictBase) -> Tensor:
 def build_fallback(config: DictConfig, folder: Path, policy: TensorDictModuleBase | None) -> Fallback | None:
     """Return the policy of a run with its first guide to fall back to, if `evaluation.fallback` asks for it.
 
-    The limits are quantiles of the critic's values along the guide's drives of the cases of selection.
-
-    Raises:
-        UserError: for a run without advice, critic or cases, or whose env does not execute the advice as it is.
+    The limits are quantiles of the critic's values along the guide's drives of the cases of selection. A run without
+    advice, critic or cases, or whose env does not execute the advice as it is, is a `UserError`.
     """
     if not config.evaluation.fallback:
         return None

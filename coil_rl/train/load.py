@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from omegaconf import DictConfig
+from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
-from tensordict.utils import NestedKey
 from torchrl.envs import EnvBase
 
 from coil_rl.errors import UserError

@@ -19,29 +19,18 @@ class Measure:
     """A measure of an episode: an entry of the env, reduced over the steps.
 
     Two measures have a meaning in reports: `completed`, the success that drivers are ordered by first, and `crashed`,
-    the failure that is counted by seed.
-
-    Args:
-        entry: key of one number a row, after a step; those of several agents are summed.
-        reduction: `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`, or
-            their mean (`mean_nonzero`). Without a number, a mean is NaN.
-        where: key of a flag; only the steps with it count.
-        at_least: the measure becomes a flag: the number is at least this.
-        at_most: the measure becomes a flag: the number is at most this.
-        title: heading of its column; a measure without one is in the CSV files only.
-        format: of its numbers in tables.
-
-    Raises:
-        ValueError: for another reduction, or two bounds.
+    the failure that is counted by seed. Another reduction, or two bounds, are a `ValueError`.
     """
 
-    entry: str | tuple[str, ...]
+    entry: str | tuple[str, ...]  # key of one number a row, after a step; those of several agents are summed
+    # `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`, or their mean
+    # (`mean_nonzero`). Without a number, a mean is NaN.
     reduction: str = "mean"
-    where: str | tuple[str, ...] | None = None
-    at_least: float | None = None
-    at_most: float | None = None
-    title: str = ""
-    format: str = ".1f"
+    where: str | tuple[str, ...] | None = None  # key of a flag; only the steps with it count
+    at_least: float | None = None  # the measure becomes a flag: the number is at least this
+    at_most: float | None = None  # the measure becomes a flag: the number is at most this
+    title: str = ""  # heading of its column; a measure without one is in the CSV files only
+    format: str = ".1f"  # of its numbers in tables
 
     def __post_init__(self) -> None:
         if self.reduction not in REDUCTIONS:
@@ -71,11 +60,7 @@ def _key(key: Any) -> str | tuple[str, ...]:
 
 
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
-    """Return measures by name from the key `evaluation.measures` of a configuration.
-
-    Raises:
-        UserError: for an invalid one.
-    """
+    """Return measures by name from the key `evaluation.measures` of a configuration; errors are `UserError`s."""
     measures = {}
     for name, node in nodes.items():
         try:

@@ -16,18 +16,8 @@ from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, SELECTION
-from coil_rl.train import checkpoint, distillation
+from coil_rl.train import build, checkpoint, distillation
 from coil_rl.train.brake import Brake
-from coil_rl.train.build import (
-    build,
-    build_env,
-    build_guided_env,
-    build_guides,
-    build_learner,
-    cases_node,
-    compile_steps,
-    trains_guides,
-)
 from coil_rl.train.curve import EvaluationCurve, measures
 from coil_rl.train.evaluate_run import driver_names, evaluate_run, report_outcome
 from coil_rl.train.experiment import Experiment, Probe, watched_keys
@@ -41,8 +31,7 @@ from coil_rl.train.run_folder import begin, flat, holds, is_evaluated, locked, r
 def run(config: DictConfig, *, wait: bool = False) -> float:
     """Do a run, or resume it if `existing=resume`, and return the mean test reward of the deterministic agent.
 
-    Raises:
-        UserError: if the folder holds another run, or another process uses it and `wait` is not set.
+    A folder that holds another run, or that another process uses if `wait` is not set, is a `UserError`.
     """
     folder = Path(config.run_dir)
     with locked(folder, wait=wait):
@@ -78,21 +67,21 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
 
 def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     """Train, draw the learning curve and return the policy to evaluate."""
-    improves_guides = trains_guides(config)
+    improves_guides = build.trains_guides(config)
     if improves_guides:
         _distil(config, folder)
     guide_returns = _saved_guide_returns(config, folder / "guide_return.json")
     # After the guides, which a resumed run does not drive again.
     torch.manual_seed(config.seed)
-    env = compile_steps(config, build_env(config, config.training.env))
-    learner = build_learner(config, env, load_guides(folder, config) if improves_guides else None)
+    env = build.compile_steps(config, build.build_env(config, config.training.env))
+    learner = build.build_learner(config, env, load_guides(folder, config) if improves_guides else None)
     keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(
         learner,
         Rollout(env, learner.policy, config.budget.steps, keys),
         config.budget.frames,
         folder,
-        logger=build(config.logger, "logger") if config.logger else None,
+        logger=build.build(config.logger, "logger") if config.logger else None,
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
         probe=_probe(config, learner),
@@ -120,7 +109,7 @@ def _distil(config: DictConfig, folder: Path) -> None:
     if (folder / PROXIES).is_dir():
         return
     proxies = {}
-    for name in distillation.guides_without_parameters(build_guides(config)):
+    for name in distillation.guides_without_parameters(build.build_guides(config)):
         proxy_config = distillation.proxy_config(config, name)
         run(proxy_config, wait=True)
         proxies[name] = Path(proxy_config.run_dir)
@@ -159,8 +148,8 @@ def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase
     """Return the mean return of each guide in the cases of the evaluation."""
     if EVALUATION not in config.evaluation.curve.cases or not (guides or config.guide):
         return {}
-    guides = guides or build_guides(config)
-    env, policy = build_guided_env(config, cases_node(config, EVALUATION), guides)
+    guides = guides or build.build_guides(config)
+    env, policy = build.build_guided_env(config, build.cases_node(config, EVALUATION), guides)
     with torch.random.fork_rng():
         returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
     return dict(zip(driver_names(guides), returns.tolist(), strict=True))
@@ -168,7 +157,7 @@ def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase
 
 def _probe(config: DictConfig, learner: Any) -> Probe | None:
     """Return what a run measures besides: its guides if it trains them, or an anchored policy."""
-    if trains_guides(config):
+    if build.trains_guides(config):
         return GuideReturns(config, learner.guides)
     if getattr(learner, "anchor", None) is None:
         return None
@@ -181,7 +170,7 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     look.evaluation.curve.num_envs = learner.anchor.cases
 
     def build_cases(policies: int) -> EnvBase:
-        return build_env(look, cases_node(look, SELECTION, policies))
+        return build.build_env(look, build.cases_node(look, SELECTION, policies))
 
     failure = measures_of(config.evaluation.measures).get("crashed")
     return Brake(learner.anchor, learner.policy, build_cases, failure)
@@ -191,7 +180,7 @@ def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> Ev
     """Return the evaluation curve of a run; None without cases."""
 
     def build_cases(cases: str, drivers: int) -> EnvBase:
-        return build_env(config, cases_node(config, cases, drivers))
+        return build.build_env(config, build.cases_node(config, cases, drivers))
 
     curve = config.evaluation.curve
     envs = {cases: partial(build_cases, cases) for cases in curve.cases}

@@ -6,7 +6,7 @@ names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment: a part that has its
   YAML file is on the list;
-- the estimators of scikit-learn and the transforms and loggers of TorchRL that are named here;
+- the estimators of scikit-learn and the transforms and loggers of TorchRL in `conf/trusted.yaml`;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
@@ -38,35 +38,13 @@ NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
     "coil_rl", "hydra", "joblib", "numpy", "omegaconf", "pandas", "scipy", "sympy", "tensordict", "torch",
 }  # fmt: skip
 
-ESTIMATORS = {
-    "compose": "TransformedTargetRegressor",
-    "cross_decomposition": "CCA PLSCanonical PLSRegression",
-    "dummy": "DummyRegressor",
-    "ensemble": "AdaBoostRegressor BaggingRegressor ExtraTreesRegressor GradientBoostingRegressor "
-    "HistGradientBoostingRegressor RandomForestRegressor StackingRegressor VotingRegressor",
-    "gaussian_process": "GaussianProcessRegressor",
-    "kernel_ridge": "KernelRidge",
-    "linear_model": "ARDRegression BayesianRidge ElasticNet ElasticNetCV GammaRegressor HuberRegressor Lars LarsCV "
-    "Lasso LassoCV LassoLars LassoLarsCV LassoLarsIC LinearRegression MultiTaskElasticNet MultiTaskElasticNetCV "
-    "MultiTaskLasso MultiTaskLassoCV OrthogonalMatchingPursuit OrthogonalMatchingPursuitCV PassiveAggressiveRegressor "
-    "PoissonRegressor QuantileRegressor RANSACRegressor Ridge RidgeCV SGDRegressor TheilSenRegressor TweedieRegressor",
-    "model_selection": "GridSearchCV GroupKFold KFold RandomizedSearchCV ShuffleSplit",
-    "multioutput": "MultiOutputRegressor RegressorChain",
-    "neighbors": "KNeighborsRegressor RadiusNeighborsRegressor",
-    "neural_network": "MLPRegressor",
-    "pipeline": "FeatureUnion Pipeline",
-    "preprocessing": "MaxAbsScaler MinMaxScaler Normalizer PolynomialFeatures PowerTransformer QuantileTransformer "
-    "RobustScaler SplineTransformer StandardScaler",
-    "svm": "LinearSVR NuSVR SVR",
-    "tree": "DecisionTreeRegressor ExtraTreeRegressor",
-}
 LOGGERS = "torchrl.record.loggers."
-NAMED = frozenset(
-    [f"sklearn.{module}.{name}" for module, names in ESTIMATORS.items() for name in names.split()]
-    + [f"torchrl.envs.{name}" for name in ("CatFrames", "ClipTransform", "DoubleToFloat", "ObservationNorm",
-       "RewardClipping", "RewardScaling", "StepCounter", "TimeMaxPool", "VecNorm")]
-    + [f"{LOGGERS}{name}" for name in ("CSVLogger", "TensorboardLogger")]
-)  # fmt: skip
+_TRUSTED: dict[str, Any] = yaml.safe_load((resources.files("coil_rl.conf") / "trusted.yaml").read_text("utf-8"))
+ESTIMATORS = frozenset(f"sklearn.{module}.{name}" for module, names in _TRUSTED["estimators"].items() for name in names)
+PARTS = frozenset(f"sklearn.{module}.{name}" for module, names in _TRUSTED["parts"].items() for name in names)
+NAMED = ESTIMATORS.union(
+    (f"torchrl.envs.{name}" for name in _TRUSTED["transforms"]), (LOGGERS + name for name in _TRUSTED["loggers"])
+)
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
 _own: frozenset[str] = frozenset()  # targets in the configuration of the command

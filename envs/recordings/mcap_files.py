@@ -77,14 +77,12 @@ class Contents:
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
     """Read a recording from start to end, with its checksums verified.
 
-    One that ends early is read as far as it goes, and damaged chunks are skipped.
+    One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of file, or damage
+    outside of the chunks, is a `RecordingError`.
 
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
         topics: topics to read; None for all. A missing one has no messages.
-
-    Raises:
-        RecordingError: if this is not a recording, or one with damage outside of its chunks.
     """
     contents = Contents({topic: [] for topic in topics or ()})
     for file in _files(Path(path)):
@@ -96,11 +94,7 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
 
 
 def digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files.
-
-    Raises:
-        RecordingError: if there is no such recording.
-    """
+    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files."""
     sha256 = hashlib.sha256()
     for file in _files(Path(path)):
         _check_format(file)
@@ -122,11 +116,7 @@ class RecordingWriter:
         self._attachments: dict[str, tuple[str, bytes, tuple[int, int] | None]] = {}
 
     def add(self, topic: str, message_type: str, time: int, fields: Mapping[str, Any]) -> None:
-        """Add a message; the time in ns, the type and fields as in `messages.encode`.
-
-        Raises:
-            ValueError: for an unknown type or field.
-        """
+        """Add a message; the time in ns, type, fields and errors as in `messages.encode`."""
         channel = Channel(topic, message_type, definition=definition(message_type))
         self.copy(RawMessage(channel, time, time, encode(message_type, fields)))
 
@@ -236,7 +226,10 @@ def _records(
                 contents.cut_off = True
                 return
             summary = _summary(stream)
-            places = _places(summary)
+            # Places of all chunks, metadata records and attachments.
+            places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+            places += [metadata.offset for metadata in summary.metadata_indexes]
+            places += [attachment.offset for attachment in summary.attachment_indexes]
             following = [place for place in places if place > start] + ([end] if record else [])
             # A wrong checksum of the whole file does not tell where the damage is.
             whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
@@ -263,13 +256,6 @@ def _summary(stream: BinaryIO) -> Summary:
         return SeekingReader(stream).get_summary() or Summary()
     except Exception:  # its bytes may be anything
         return Summary()
-
-
-def _places(summary: Summary) -> list[int]:
-    """Return the places of all chunks, metadata records and attachments in a file."""
-    places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
-    places += [metadata.offset for metadata in summary.metadata_indexes]
-    return places + [attachment.offset for attachment in summary.attachment_indexes]
 
 
 def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:

@@ -28,14 +28,11 @@ def definition(message_type: str) -> bytes:
 
 
 def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
-    """Return a message as little-endian CDR.
+    """Return a message as little-endian CDR; an unknown type or field is a `ValueError`.
 
     Args:
         message_type: such as "geometry_msgs/msg/Twist".
         fields: number, text, sequence or nested mapping by field; a missing one is zero or empty.
-
-    Raises:
-        ValueError: for an unknown type or field.
     """
     return bytes(ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True))
 
@@ -43,10 +40,8 @@ def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
 def decode(data: bytes, message_type: str, language: str = "ros2msg", text: bytes = b"") -> Any:
     """Return a message in CDR of either byte order, with its fields as attributes.
 
-    The definition stored with the message is used, or the standard one if that text cannot be parsed.
-
-    Raises:
-        SerdeError: if the bytes are not a message of this type.
+    The definition stored with the message is used, or the standard one if that text cannot be parsed. Bytes that are
+    not a message of this type are a `SerdeError`.
     """
     return _types_of(message_type, language, text).deserialize_cdr(data, message_type)
 

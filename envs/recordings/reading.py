@@ -13,16 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, read_messages
-from coil_rl.envs.recordings.messages import (
-    ODOMETRY,
-    SCAN,
-    TWIST,
-    TWIST_STAMPED,
-    decode,
-    pose_of,
-    stamp_of,
-    twist_of,
-)
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, TWIST_STAMPED, decode, pose_of, stamp_of, twist_of
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 LARGEST = 1e7  # of poses, commands and angles
@@ -90,10 +81,8 @@ class Recording:
 
         It is the last command before the next scan: a controller needs time for a scan, and a program that sends
         commands at a higher rate repeats the old one meanwhile. The speed is the command's own, with which its turn
-        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s.
-
-        Raises:
-            ValueError: if the recording has no commands.
+        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s. A
+        recording without commands is a `ValueError`.
         """
         if self.commands is None:
             raise ValueError(f"{self.path} has no commands; check that commands is not None")
@@ -122,7 +111,8 @@ def read_recording(
 ) -> Recording:
     """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
 
-    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners.
+    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners. What
+    cannot be read is a `RecordingError`, in one sentence with its remedy.
 
     Args:
         path: of the file or folder.
@@ -131,9 +121,6 @@ def read_recording(
         command: likewise, for the commands, Twist or TwistStamped.
         frame: of the scanner, if several send scans on one topic; None for the first one.
         strict: raise for a recording that is cut off or damaged, instead of a warning with the number of scans.
-
-    Raises:
-        RecordingError: in one sentence, the problem and its remedy.
 
     Example:
         >>> import tempfile
@@ -275,8 +262,7 @@ def _remarks_on_loss(contents: Contents, topic: str) -> list[str]:
 def _ignore_other_types(path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str) -> str | None:
     """Remove the messages of other types or encodings of a topic; return a remark on them, if there are any.
 
-    Raises:
-        RecordingError: if only such messages are on the topic of the scans.
+    Only such messages on the topic of the scans are a `RecordingError`.
     """
     channels = [channel for channel in contents.channels if channel.topic == topic]
     others = [channel for channel in channels if channel.message_type not in types or channel.encoding != "cdr"]

@@ -48,10 +48,8 @@ class Clusters:
 def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float) -> Points:
     """Return the points between two ranges in m of scans [N, P] m; NaN and infinity are no points.
 
-    The beams have the bearings `angles` radians, [P] or, where each scan has its own, [N, P], in any order.
-
-    Raises:
-        ValueError: if the shapes do not match or a bearing is not finite.
+    The beams have the bearings `angles` radians, [P] or, where each scan has its own, [N, P], in any order. Shapes that
+    do not match, or a bearing that is not finite, are a `ValueError`.
     """
     ranges, angles = np.asarray(ranges), np.asarray(angles, dtype=np.float64)
     if ranges.ndim != 2 or angles.shape not in (ranges.shape, ranges.shape[1:]):

@@ -7,14 +7,11 @@ from functools import cache
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from coil_rl.envs.sight import Frame
-from coil_rl.envs.track import SIDES, Track, TrackError, resample
-
-Array = NDArray[np.float64]
+from coil_rl.envs.track import SIDES, Array, Track, TrackError, resample
 
 THIN, THICK = 0.020, 0.045  # m, radius of a cone on the left and on the right
 HALF_WIDTH = 0.18  # m, from the centre line to the middle of a cone
@@ -53,11 +50,7 @@ def track_notes(track: Track) -> dict[str, str]:
 
 
 def noted_track(notes: Mapping[str, str]) -> Track:
-    """Return the track of a metadata record; `left` and `right`, each [[x, y], ...] m, are required.
-
-    Raises:
-        TrackError: if the record is not valid.
-    """
+    """Return the track of a metadata record; without valid `left` and `right`, [[x, y], ...] m each, a `TrackError`."""
     try:
         left, right, start = (json.loads(notes.get(key, "null")) for key in ("left", "right", "start"))
         rings = [np.array(ring, dtype=np.float64).reshape(-1, 2) for ring in (left, right)]
@@ -115,11 +108,9 @@ class Laps:
 
 
 def laps(poses: Array, seconds: Array) -> Laps:
-    """Return the laps of a drive. A lap ends where the drive crosses, forwards, the line across its start.
+    """Return the laps of a drive with poses [N, 3] m, m, radians at times [N] s.
 
-    Args:
-        poses: [N, 3] m, m, radians, ordered by time.
-        seconds: [N].
+    A lap ends where the drive crosses, forwards, the line across its start.
     """
     x, y, heading = poses[0]
     forward = (poses[:, 0] - x) * np.cos(heading) + (poses[:, 1] - y) * np.sin(heading) - LINE_OFFSET

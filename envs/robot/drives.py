@@ -16,8 +16,7 @@ import numpy as np
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
-from torchrl.envs import EnvBase, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
+from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type, step_mdp
 
 from coil_rl.envs.limits import check_choice
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
@@ -84,10 +83,8 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
 def labelled_drive(recording: Recording) -> SimulatedDrive:
     """Return a recorded drive, simulated or real, with the ground truth that follows from its odometry and track.
 
-    The last scan is left out, as the pose at its end is unknown.
-
-    Raises:
-        RecordingError: if the recording lacks a track, odometry or a second scan.
+    The last scan is left out, as the pose at its end is unknown. A recording without a track, odometry or a second scan
+    is a `RecordingError`.
     """
     path, scans = recording.path, recording.ranges
     if "track" not in recording.notes or recording.odometry is None or len(scans) < 2:
@@ -153,10 +150,8 @@ def record_drives(
     """Run a policy on B simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
 
     The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically. The entries of
-    `about`, such as the name of the policy, are noted in each file. `tick` is called after every step.
-
-    Raises:
-        ValueError: if the env is of another kind, or the number of paths is not B.
+    `about`, such as the name of the policy, are noted in each file. `tick` is called after every step. Another kind of
+    env, or another number of paths, is a `ValueError`.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, SimulatedRobotEnv):

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import make_composite_from_td
+from torchrl.envs import EnvBase, make_composite_from_td
 
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage

@@ -247,7 +247,6 @@ def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     ("name", "arguments", "message"),
     [
         ("evaluate", "method=ppo", "method=ppo has no effect: a guide is evaluated without an agent"),
-        ("robot", "method=ppo", "method=ppo has no effect: guides drive alone"),
         ("distill", "degrade=[noisy]", "degrade=[noisy] has no effect: a proxy is trained as the key proxy says"),
         ("distill", "proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
         (
@@ -353,8 +352,8 @@ def test_refused_program_leaves_no_folder_with_another_name_of_hydras_files(tmp_
 
 def test_warning_is_one_line_of_the_program(monkeypatch):
     monkeypatch.setattr(warnings, "formatwarning", warnings.formatwarning)
-    with app.program("robot"):
+    with app.program("replay"):
         assert (
             warnings.formatwarning("a topic is ignored", UserWarning, "reading.py", 189)
-            == "robot: a topic is ignored\n"
+            == "replay: a topic is ignored\n"
         )

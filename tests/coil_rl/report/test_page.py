@@ -31,7 +31,7 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     ]  # fmt: skip
     assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (["-", "-", "-"], "no", ["coil", "zeroed"], "-")
     assert cells(rewards)[0] == ["mean reward", "a", "b"]
-    assert cells(rewards)[-1] == ["coil, zeroed", "-100.0", "-201.0"]
+    assert cells(rewards)[-1] == ["coil, zeroed", "-100.0 (0% completed)", "-201.0 (0% completed)"]
 
 
 def test_terms_of_the_reward_are_beside_the_sum(tmp_path):

@@ -8,12 +8,21 @@ from reproduced_runs import read_csv, row
 from run_folders import make_untrained_run
 from worlds import driving_measures
 
-from coil_rl.envs import RecordingError, SimulatedRobotEnv, read_recording, record_drives
+from coil_rl.envs import (
+    McapReplayEnv,
+    Perception,
+    RecordingError,
+    SimulatedRobotEnv,
+    read_recording,
+    record_drives,
+    simulated_cone_classifier,
+)
 from coil_rl.errors import UserError
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.report.runs import Run
 from coil_rl.reproduce import Table6
 from coil_rl.reproduce.robot import robot_page
+from coil_rl.train import checkpoint
 from coil_rl.train.evaluation import evaluate_policy
 
 
@@ -100,6 +109,40 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert sorted(map(str, read_csv(tmp_path / "again.csv"))) == sorted(map(str, rows))
 
 
+def robots_of(run, folder):
+    """Return the recordings of the agent of a run, one robot and a lap of the constant guide at most."""
+    Table6(runs=[str(run)], repeats=1, laps=1).make(folder / "own")
+    return read_recording(folder / "own_drives" / f"{run.name}_0.mcap")
+
+
+def test_own_runs_drive_with_any_label_and_again_with_other_weights(tmp_path):
+    options = ["guide=constant", "guide.constant.value=1", "track=generated", "track.train.count=1", "label=mine"]
+    run = make_untrained_run(tmp_path / "run", "method=coil", "seed=3", *options)
+    first = robots_of(run, tmp_path)
+    assert [line["method"] for line in read_csv(tmp_path / "own.csv")] == ["guide", "mine"]
+    notes = first.notes["simulated"]
+    assert (notes["policy"], notes["seed"], notes["run"]) == ("mine", "3", "run")
+    state = checkpoint.load(run / "policy_last.pt")
+    checkpoint.save({name: weight + 0.1 for name, weight in state.items()}, run / "policy_last.pt")
+    assert (robots_of(run, tmp_path).commands[0][0] != first.commands[0][0]).any()
+
+
+def test_recorded_command_is_the_transformed_action(tmp_path):
+    options = ["learner.action_gain=1.0", "track=generated", "track.train.count=1"]
+    recording = robots_of(make_untrained_run(tmp_path / "residual", "method=residual", *options), tmp_path)
+    guide = McapReplayEnv(recording, Perception(simulated_cone_classifier())).rollout(100, SplineGuide())
+    turn_rate = torch.from_numpy(recording.commands[0][: guide.shape[1], 1])
+    # An untrained residual agent adds little to its guide.
+    advised = (guide["action"][0, :, 0] * torch.pi * 80 / 180).sin() * 0.15 / (2 / 7)
+    assert 0 < (turn_rate - advised).abs().mean() < 0.2
+
+
+def test_run_without_an_agent_is_refused(tmp_path):
+    run = make_untrained_run(tmp_path / "guide", "method=guide", "track=generated", "track.train.count=1")
+    with pytest.raises(UserError, match="has no agent"):
+        robots_of(run, tmp_path)
+
+
 KNOWN = {"crashed": False, "laps": 3, "lap_time": 40.0, "corner_cut": 1.0, "off_centre": 0.02, "clearance": 0.04}
 LOST = {"laps": 0, "lap_time": math.nan, "corner_cut": math.nan, "crashed": True, "clearance": -0.01}
 
@@ -160,6 +203,7 @@ def test_an_agent_without_seed_leaves_claims_undecided_and_other_drivers_have_no
         ({}, "give no driver"),
         ({"experiments": ["mine"], "repeats": 0}, "repeats=0 must be at least 1"),
         ({"experiments": ["mine"], "labels": []}, "labels=.. leaves the guide alone"),
+        ({"runs": ["empty"]}, "holds no run of coil-train"),
         ({"recordings": ["empty"]}, "has no MCAP file"),
         ({"recordings": ["none.mcap"]}, "is not an MCAP file"),
     ],

@@ -87,4 +87,4 @@ def test_many_tracks_are_in_the_csv_only(tmp_path):
         first = run.evaluation[run.evaluation["case"] == "a"]
         object.__setattr__(run, "evaluation", pd.concat([first.assign(case=name) for name in "abcdefghi"]))
     page = Table5(["main"]).make(tmp_path / "t", {"main": runs})
-    assert page.count("The numbers of each of the 9 tracks are in t.csv.") == 2
+    assert page.count("The rewards in each of the 9 cases are in t.csv.") == 2
