@@ -58,10 +58,10 @@ class ConeTrackEnv(SeededEnv):
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
     [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force,
-    `motion` [B, 3] (m ahead, m to the left, radians) since the last observation in the car's frame there, `reward`, `done`,
-    `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed laps), `lap_time` s
-    (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness` |a - mean of
-    the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
+    `motion` [B, 3] (m ahead, m to the left, radians) since the last observation in the car's frame there, `reward`,
+    `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed laps),
+    `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness`
+    |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
 
     Args:
         tracks: the tracks.
@@ -309,7 +309,7 @@ class ConeTrackEnv(SeededEnv):
         step = self.speed / self.rate
         strides = constant((step, step, step / self.car_length), self.pose)
         pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
-        return pose, strides * torch.stack([torch.ones_like(turn), torch.zeros_like(turn), turn])
+        return pose, torch.cat([constant((step, 0.0), pose).expand(2, len(turn)), (turn * strides[2]).unsqueeze(0)])
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""

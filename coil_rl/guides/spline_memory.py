@@ -167,7 +167,7 @@ class SplineMemoryGuide(SplineGuide):
         self, memory: dict[str, Tensor], frame: Frame, rows: Tensor, plans: Tensor, cones: Tensor, count: Tensor,
         left: Tensor,
     ) -> None:  # fmt: skip
-        """Place targets on the path through the cones in view where `plans`; `left` is the number of left cones seen."""
+        """Place targets on the path through the cones in view where `plans`; `left` is the number of left cones."""
         midpoints, total = self._midpoints(cones, count)
         points, total = frame.to_world(midpoints), total.to(torch.int64)
         if self.oddities:
