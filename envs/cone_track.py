@@ -58,10 +58,11 @@ class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
     Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
-    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force, `motion`
-    [B, 3] the way since the last observation (m ahead, m to the left, radians) in the car's frame there, `reward`, `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed
-    laps), `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash),
-    `smoothness` |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
+    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force,
+    `motion` [B, 3] (m ahead, m to the left, radians) since the last observation in the car's frame there, `reward`,
+    `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed laps),
+    `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness`
+    |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
 
     Args:
         tracks: the tracks.
@@ -80,8 +81,8 @@ class ConeTrackEnv(SeededEnv):
         assignment: "random" draws a place at each reset; with `starts` it also draws at the first reset how much of
             `time_limit` is over, so that the episodes do not end together. "cyclic" keeps car i on place i mod places.
         sight: m, range of view.
-        hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It is then made without
-            cones that share their x or y with a nearer one, and a side with fewer than two cones lies at the origin.
+        hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It is then made
+            without cones that share their x or y with a nearer one; a side with fewer than two lies at the origin.
         late_observation: whether `observation` is the one of the step before; `cones` are not late.
         finish_in_sight: whether the finish line is between the first cones of the level file that are visible from the
             track's start, in place of the first ones.
@@ -330,13 +331,13 @@ class ConeTrackEnv(SeededEnv):
         )
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the next pose by the bicycle model (equations 99-100): move along the heading, then turn; and the motion."""
+        """Return pose and motion by the bicycle model (equations 99-100): move along the heading, then turn."""
         heading = self.pose[2]
         turn = (action * constant(self.max_steering, action)).sin_()
         step = self.speed / self.rate
         strides = constant((step, step, step / self.car_length), self.pose)
         pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
-        return pose, strides * torch.stack([torch.ones_like(turn), torch.zeros_like(turn), turn])
+        return pose, torch.cat([constant((step, 0.0), pose).expand(2, len(turn)), (turn * strides[2]).unsqueeze(0)])
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
@@ -385,7 +386,7 @@ class ConeTrackEnv(SeededEnv):
         return self.fit(points, count).equidistant(SAMPLES) * (count > 1)
 
     def _count_new_cones(self, visible: View, slots: Tensor, finished: Tensor) -> tuple[Tensor, Tensor]:
-        """Note the visible cones; return the number of sides with a rewarded one, and whether one came into view, [B]."""
+        """Note the visible cones; return the number of sides with a rewarded one and whether one came into view."""
         before = self.epoch
         self.epoch = before + constant(1, before)
         self.lap_epoch = torch.where(finished, self.epoch, self.lap_epoch)

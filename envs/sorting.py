@@ -90,12 +90,8 @@ def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
 def append(points: Tensor, count: Tensor, more: Tensor, selected: Tensor) -> tuple[Tensor, Tensor]:
     """Append the selected ones of `more` [D, M, *batch] to lists of points in order, as far as there is room.
 
-    Args:
-        points: [D, N, *batch], of which `count` [*batch], integers, are in use.
-        selected: [M, *batch], bool.
-
-    Returns:
-        The new points and count.
+    The lists `points` are [D, N, *batch], of which `count` [*batch], integers, are in use; `selected` is [M, *batch],
+    bool. Returns the new lists and counts.
     """
     room = points.shape[1]
     slot = torch.where(selected, count + selected.cumsum(0) - 1, room).clamp_(max=room)

@@ -139,7 +139,7 @@ def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
         offset = (ring - (x, y)) @ AS_COMPLEX * np.exp(-1j * heading)
         visible = (np.abs(offset) < sight) & (np.abs(np.angle(offset)) < half_angle)
         rings.append(np.roll(ring, -int(visible.argmax()), axis=0))
-    return Track(track.name, *rings, track.start)
+    return Track(track.name, rings[0], rings[1], track.start)
 
 
 def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:

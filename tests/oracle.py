@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline, make_interp_spline
+from scipy.interpolate import CubicSpline
 from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial import cKDTree
 
@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 Curve = Callable[[Array], Array]
 
 MAX_STEERING = np.deg2rad(80)
-SIGHT = 7.0
 HALF_FIELD_OF_VIEW = np.deg2rad(60)
 KEPT_CONES = 16
 SAMPLES = 5
@@ -64,12 +63,6 @@ def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
     return u, CubicSpline(u, values, bc_type="natural")
 
 
-def fit_quadratic(points: Array) -> tuple[Array, Curve]:
-    """Fit the interpolating quadratic spline by chord length, a line for two points."""
-    u = chord_length(points)
-    return u, make_interp_spline(u, points, k=1 if len(points) == 2 else 2)
-
-
 def fit_parabola(points: Array) -> tuple[Array, Curve]:
     """Fit the least-squares parabola by chord length, a line for two points."""
     u = chord_length(points)
@@ -82,6 +75,20 @@ def to_car(pose: Array, points: Array) -> Array:
     x, y = (points - pose[:2]).T
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     return np.stack([cos * x + sin * y, -sin * x + cos * y], axis=1)
+
+
+def to_world(pose: Array, point: Array) -> Array:
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return pose[:2] + np.array([[cos, -sin], [sin, cos]]) @ point
+
+
+def without_shared(points: Array, tolerance: float = 0.0) -> Array:
+    """Drop the points that share a coordinate with a kept one before them."""
+    kept: list[Array] = []
+    for point in points:
+        if not any((np.abs(point - other) <= tolerance).any() for other in kept):
+            kept.append(point)
+    return np.array(kept).reshape(-1, 2)
 
 
 def midpoints(left: Array, right: Array) -> Array:
@@ -143,6 +150,10 @@ class OneCar:
     held_steps: int = 0
     time_limit: float = 200.0
     laps: int = 2
+    sight: float = 7.0
+    hold_boundary: bool = False
+    late_observation: bool = False
+    finish_in_sight: bool = False
     speed: float = 2.0
     car_length: float = 2.0
     history: list[float] = field(default_factory=list)
@@ -150,6 +161,10 @@ class OneCar:
     def __post_init__(self) -> None:
         self.rings = (self.left, self.right)
         self.finish = (self.left[0] + self.right[0]) / 2
+        if self.finish_in_sight:
+            self.pose = np.array(self.start, dtype=float)
+            self.find_visible()
+            self.finish = (self.left[min(self.visible[0])] + self.right[min(self.visible[1])]) / 2
         curves = []
         for ring in self.rings:
             closed = np.vstack([ring, ring[:1]])
@@ -169,7 +184,8 @@ class OneCar:
         self.before: list[set[int]] = [set(), set()]
         self.samples: list[Array | None] = [None, None]
         self.find_visible()
-        return self.observe()
+        self.latest = self.observe()
+        return self.latest
 
     def find_visible(self) -> None:
         """Find the visible cones of each side, nearest first."""
@@ -178,7 +194,7 @@ class OneCar:
             local = to_car(self.pose, ring)
             distance = np.linalg.norm(local, axis=1)
             angle = np.arctan2(local[:, 1], local[:, 0])
-            rows = np.flatnonzero((distance <= SIGHT) & (np.abs(angle) <= HALF_FIELD_OF_VIEW))
+            rows = np.flatnonzero((distance <= self.sight) & (np.abs(angle) <= HALF_FIELD_OF_VIEW))
             self.visible.append([int(i) for i in rows[np.argsort(distance[rows])][:KEPT_CONES]])
 
     def cones(self) -> tuple[Array, Array]:
@@ -189,14 +205,16 @@ class OneCar:
     def steering(self) -> float:
         return self.history[-1] if self.history else 0.0
 
-    def observe(self) -> Array:
+    def observe(self, entered: bool = True) -> Array:
         parts = []
         for side, (ring, indices) in enumerate(zip(self.rings, self.visible, strict=True)):
-            if len(indices) >= 2:
-                fit = (
-                    fit_cubic(ring[indices], self.smoothing) if self.spline == "cubic" else fit_quadratic(ring[indices])
-                )
-                u, curve = fit
+            cones = ring[indices]
+            if self.hold_boundary:
+                cones = without_shared(cones) if entered else cones[:0]
+                if entered and len(cones) < 2:
+                    self.samples[side] = np.zeros((SAMPLES, 2))
+            if len(cones) >= 2:
+                u, curve = fit_cubic(cones, self.smoothing) if self.spline == "cubic" else fit_parabola(cones)
                 self.samples[side] = curve(np.linspace(0, u[-1], SAMPLES))
             samples = self.samples[side]
             if samples is None:
@@ -205,7 +223,7 @@ class OneCar:
             local = to_car(self.pose, samples)
             distance = np.linalg.norm(local, axis=1)
             degrees = np.rad2deg(np.arctan2(local[:, 1], local[:, 0]))
-            both = np.stack([2 * distance / SIGHT - 1, degrees / 120], axis=1)
+            both = np.stack([2 * distance / self.sight - 1, degrees / 120], axis=1)
             parts.append(np.clip(both, -1, 1).ravel())
         return np.concatenate(parts)
 
@@ -236,16 +254,20 @@ class OneCar:
             self.lap_start = self.steps
 
         self.find_visible()
-        cone_sides = 0
+        cone_sides, entered = 0, False
         for side in range(2):
             now = set(self.visible[side])
             if lap_time:
                 self.rewarded[side] = set()
             known = self.rewarded[side] if self.cone_bonus == "first_sighting" else self.before[side]
             cone_sides += bool(now - known)
+            entered |= bool(now - self.before[side])
             self.rewarded[side] |= now
             self.before[side] = now
 
+        observation, self.latest = self.latest, self.observe(entered)
+        if not self.late_observation:
+            observation = self.latest
         to_cone = np.linalg.norm(np.vstack(self.rings) - self.pose[:2], axis=1).min()
         to_boundary = self.boundary.query(self.pose[:2])[0]
         clearance = float(min(to_cone - CONE_RADIUS, to_boundary - BOUNDARY_MARGIN))
@@ -261,7 +283,7 @@ class OneCar:
             terms = dict.fromkeys(terms, 0.0) | {"crash": -100.0}
         terminated = crashed or self.lap >= self.laps
         return Outcome(
-            observation=self.observe(),
+            observation=observation,
             terms=terms,
             lap=self.lap,
             lap_time=lap_time,
@@ -271,3 +293,78 @@ class OneCar:
             terminated=terminated,
             truncated=not terminated and self.steps >= round(self.time_limit * self.rate),
         )
+
+
+@dataclass
+class RememberingGuide:
+    """The guide with a memory for one car, from its pose and the numbers of the cones in view."""
+
+    rings: tuple[Array, Array]
+    oddities: bool = False
+    sight: float = 7.0
+    gain: float = 1.0
+
+    def __post_init__(self) -> None:
+        self.targets: list[Array] = []
+        self.passed: list[bool] = []
+        self.seen: list[set[int]] = [set(), set()]
+        self.chosen: Array | None = None
+        self.gate: Array | None = None
+        self.poses: list[Array] = []
+
+    def act(self, pose: Array, visible: list[list[int]], steering: float) -> float:
+        """Return the advice for a pose and the cones in view of each side, nearest first."""
+        self.poses.append(pose)
+        if self.oddities and len(self.poses) == 1:
+            return 0.0
+        target, self.chosen = self.chosen, self.nearest(pose)
+        self.place(pose, visible)
+        target = target if self.oddities else self.chosen
+        if target is None:
+            return 0.0 if self.oddities else steering
+        ahead, left = to_car(pose, target[None])[0]
+        distance = np.hypot(ahead, left)
+        if not TARGET_REACHED < distance < self.sight:
+            return 0.0 if self.oddities else steering
+        return self.gain * 2 / np.pi * np.arctan(np.rad2deg(np.arctan2(left, ahead)) / distance**1.8)
+
+    def nearest(self, pose: Array) -> Array | None:
+        earlier = self.poses[-3][:2] if len(self.poses) > 2 else None
+        in_circle = (
+            earlier is not None and self.gate is not None and np.linalg.norm(earlier - self.gate) < TARGET_REACHED
+        )
+        best = None
+        for i, target in enumerate(self.targets):
+            ahead, left = to_car(pose, target[None])[0]
+            distance = np.hypot(ahead, left)
+            if in_circle if self.oddities else distance >= self.sight:
+                self.passed[i] = False
+            self.passed[i] |= distance <= TARGET_REACHED
+            visible = distance < self.sight and abs(np.arctan2(left, ahead)) <= HALF_FIELD_OF_VIEW
+            if visible and not self.passed[i] and (best is None or distance < best[0]):
+                best = distance, target
+        return None if best is None else best[1]
+
+    def place(self, pose: Array, visible: list[list[int]]) -> None:
+        known = sum(map(len, self.seen))
+        for seen, now in zip(self.seen, visible, strict=True):
+            seen.update(now)
+        if sum(map(len, self.seen)) == known or min(map(len, visible)) < 2:
+            return
+        left, right = (ring[now] for ring, now in zip(self.rings, visible, strict=True))
+        if self.gate is None:
+            self.gate = (left[0] + right[0]) / 2
+        middle = (left[:, None] + right)[np.linalg.norm(left[:, None] - right, axis=-1) < PAIR_DISTANCE] / 2
+        middle = middle[np.argsort(np.linalg.norm(middle - pose[:2], axis=1), kind="stable")]
+        # Coordinates are those of the frame at the start.
+        middle = to_car(self.poses[0], middle)
+        if self.oddities:
+            middle = without_shared(middle, 5e-3)
+        if len(middle) < 2:
+            return
+        u, curve = fit_parabola(middle)
+        for fraction in np.arange(0, 1.01, 0.5 / len(self.seen[0]) ** 0.4):
+            target = to_world(self.poses[0], np.asarray(curve(fraction * u[-1])))
+            if all(np.linalg.norm(target - other) >= 1 for other in self.targets):
+                self.targets.append(target)
+                self.passed.append(False)

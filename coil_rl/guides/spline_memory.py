@@ -23,20 +23,20 @@ NOWHERE = 1e4  # m, coordinates of empty slots
 class SplineMemoryGuide(SplineGuide):
     """Pursuit of remembered targets: the safety policy of the paper as in the authors' program (appendix A.1).
 
-    Where a cone that it has never seen comes into view, and two of each side are in view, the guide places targets on
-    the least-squares parabola through the midpoints of left-right pairs, at most 1 m from another one. It steers for
-    the nearest visible target that has not been passed. All positions are in the frame of the car at the start of the
-    episode, which the guide knows from `motion` alone. There is room for 192 targets and 128 cones a side; what comes
-    after is not remembered.
+    When a cone that was never seen comes into view, and two of each side are in view, the guide places targets on the
+    least-squares parabola through the midpoints of left-right pairs, at least 1 m from each other. It steers for the
+    nearest visible target that has not been passed. All positions are in the frame of the car at the start of the
+    episode, and the car's own follows from `motion`. There is room for 192 targets and 128 cones a side; further ones
+    are not remembered.
 
     Reads `cones`, `cone_count`, `steering`, `motion` and `is_init`, writes `action`. Its memory is entries named
     `path_...`.
 
     Args:
         oddities: whether to act as the authors' program: the target is the one chosen in the step before, and without
-            one the steering is 0; passed targets count again only within the circle around the first two midpoint, and
-            midpoints that share a coordinate with a nearer one are dropped. By default the target is chosen now, the
-            steering is kept without one, and passed targets count again out of sight.
+            one the steering is 0; passed targets count again only in a circle around the first midpoint; midpoints that
+            share a coordinate with a nearer one are dropped; the first observation is ignored. By default the target is
+            chosen now, the steering is kept without one, and passed targets count again out of sight.
         sight: m, range in which a target is visible.
         gain, sharpness, max_steering: as for `SplineGuide`.
 
@@ -66,7 +66,7 @@ class SplineMemoryGuide(SplineGuide):
             "path_targets": ((2, TARGETS), NOWHERE, torch.float32),
             "path_target_count": ((1,), 0, torch.int64),
             "path_passed": ((TARGETS,), False, torch.bool),
-            # Ever seen: coordinate, side, cone. Half precision halves the cost of resets, and is fine enough to tell cones.
+            # Ever seen: coordinate, side, cone. Half precision is enough to tell cones, and resets cost less.
             "path_cones": ((2, 2, CONES), NOWHERE, torch.float16),
             "path_cone_count": ((2,), 0, torch.int64),
             "path_in_view": ((2, self.cones, 2), NOWHERE, torch.float32),  # at the last step: coordinate, cone, side
@@ -89,7 +89,8 @@ class SplineMemoryGuide(SplineGuide):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice and the memory for the next step."""
-        cones, count, steering, motion = (tensordict[key] for key in ("cones", "cone_count", "steering", "motion"))
+        count, dtype = tensordict["cone_count"], tensordict["steering"].dtype
+        cones, steering, motion = (tensordict[key].float() for key in ("cones", "steering", "motion"))
         memory = {key: tensordict[key] for key in self.memory}
         if self.oddities:
             count = count.masked_fill(tensordict["is_init"], 0)
@@ -108,7 +109,7 @@ class SplineMemoryGuide(SplineGuide):
         action = torch.where(advised, self._pursuit(local), without.squeeze(-1)).unsqueeze(-1)
         for key, value in memory.items():
             tensordict.set(("next", key), value)
-        return tensordict.set(self.out_keys[0], action)
+        return tensordict.set(self.out_keys[0], action.to(dtype))
 
     def _nearest_unpassed(self, memory: dict[str, Tensor], frame: Frame, before: Tensor) -> Tensor:
         """Update which targets are passed; return the nearest visible one that is not, or a place far away, [2, B].
@@ -166,7 +167,7 @@ class SplineMemoryGuide(SplineGuide):
         self, memory: dict[str, Tensor], frame: Frame, rows: Tensor, plans: Tensor, cones: Tensor, count: Tensor,
         left: Tensor,
     ) -> None:  # fmt: skip
-        """Place targets on the path through the cones in view of `rows`; `left` is the number of left cones ever seen."""
+        """Place targets on the path through the cones in view where `plans`; `left` is the number of left cones."""
         midpoints, total = self._midpoints(cones, count)
         points, total = frame.to_world(midpoints), total.to(torch.int64)
         if self.oddities:

@@ -17,7 +17,10 @@ from coil_rl.testing import check_env
 from coil_rl.train.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
-AUTHORS: dict[str, Any] = {"rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2}
+AUTHORS: dict[str, Any] = {
+    "rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2, "sight": 7.03125,
+    "hold_boundary": True, "late_observation": True, "finish_in_sight": True,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +69,21 @@ def test_outputs_are_finite_and_within_their_specs(preset: dict) -> None:
     assert env.observation_spec.is_in(env.reset().select(*env.observation_spec.keys()))
     for emitted in drive(env, steering(120, 128, seed=2)):
         assert env.observation_spec.is_in(emitted.select(*env.observation_spec.keys()))
-        assert emitted["cones"].square().sum(-1).max() <= 49 + 1e-4
+        assert emitted["cones"].square().sum(-1).max() <= env.sight**2 + 1e-4
         assert emitted.isfinite().all()
+
+
+def test_motion_is_the_way_in_the_frame_of_the_last_observation(tracks: list[Track]) -> None:
+    env = ConeTrackEnv(tracks, 16, dtype=torch.float64)
+    state = env.reset()
+    assert state["motion"].eq(0).all()
+    for action in steering(40, 16, seed=5):
+        before = state["info", "pose"]
+        emitted, state = advance(env, state, action)
+        x, y, turn = emitted["motion"].unbind(-1)
+        cos, sin = before[:, 2].cos(), before[:, 2].sin()
+        moved = torch.stack([cos * x - sin * y, sin * x + cos * y, turn], -1)
+        assert torch.allclose(before + moved, emitted["info", "pose"], atol=1e-12)
 
 
 def test_env_is_batch_invariant(tracks: list[Track]) -> None:
@@ -224,7 +240,17 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
         ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, cyclic"),
         *(
             ({name: value}, f"{name}={value} must be more than 0")
-            for name in ("num_envs", "rate", "laps", "time_limit", "kept_cones", "speed", "car_length", "max_steering")
+            for name in (
+                "num_envs",
+                "rate",
+                "laps",
+                "time_limit",
+                "kept_cones",
+                "speed",
+                "car_length",
+                "max_steering",
+                "sight",
+            )
             for value in (0, -1)
         ),
         ({"rate": math.nan}, "rate=nan must be more than 0"),

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coil_rl.envs.sorting import smallest
+from coil_rl.envs.sorting import append, first_come, rows_in_use, smallest
 
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 
@@ -28,3 +28,24 @@ def test_smallest_agrees_with_argsort(dtype: torch.dtype, size: int, data: st.Da
 def test_equal_entries_keep_their_order(dtype: torch.dtype) -> None:
     values = torch.tensor([[3.0], [1.0], [3.0], [0.0], [3.0]], dtype=dtype)
     assert smallest(values, torch.zeros_like(values), 5).flatten().tolist() == [3, 1, 0, 2, 4]
+
+
+def test_first_come_keeps_what_conflicts_with_no_kept_entry_before_it() -> None:
+    values = torch.tensor([[0.0], [0.5], [1.2], [5.0], [1.9], [5.5]])
+    eligible = torch.tensor([[True], [True], [True], [False], [True], [True]])
+    conflict = (values.unsqueeze(0) - values.unsqueeze(1)).abs() < 1
+    # 0.5 is too near to 0, 1.9 to 1.2; 5.5 is near to 5 alone, which is not eligible.
+    assert first_come(eligible, conflict).flatten().tolist() == [True, False, True, False, False, True]
+
+
+def test_append_adds_selected_points_in_order_as_far_as_there_is_room() -> None:
+    points, more = torch.zeros(1, 4, 2), torch.tensor([[[1.0, 1.0], [2.0, 2.0], [3.0, 3.0]]])
+    selected = torch.tensor([[True, False], [False, True], [True, True]])
+    longer, count = append(points, torch.tensor([1, 3]), more, selected)
+    assert count.tolist() == [3, 4]
+    assert longer[0].T.tolist() == [[0, 1, 3, 0], [0, 0, 0, 2]]
+    assert points.eq(0).all()
+
+
+def test_rows_in_use_are_those_of_the_mask() -> None:
+    assert rows_in_use(torch.tensor([False, True, True, False])).tolist() == [1, 2]

@@ -5,22 +5,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.interpolate import make_interp_spline, make_smoothing_spline
+from scipy.interpolate import make_smoothing_spline
 from torch import Tensor
 
-from coil_rl.envs.splines import (
-    SelfEvolvingSpline,
-    Spline,
-    least_squares_parabola,
-    quadratic_spline,
-    smoothing_spline,
-)
+from coil_rl.envs.splines import SelfEvolvingSpline, Spline, least_squares_parabola, smoothing_spline
 
 SLOTS = 16
 FITS = {
     "smoothing": lambda points, count: smoothing_spline(points, count, 0.3),
     "interpolating": lambda points, count: smoothing_spline(points, count, 0.0),
-    "quadratic": quadratic_spline,
     "parabola": least_squares_parabola,
 }
 every_fit = pytest.mark.parametrize("fit", FITS.values(), ids=FITS.keys())
@@ -94,15 +87,13 @@ def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(n: int, 
 
 @steady
 @given(seeds, st.integers(2, SLOTS))
-def test_quadratic_spline_and_parabola_agree_with_scipy_and_numpy(seed: int, n: int) -> None:
+def test_parabola_agrees_with_numpy(seed: int, n: int) -> None:
     row = separated(seed, n)
     u = chord(row)
     where = np.linspace(0, u[-1], 41)
-    interpolation = make_interp_spline(u, row.T, k=min(2, n - 1))(where).T
     parabola = np.stack([np.polyval(np.polyfit(u, axis, min(2, n - 1)), where) for axis in row])
-    for fit, truth in ((quadratic_spline, interpolation), (least_squares_parabola, parabola)):
-        sampled = fit(*padded([row])).sample(torch.from_numpy(where)[:, None])[..., 0].numpy()
-        assert sampled == pytest.approx(truth, abs=1e-9)
+    sampled = least_squares_parabola(*padded([row])).sample(torch.from_numpy(where)[:, None])[..., 0].numpy()
+    assert sampled == pytest.approx(parabola, abs=1e-9)
 
 
 @every_fit
@@ -219,7 +210,7 @@ degenerate = st.one_of(
 def test_results_and_gradients_are_finite_for_any_points(row: np.ndarray, smoothing: float, dtype) -> None:
     points = torch.from_numpy(row).to(dtype)[..., None].repeat(1, 1, SLOTS + 1)
     count = torch.arange(SLOTS + 1)
-    for fit in (lambda *a: smoothing_spline(*a, smoothing), quadratic_spline, least_squares_parabola):
+    for fit in (lambda *a: smoothing_spline(*a, smoothing), least_squares_parabola):
         leaf = points.clone().requires_grad_()
         spline = fit(leaf, count)
         u = torch.linspace(-1, 9, 4, dtype=dtype)[:, None].expand(4, SLOTS + 1)
@@ -283,7 +274,7 @@ def test_reset_removes_the_points_of_masked_rows_and_state_dict_restores_all() -
     [
         (lambda points, count: SelfEvolvingSpline(1, 3, 0.1), "capacity=1"),
         (lambda points, count: smoothing_spline(points, count[:3], 0.1), "count"),
-        (lambda points, count: quadratic_spline(points[:, :1], count), "K >= 2"),
+        (lambda points, count: least_squares_parabola(points[:, :1], count), "K >= 2"),
         (lambda points, count: smoothing_spline(points, count, -1), "smoothing=-1"),
     ],
 )

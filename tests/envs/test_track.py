@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from coil_rl.envs import shipped_tracks
-from coil_rl.envs.track import SIDES, Track, TrackError, places, resample
+from coil_rl.envs.track import SIDES, Track, TrackError, begin_in_sight, places, resample
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 CIRCLE = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
@@ -32,6 +32,20 @@ def test_default_start_is_between_the_last_cones_heading_for_the_finish():
     assert (x, y) == pytest.approx((10 * np.cos(TURN[-1]), 10 * np.sin(TURN[-1])))
     assert heading == pytest.approx(np.arctan2(-y, 10 - x))
     assert circle_track(start=(0, -10, 0)).start == (0.0, -10.0, 0.0)
+
+
+def test_sides_begin_with_the_first_cones_in_sight_of_the_start():
+    track = circle_track(start=(10 * np.cos(TURN[5]), 10 * np.sin(TURN[5]), TURN[5] + np.pi / 2))
+    turned = begin_in_sight(track, 7.0, np.pi / 3)
+    for side in SIDES:
+        before, after = getattr(track, side), getattr(turned, side)
+        offset = (before - track.start[:2]) @ [1, 1j] * np.exp(-1j * track.start[2])
+        visible = (np.abs(offset) < 7) & (np.abs(np.angle(offset)) < np.pi / 3)
+        first = np.flatnonzero(visible)[0]
+        assert first > 0
+        assert after.tolist() == np.concatenate([before[first:], before[:first]]).tolist()
+    assert turned.start == track.start
+    assert begin_in_sight(track, 0.1, np.pi / 3).left.tolist() == track.left.tolist()
 
 
 def test_boundary_of_a_circle_is_that_circle():

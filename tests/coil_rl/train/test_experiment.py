@@ -9,7 +9,7 @@ from torchrl.record.loggers import TensorboardLogger
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
-from coil_rl.guides import RandomGuide, SplineGuide
+from coil_rl.guides import RandomGuide, SplineGuide, SplineMemoryGuide
 from coil_rl.learners import PPO
 from coil_rl.train import checkpoint
 from coil_rl.train.curve import EvaluationCurve
@@ -68,7 +68,7 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineGuide, 4)])
+@pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4)])
 def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
     rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
