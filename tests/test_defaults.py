@@ -20,6 +20,7 @@ VARIATIONS = {
     "env/gym.yaml": ["env.options", "env.controllers"],  # None in the constructor: no options, no controllers
     "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["car_length"],
+    "guide/authors.yaml": ["oddities"],
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],
     "proxy/network.yaml": ["method.transforms"],

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 from oracle import OneCar, RememberingGuide
+from tensordict import TensorDictBase
 from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks
-from coil_rl.guides import SplineMemoryGuide
+from coil_rl.guides import FollowAdvice, SplineMemoryGuide
 from coil_rl.testing import check_guide
 from coil_rl.transforms import GuideActions
 
@@ -63,6 +64,22 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
 def test_guide_contract_holds(rings: list[Track], world: dict[str, Any], options: dict[str, Any]) -> None:
     env = ConeTrackEnv(rings, 5, **world)
     check_guide(SplineMemoryGuide(**options), env, steps=30)
+
+
+@both_guides
+def test_rows_that_need_nothing_may_be_computed_too(
+    rings: list[Track], world: dict[str, Any], options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def drive() -> TensorDictBase:
+        env = guided(rings, 5, world, options)
+        return env.rollout(40, FollowAdvice(env), break_when_any_done=False)
+
+    chosen = drive()
+    for module in ("coil_rl.guides.spline_memory", "coil_rl.envs.cone_track"):
+        # As on a GPU, where reading the mask would cost more.
+        monkeypatch.setattr(f"{module}.rows_in_use", lambda mask: torch.arange(len(mask)))
+    assert (drive() == chosen).all()
+    assert chosen["guide_state", "memory", "path_target_count"][:, -1].min() > 2
 
 
 def test_guide_knows_its_way_from_motion_alone() -> None:
