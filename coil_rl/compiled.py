@@ -119,7 +119,8 @@ def compiling() -> Iterator[None]:
 
 def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
     """Return a name for the compiled code of a graph on this machine."""
-    parts = [graph.code, torch.__version__, OPTIONS, platform.node(), torch.backends.cpu.get_cpu_capability()]
+    parts: list[Any] = [graph.code, torch.__version__, OPTIONS]
+    parts += [platform.node(), torch.backends.cpu.get_cpu_capability()]  # the code is for this processor
     parts += [(argument.shape, argument.stride(), argument.dtype, argument.device) for argument in arguments]
     digest = hashlib.sha256(repr(parts).encode())
     for name, constant in sorted(graph.named_buffers()):

@@ -5,7 +5,7 @@ cones ahead. The reward pays for laps, newly visible cones and each step, and ch
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial, reduce
 from typing import Any, ClassVar, Literal
 
@@ -15,7 +15,6 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from coil_rl.compiled import Compiled
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
 from coil_rl.envs.reward import (
@@ -164,7 +163,7 @@ class ConeTrackEnv(SeededEnv):
         self.weights: Tensor = nn.Buffer(weights, persistent=False)
         self._declare_specs()
         self._register_state(num_envs)
-        self.compiled: Compiled | None = None
+        self.compiled: Callable[..., Sequence[Tensor]] | None = None
         self.tables = [self.weights, *self.map.buffers()]
         self.staggered = starts is not None
         self._register_starts(starts)
@@ -271,9 +270,9 @@ class ConeTrackEnv(SeededEnv):
         motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
         return self._output(observation.t(), cones, count, motion, info, terms)
 
-    def compile_steps(self) -> None:
-        """Compile the steps, which changes the last digits of the numbers."""
-        self.compiled = Compiled(self._step_on_tensors)
+    def compile_steps(self, compiled: Callable[[Callable[..., list[Tensor]]], Callable[..., Sequence[Tensor]]]) -> None:
+        """Compile the steps by a function that compiles one of tensors; the last digits of the numbers change."""
+        self.compiled = compiled(self._step_on_tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)

@@ -1,7 +1,7 @@
 """Safety policy of the paper (appendix A.1): pursuit of a spline through the middle of the visible cones."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -9,7 +9,6 @@ from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from coil_rl.compiled import Compiled
 from coil_rl.envs.constants import constant, flat_index
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import field_of_view_margin
@@ -79,11 +78,11 @@ class SplineGuide(TensorDictModuleBase):
         check_range(-1e6, 1e6, gain=gain)
         self.fit = spline_fit(spline, smoothing)
         self.gain, self.sharpness, self.max_steering = gain, sharpness, max_steering
-        self.compiled: Compiled | None = None
+        self.compiled: Callable[..., Sequence[Tensor]] | None = None
 
-    def compile_steps(self) -> None:
-        """Compile the advice for batches of the size of the first one, which changes the last digits."""
-        self.compiled = Compiled(lambda *entries: [self.steer(*entries)], once=True)
+    def compile_steps(self, compiled: Callable[..., Callable[..., Sequence[Tensor]]]) -> None:
+        """Compile the advice for batches of the size of the first one, see `Compiled`."""
+        self.compiled = compiled(lambda *entries: [self.steer(*entries)], once=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice."""

@@ -48,7 +48,7 @@ class GradientStep:
         compile: bool | Literal["auto"] = "auto",
         compilable: bool = True,
     ) -> None:
-        check_choice((True, False, "auto"), compile=compile)
+        check_choice(("true", "false", "auto"), compile=str(compile).lower())
         if compile is True and not compilable:
             raise ValueError("compile=true: this learner's update depends on data in its shapes; take compile=auto")
         self.losses, self.modules, self.max_grad_norm, self.after = losses, modules, max_grad_norm, after
@@ -128,7 +128,7 @@ class GradientStep:
         self.names = list(losses.keys())
         total = sum(weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True))
         with self._traceable(rates):
-            gradients = torch.autograd.grad(total, self.parameters, allow_unused=True)  # type: ignore[arg-type]
+            gradients = torch.autograd.grad(total, self.parameters, allow_unused=True)
             for parameter, gradient in zip(self.parameters, gradients, strict=True):
                 parameter.grad = gradient
             torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)

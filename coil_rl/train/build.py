@@ -10,6 +10,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 
+from coil_rl.compiled import Compiled
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.train.arguments import check_arguments, yaml_text
@@ -98,7 +99,7 @@ def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *,
 def compile_steps(config: DictConfig, env: EnvBase) -> EnvBase:
     """Return an env whose steps, and those of its guides, are compiled where they can be, if `compile` is true."""
     for module in env.modules() if config.compile else ():
-        getattr(module, "compile_steps", lambda: None)()
+        getattr(module, "compile_steps", lambda _: None)(Compiled)
     return env
 
 

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchrl.envs import TransformedEnv
 from worlds import driving_measures
 
+from coil_rl.compiled import Compiled
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import REWARD_TERMS
 from coil_rl.guides.spline import SplineGuide
@@ -336,7 +337,7 @@ def test_compiled_steps_are_the_steps(rings, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     envs = [TransformedEnv(ConeTrackEnv(rings, 6), GuideActions({"spline": SplineGuide()})) for _ in "ab"]
     for module in envs[1].modules():
-        getattr(module, "compile_steps", lambda: None)()
+        getattr(module, "compile_steps", lambda _: None)(Compiled)
     carriers = [env.reset() for env in envs]
     for count in range(60):
         action = torch.linspace(-1, 1, 6).unsqueeze(-1) * (count / 60)
