@@ -134,8 +134,13 @@ def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_t
     assert metrics["epsilon"] == pytest.approx(0.3), "little noise"
 
 
-def look(*returns, failures=(0, 0, 0)):
+def look(*returns, failures=(0, 0, 0, 0, 0)):
     return Look(torch.tensor(returns), failures[: len(returns)])
+
+
+def first_look(*returns):
+    """Return a look with two guides, the policy of its own, and opposites of the guides that are worse than that."""
+    return look(*returns, *[[value - 1 for value in returns[2]]] * 2)
 
 
 @pytest.fixture
@@ -145,10 +150,27 @@ def anchor():
 
 
 def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(anchor):
-    anchor.begin(look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]))
+    anchor.begin(first_look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]))
     assert anchor.holds
     assert anchor.head.weight.tolist() == [0, 1]
     assert anchor.guide_return == pytest.approx(31 / 3)
+
+
+def test_opposite_of_the_worst_guide_holds_if_it_is_the_best_and_lets_go_like_a_guide(anchor):
+    bad = [-20.0, -20, -20]
+    anchor.begin(look(bad, bad, [0.0, 0, 0], [5.0, 6, 7], [100.0, 100, 100], failures=(9, 9, 9, 9, 1)), torch.zeros(3))
+    assert anchor.head.weight.tolist() == [0, -1]
+    assert (anchor.weight, anchor.guide_return, anchor.guide_failures) == (1, 100, 1)
+    anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]))
+    assert anchor.head.weight.tolist() == pytest.approx([0, -0.95])
+    anchor.decide(look([90.0, 90, 90], [90.0, 90, 90]))
+    assert anchor.head.weight.tolist() == [0, -1]
+    assert anchor.set_noise(0.0)["anchor"] == -1
+    for _ in range(30):
+        anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]))
+    assert anchor.weight == 0
+    anchor.decide(look([90.0, 90, 90], [90.0, 90, 90]))
+    assert anchor.head.weight.tolist() == pytest.approx([0, -0.1]), "zero keeps the sign"
 
 
 @pytest.mark.parametrize(
@@ -157,7 +179,7 @@ def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(a
     ids=["as its own", "as random actions", "better by less than a standard error"],
 )
 def test_guide_that_is_no_better_does_not_hold(anchor, own, random):
-    anchor.begin(look([9.0, 10, 12], [0.0, 0, 0], own), torch.tensor(random))
+    anchor.begin(first_look([9.0, 10, 12], [0.0, 0, 0], own), torch.tensor(random))
     assert not anchor.holds
     assert anchor.weight == 0
     assert not any(anchor.due(update, 24) for update in range(24))
@@ -165,7 +187,9 @@ def test_guide_that_is_no_better_does_not_hold(anchor, own, random):
 
 
 def begun(anchor, weight=1.0):
-    anchor.begin(look([100.0, 100, 100], [0.0, 0, 0], [0.0, 0, 0]), torch.zeros(3))
+    opposites = [[-100.0, -100, -100]] * len(anchor.head.weight)
+    guides = [[100.0, 100, 100], [0.0, 0, 0]][: len(opposites)]
+    anchor.begin(look(*guides, [0.0, 0, 0], *opposites), torch.zeros(3))
     anchor.head.weight.copy_(anchor.weights(weight))
     return anchor
 
@@ -215,7 +239,7 @@ def test_only_the_critic_learns_at_first_and_the_noise_follows_its_schedule(kind
     torch.manual_seed(0)
     env = advised(Bounded(-1, 1, (2,)), two_numbers)
     trained = learner(env, kind, warmup=0.5, noise=lambda progress: 0.3 - 0.2 * progress)
-    trained.anchor.begin(look([1.0, 1], [0.0, 0]), torch.zeros(2))
+    trained.anchor.begin(look([1.0, 1], [0.0, 0], [0.0, 0]), torch.zeros(2))
     rollout = Rollout(env, trained.policy, 8, trained.keys)
     data = env.reset()
     first, value = acted(trained.policy, data), trained.critic(data.copy())["state_value"].detach()
