@@ -142,6 +142,8 @@ class Anchor:
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
+        unit: for rewards in the updates of PPO and the like, the largest mean return before training, without its sign.
+            A critic starts near 0, and would follow returns of hundreds for most of the run. 1 without an anchor.
 
     Raises:
         ValueError: for a value out of range.
@@ -153,7 +155,7 @@ class Anchor:
         looks: int = 24,
         cases: int = 24,
         step: float = 0.05,
-        margin: float = 0.15,
+        margin: float = 0.3,
         back: float = 0.1,
         tolerance: float = 0.01,
         warmup: float = 0.05,
@@ -171,7 +173,7 @@ class Anchor:
         self.holds = True
         self.guide_return = self.allowed = self.best = math.nan
         self.guide = self.guide_failures = 0
-        self.sign = 1
+        self.sign, self.unit = 1, 1.0
 
     def attach(self, head: AnchoredHead) -> AnchoredHead:
         """Choose the head of the policy, and return it."""
@@ -235,6 +237,8 @@ class Anchor:
         self.set_noise(0.0)
         self.guide_return = self.best = look.score(best)
         self.guide_failures = look.failures[best]
+        if self.holds:
+            self.unit = float(torch.cat([look.returns.mean(1), random.mean()[None]]).abs().max())
         self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look) -> None:
@@ -249,7 +253,7 @@ class Anchor:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next look depends on, besides the policy."""
-        names = ("holds", "guide", "sign", "guide_return", "guide_failures", "allowed", "best")
+        names = ("holds", "guide", "sign", "unit", "guide_return", "guide_failures", "allowed", "best")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
