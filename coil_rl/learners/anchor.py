@@ -3,7 +3,7 @@
 COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored policy adds the
 advice g to what its network f gives, before squashing:
 
-    mean = w atanh(clip(g, -0.95, 0.95)) + f(s, g)
+    mean = w atanh(clip(g, -0.97, 0.97)) + f(s, g)
 
 The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete actions w kappa is added
 to the logit of the advised action. Residual policies start the same way (Silver et al. 2018; Johannink et al. 2019),
@@ -28,7 +28,7 @@ from torch import Tensor, nn
 from coil_rl.envs.limits import check_range
 from coil_rl.schedules import Linear, Schedule, schedule
 
-LIMIT = 0.95  # of advice before atanh, as a fraction of half the range of the action
+LIMIT = 0.97  # of advice before atanh, as a fraction of half the range of the action
 TIE = 1e-6  # decides between equal values
 FIRST = 0.9  # probability of the advised one of several actions at weight 1
 
@@ -142,8 +142,9 @@ class Anchor:
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
-        unit: for rewards in the updates of PPO and the like, the largest mean return before training, without its sign.
-            A critic starts near 0, and would follow returns of hundreds for most of the run. 1 without an anchor.
+        unit: of rewards in the updates of PPO and the like, the largest mean return, without its sign, of the first
+            policy, one without a guide and random actions; 1 without an anchor. A critic starts near 0, and would
+            follow returns of hundreds for most of the run.
 
     Raises:
         ValueError: for a value out of range.
@@ -230,7 +231,8 @@ class Anchor:
         """
         guides = len(self.head.weight)
         best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)
-        differences = look.returns[best] - torch.stack([look.returns[guides], random])
+        others = torch.stack([look.returns[guides], random])
+        differences = look.returns[best] - others
         self.holds = bool((differences.mean(1) > standard_error(differences)).all())
         self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
         self.head.weight.copy_(self.weights(float(self.holds)))
@@ -238,7 +240,7 @@ class Anchor:
         self.guide_return = self.best = look.score(best)
         self.guide_failures = look.failures[best]
         if self.holds:
-            self.unit = float(torch.cat([look.returns.mean(1), random.mean()[None]]).abs().max())
+            self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
         self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look) -> None:
