@@ -3,11 +3,12 @@
 COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored policy adds the
 advice g to what its network f gives, before squashing:
 
-    mean = w atanh(clip(g, -0.95, 0.95)) + f(s, g)
+    mean = w atanh(clip(g, -0.97, 0.97)) + f(s, g)
 
 The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete actions w kappa is added
 to the logit of the advised action. Residual policies start the same way (Silver et al. 2018; Johannink et al. 2019),
-but here f is unbounded, and w falls: a policy that keeps w = 1 never loses the guide's habits.
+but here f is unbounded, and w falls: a policy that keeps w = 1 never loses the guide's habits. A guide that is always
+wrong is of use too: with w = -1 the first policy does the opposite, and |w| falls.
 
 Falling too far breaks the policy, so there is a brake. At a few looks over the run the policy acts deterministically in
 fixed cases of the training, with today's weight and with one that is lower by a margin. If the lower one fails in no
@@ -27,7 +28,7 @@ from torch import Tensor, nn
 from coil_rl.envs.limits import check_range
 from coil_rl.schedules import Linear, Schedule, schedule
 
-LIMIT = 0.95  # of advice before atanh, as a fraction of half the range of the action
+LIMIT = 0.97  # of advice before atanh, as a fraction of half the range of the action
 TIE = 1e-6  # decides between equal values
 FIRST = 0.9  # probability of the advised one of several actions at weight 1
 
@@ -122,9 +123,9 @@ class Look:
 class Anchor:
     """Start of a policy at the action of a guide, and the brake by which it lets go of it.
 
-    Before training the guides, the first policy without a guide and random actions are compared in the same cases. The
-    anchor holds if the best guide is better than both by more than a standard error of the difference; otherwise the
-    weight is 0, and training is COIL.
+    Before training the guides, their opposites (weight -1), the first policy without a guide and random actions are
+    compared in the same cases. The anchor holds if the best guide or opposite is better than the last two by more than
+    a standard error of the difference; otherwise the weight is 0, and training is COIL.
 
     Args:
         looks: number of looks over the run.
@@ -141,6 +142,9 @@ class Anchor:
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
+        unit: of rewards in the updates of PPO and the like, the largest mean return, without its sign, of the first
+            policy, one without a guide and random actions; 1 without an anchor. A critic starts near 0, and would
+            follow returns of hundreds for most of the run.
 
     Raises:
         ValueError: for a value out of range.
@@ -152,7 +156,7 @@ class Anchor:
         looks: int = 24,
         cases: int = 24,
         step: float = 0.05,
-        margin: float = 0.15,
+        margin: float = 0.3,
         back: float = 0.1,
         tolerance: float = 0.01,
         warmup: float = 0.05,
@@ -170,6 +174,7 @@ class Anchor:
         self.holds = True
         self.guide_return = self.allowed = self.best = math.nan
         self.guide = self.guide_failures = 0
+        self.sign, self.unit = 1, 1.0
 
     def attach(self, head: AnchoredHead) -> AnchoredHead:
         """Choose the head of the policy, and return it."""
@@ -178,14 +183,19 @@ class Anchor:
 
     @property
     def weight(self) -> float:
-        """Weight of the guide; 0 without an anchor."""
-        return float(self.head.weight.sum())
+        """Weight of the guide, or of its opposite; 0 without an anchor."""
+        return self.sign * float(self.head.weight.sum())
 
-    def weights(self, value: float, guide: int | None = None) -> Tensor:
-        """Return the weights of all guides, [n_guides], with a value for one of them, by default the one that holds."""
+    def weights(self, value: float) -> Tensor:
+        """Return the weights of all guides, [n_guides], with a value for the one that holds, or for its opposite."""
         weights = torch.zeros_like(self.head.weight)
-        weights[self.guide if guide is None else guide] = value
+        weights[self.guide] = self.sign * value
         return weights
+
+    def starts(self) -> list[Tensor]:
+        """Return the weights, [n_guides] each, of the look before training: each guide, none, each opposite."""
+        guides = torch.eye(len(self.head.weight), device=self.head.weight.device)
+        return [*guides, guides[0] * 0, *-guides]
 
     def waits(self, progress: float) -> bool:
         """Return whether the policy is not to learn yet."""
@@ -196,12 +206,12 @@ class Anchor:
         """Set the standard deviation of an anchored policy that has one of its own.
 
         Returns:
-            The metrics `anchor`, the weight of the guide, and `noise`, the standard deviation.
+            The metrics `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
         """
         scale: Tensor | None = getattr(self.head.head, "log_scale", None)
         if scale is not None and self.holds:
             scale.fill_(math.log(self.noise(progress)))
-        return {"anchor": self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
+        return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
 
     def due(self, update: int, updates: int) -> bool:
         """Return whether there is a look after an update of a run, apart from the first and the last one."""
@@ -213,22 +223,25 @@ class Anchor:
         return max(self.weight - self.margin, 0.0)
 
     def begin(self, look: Look, random: Tensor) -> None:
-        """Hold the best guide, or let go.
+        """Hold the best guide or opposite, or let go.
 
         Args:
-            look: with the weight of each guide at 1 and those of the others at 0, and last with all at 0.
+            look: with the weights of `starts`.
             random: returns of random actions, [C].
         """
-        *guides, own = look.returns
-        best = max(range(len(guides)), key=look.score)
-        differences = torch.stack([guides[best] - own, guides[best] - random])
+        guides = len(self.head.weight)
+        best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)
+        others = torch.stack([look.returns[guides], random])
+        differences = look.returns[best] - others
         self.holds = bool((differences.mean(1) > standard_error(differences)).all())
-        self.guide = best
+        self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
         self.head.weight.copy_(self.weights(float(self.holds)))
         self.set_noise(0.0)
         self.guide_return = self.best = look.score(best)
         self.guide_failures = look.failures[best]
-        self.allowed = max(self.tolerance * abs(self.best), float(standard_error(guides[best])) / 2)
+        if self.holds:
+            self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
+        self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look) -> None:
         """Lower, keep or raise the weight after a look with today's weight and with the lower one."""
@@ -242,7 +255,7 @@ class Anchor:
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next look depends on, besides the policy."""
-        names = ("holds", "guide", "guide_return", "guide_failures", "allowed", "best")
+        names = ("holds", "guide", "sign", "unit", "guide_return", "guide_failures", "allowed", "best")
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

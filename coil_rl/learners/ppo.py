@@ -254,6 +254,8 @@ class PPO:
         if self.reward_key != ("next", "reward"):  # several agents: their rewards are summed
             reward = batch[self.reward_key]
             batch["next", "reward"] = reward.sum(tuple(range(batch.ndim, reward.ndim)))[..., None]
+        if self.anchor is not None:
+            batch["next", "reward"] = batch["next", "reward"] / self.anchor.unit
         self.advantage(batch)
         rows = batch.select(*self.minibatch_keys)
         rows = rows.reshape(-1) if self.memory is None else rows.reshape(-1, batch.shape[-1])

@@ -82,7 +82,8 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
     weights = axes.twinx()
     for label, curves in anchors.items():
         for curve in curves:
-            weights.step(*curve.T, where="pre", color=strokes[label].colour, lw=0.7, alpha=0.6)
+            frames, weight = curve.T
+            weights.step(frames, abs(weight), where="pre", color=strokes[label].colour, lw=0.7, alpha=0.6)
     weights.set_ylim(0, 4)  # at the foot of the plot
     weights.set_yticks([0, 1])
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)

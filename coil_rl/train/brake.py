@@ -48,9 +48,7 @@ class Brake:
         return dict(zip(self.names, numbers, strict=True))
 
     def _begin(self) -> Look:
-        guides = len(self.anchor.head.weight)
-        weights = [self.anchor.weights(1.0, guide) for guide in range(guides)]
-        look = self._look([*weights, self.anchor.weights(0.0)])
+        look = self._look(self.anchor.starts())
         env = self.build(1)
         with torch.random.fork_rng():
             torch.manual_seed(0)

@@ -45,7 +45,16 @@ def guided(data, action):
     return advice.argmax(-1) if action == "choices" else advice
 
 
-@pytest.mark.parametrize("degrade", ["adversarial", "zeroed"])
+def test_opposite_of_a_reversed_guide_is_as_good_as_the_guide():
+    learner, brake, _ = built("degrade=adversarial")
+    brake(0)
+    good, brake_of_good, _ = built()
+    brake_of_good(0)
+    assert learner.anchor.head.weight.tolist() == [-1]
+    assert learner.anchor.guide_return == pytest.approx(good.anchor.guide_return)
+
+
+@pytest.mark.parametrize("degrade", ["random", "zeroed"])
 def test_guide_that_is_of_no_use_does_not_hold(degrade):
     learner, brake, _ = built(f"degrade={degrade}")
     brake(0)
