@@ -20,7 +20,7 @@ from tqdm import tqdm
 from benchmarks.driving import measure_compiled, measure_driving, measure_robot, profile_operators, train_config
 from benchmarks.process import measure_processes
 from benchmarks.timing import Row
-from benchmarks.training import measure_one_car, measure_sb3, measure_shares, measure_training
+from benchmarks.training import measure_command, measure_one_car, measure_sb3, measure_shares, measure_training
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs.app import program
 from coil_rl.train.check import check_parts
@@ -35,23 +35,29 @@ PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "one_car": ("Guide drives, beside one car in NumPy and SciPy", measure_one_car),
     "sb3": ("PPO beside Stable-Baselines3", measure_sb3),
     "operators": ("Operators of 20 batched steps with advice", profile_operators),
-    "compiled": ("Env steps per second with advice under torch.compile", measure_compiled),
+    "command": ("coil-train with its defaults, from the command to its pictures", measure_command),
+    "compiled": ("The guide's drives in steps per second, with compiled steps", measure_compiled),
 }
 GOALS = [
     ("training", "PPO / by hand, {batch}", "ppo / by hand", ">=", 0.9),
     ("training", "COIL / by hand, {batch}", "coil / by hand", ">=", 0.9),
+    ("training", "PPO compiled / by hand, {batch}", "ppo compiled / by hand", ">=", 1.3),
+    ("training", "COIL compiled / by hand, {batch}", "coil compiled / by hand", ">=", 1.3),
+    ("command", "default command, {time} time (s)", "whole command (s)", "<", 45),
     ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
     ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
     ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),
     ("processes", "state per car (B), {cars} cars", "state per car (B)", "<", 2000),
 ]
+SHORT = ["budget.frames=4096", "budget.num_envs=64", "evaluation.repeats=1", "evaluation.gif=false", "env.laps=1"]
 FULL = {
     "cars": [64, 256, 1024, 4096, 16384, 65536], "batches": [(256, 64), (1024, 32), (4096, 16)], "compare_cars": 4096,
     "memory_cars": [64, 4096, 65536], "sb3_frames": 512, "seconds": 2.0, "repeats": 5,
+    "compile_updates": True, "command": [],
 }  # fmt: skip
 QUICK = {
     "cars": [16, 64], "batches": [(16, 16)], "compare_cars": 64, "memory_cars": [64, 1024], "sb3_frames": 64,
-    "seconds": 0.1, "repeats": 2,
+    "seconds": 0.1, "repeats": 2, "compile_updates": False, "command": SHORT,
 }  # fmt: skip
 
 
@@ -64,7 +70,7 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
     parts = [name for name in PARTS if name != "compiled"]
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--cars", nargs="+", type=int, help="numbers of cars for env steps")
-    parser.add_argument("--compile", nargs="+", type=int, default=[], metavar="CARS", help="also under torch.compile")
+    parser.add_argument("--compile", nargs="+", type=int, default=[], metavar="CARS", help="also with compiled steps")
     parser.add_argument("--seconds", type=float, help="of each subject, all rounds together")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it works")
     parser.add_argument("--output", type=Path, default=Path("outputs/benchmark") / time.strftime("%Y-%m-%d_%H-%M-%S"))

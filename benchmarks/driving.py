@@ -17,14 +17,14 @@ from torchrl.envs import EnvBase, TransformedEnv
 import coil_rl.train.config  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
 from coil_rl.envs import Perception, read_recording, save_drive, simulated_cone_classifier, simulated_drive
-from coil_rl.train.build import build_bare_env, build_guides
+from coil_rl.train.build import build_bare_env, build_guides, compile_steps
 from coil_rl.transforms import GuideActions
 
 
-def train_config(args: Namespace, method: str) -> DictConfig:
+def train_config(args: Namespace, method: str, *more: str) -> DictConfig:
     """Return the configuration of `coil-train` with the overrides of the command line."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        given = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused", *args.overrides]
+        given = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused", *args.overrides, *more]
         return compose("train", given)
 
 
@@ -92,16 +92,16 @@ def measure_driving(args: Namespace) -> list[Row]:
 
 
 def measure_compiled(args: Namespace) -> list[Row]:
-    """Return the speed with advice under `torch.compile` beside eager mode."""
+    """Return the speed of the guide's drives with compiled steps beside that without."""
     rows = []
     for cars in args.compile:
-        env = driving_env(args, cars, guide=True)
-        env.compile(warmup=3)
-        compiled, start = Driving(env), time.perf_counter()
-        compiled.until_resets()  # resets are compiled separately
+        env = compile_steps(train_config(args, "coil", "compile=true"), driving_env(args, cars, guide=True))
+        compiled, start = Driving(env, follow=True), time.perf_counter()
+        compiled()
         synchronise()
         seconds = time.perf_counter() - start
-        rates = measure(args, {"eager": Driving(driving_env(args, cars, guide=True)), "compiled": compiled})
+        eager = Driving(driving_env(args, cars, guide=True), follow=True)
+        rates = measure(args, {"eager": eager, "compiled": compiled})
         ratio = median_ratio(rates["compiled"], rates["eager"])
         rows.append({"cars": cars, **medians(rates), "ratio": ratio, "compiling (s)": seconds, "rounds": rates})
     return rows

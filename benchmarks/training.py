@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 import tempfile
 import time
@@ -11,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -18,6 +20,8 @@ from benchmarks.driving import Driving, driving_env, train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.report.curves import learning
+from coil_rl.report.runs import read_runs
 from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
@@ -36,8 +40,8 @@ class Training:
     Replay of off-policy learners is filled first.
     """
 
-    def __init__(self, args: Namespace, method: str, cars: int, steps: int) -> None:
-        config = train_config(args, method)
+    def __init__(self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False) -> None:
+        config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         env = build_env(config, {"num_envs": cars})
         learner = build_learner(config, env)
         rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
@@ -87,11 +91,54 @@ def measure_training(args: Namespace) -> list[Row]:
     for cars, steps in args.batches:
         subjects: dict[str, Work] = {method: Training(args, method, cars, steps) for method in METHODS}
         hand = METHODS if has_yardstick(args) else ()
+        compiled = METHODS if args.compile_updates else ()
+        subjects |= {f"{method} compiled": Training(args, method, cars, steps, compile=True) for method in compiled}
         subjects |= {f"{method} by hand": by_hand(args, method, cars, steps) for method in hand}
         rates = measure(args, subjects)
         ratios = {f"{method} / by hand": median_ratio(rates[method], rates[f"{method} by hand"]) for method in hand}
+        ratios |= {
+            f"{method} compiled / by hand": median_ratio(rates[f"{method} compiled"], rates[f"{method} by hand"])
+            for method in hand
+            if method in compiled
+        }
+        floor = {"floor, ppo": floor_rate(args, cars * steps)} if hand else {}
         cost = {"cost of a frame, coil / ppo": median_ratio(rates["ppo"], rates["coil"])}
-        rows.append({"batch": f"{cars} x {steps}", **medians(rates), **cost, **ratios, "rounds": rates})
+        rows.append({"batch": f"{cars} x {steps}", **medians(rates), **floor, **cost, **ratios, "rounds": rates})
+    return rows
+
+
+def floor_rate(args: Namespace, frames: int) -> float:
+    """Return the frames per second of PPO if it only multiplied matrices, at the measured speed of its largest ones."""
+    config = train_config(args, "ppo")
+    learner = build_learner(config, build_env(config, {"num_envs": 1}))
+    sizes = [parameter.numel() for parameter in learner.gradient.parameters if parameter.ndim == 2]
+    # Of each weight a multiplication and an addition: forward, and twice backward; and once to act and to value.
+    operations = 2 * sum(sizes) * (3 * learner.epochs + 1)
+    rows, width = max(frames // learner.minibatches, 1), config.learner.hidden[0]
+    left, right = torch.ones(rows, width, device=args.device), torch.ones(width, width, device=args.device)
+
+    def multiply() -> int:
+        torch.mm(left, right)
+        return 2 * rows * width * width
+
+    return medians(measure(args, {"matrices": multiply}))["matrices"] / operations
+
+
+def measure_command(args: Namespace) -> list[Row]:
+    """Return the seconds of `coil-train method=coil` with its defaults, twice: the second time finds compiled code."""
+    rows = []
+    for name in ("first", "second"):
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, "-m", "coil_rl.programs.train", f"hydra.run.dir={folder}/run", *args.overrides]
+            command += [f"device={args.device}", *args.command]
+            start = time.perf_counter()
+            subprocess.run(command, check=True, capture_output=True)
+            seconds = time.perf_counter() - start
+            (run,) = read_runs([Path(folder)])
+        found, training = learning(run), run.seconds or math.nan
+        times = {"whole command (s)": seconds, "training (s)": training}
+        times["to the guide's level (s)"] = found["until_100"] / found["frames"] * training
+        rows.append({"time": name, **times, "frames to the guide's level": found["until_100"]})
     return rows
 
 
