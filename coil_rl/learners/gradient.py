@@ -35,6 +35,8 @@ class GradientStep:
         ValueError: for another value of `compile`, or true if it cannot be compiled.
     """
 
+    NUMBERS = ("steps", "begun", "compile")
+
     def __init__(
         self,
         losses: Callable[[TensorDictBase], TensorDictBase],
@@ -56,16 +58,18 @@ class GradientStep:
         self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=eps, fused=True)
         self.compile, self.required = compile if compilable else False, compile is True
         self.compiled = Compiled(self._on_tensors)
-        self.steps = 0
+        self.steps, self.begun = 0, 0.0  # progress of the run at the first step
         self.names: list[str] = []  # of the losses
         self.keys: list[Any] = []
         self.weighted: list[str] = []
         self.state: list[Tensor] = []  # all tensors that a step reads, besides its minibatch
 
     def decide(self, progress: float) -> None:
-        """Decide for "auto", when a share of the run is over."""
-        if self.compile == "auto" and self.steps and progress > 0:
-            self.compile = self.steps / progress >= ENOUGH
+        """Decide for "auto", at the second update that takes steps; `progress` is that of the run before an update."""
+        if not self.steps:
+            self.begun = progress
+        elif self.compile == "auto" and progress > self.begun:
+            self.compile = self.steps * (1 - self.begun) / (progress - self.begun) >= ENOUGH
 
     def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`.
@@ -154,12 +158,15 @@ class GradientStep:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the optimiser, the number of steps, and whether they are compiled."""
-        return {"adam": self.optimiser.state_dict(), "steps": self.steps, "compile": self.compile}
+        numbers = {name: getattr(self, name) for name in self.NUMBERS}
+        return {"adam": self.optimiser.state_dict(), **numbers}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
         self.optimiser.load_state_dict(state["adam"])
-        self.steps, self.compile, self.state = state["steps"], state["compile"], []
+        self.state = []
+        for name in self.NUMBERS:
+            setattr(self, name, state[name])
 
 
 def _vector(losses: TensorDictBase) -> Tensor:
