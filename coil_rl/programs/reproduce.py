@@ -80,6 +80,9 @@ def requested(config: DictConfig) -> list[str]:
     for kind in KINDS:
         values = config[kind] if isinstance(config[kind], ListConfig) else [config[kind]]
         for key in (f"{kind}={value}" for value in values if value is not None):
+            for what, numbers in config.other_figures.items():
+                if key in [f"figure={number}" for number in numbers]:
+                    raise UserError(f"{key} is {what}, which is not reproduced; there are {', '.join(available)}")
             if key not in available:
                 raise UserError(f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}")
             names.append(available[key])

@@ -1,6 +1,12 @@
 """Reproduced tables and figures of the paper, each with the paper's values next to ours."""
 
 from coil_rl.reproduce.classifier import Figure25 as Figure25
+from coil_rl.reproduce.figures import Figure10 as Figure10
+from coil_rl.reproduce.figures import Figure19 as Figure19
+from coil_rl.reproduce.figures import Figure21 as Figure21
+from coil_rl.reproduce.figures import Figure26 as Figure26
+from coil_rl.reproduce.figures import Figure30 as Figure30
+from coil_rl.reproduce.figures import Figure31 as Figure31
 from coil_rl.reproduce.result import Result as Result
 from coil_rl.reproduce.result import Runs as Runs
 from coil_rl.reproduce.robot import Table6 as Table6

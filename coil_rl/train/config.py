@@ -246,6 +246,7 @@ class ReproduceConfig(ProgramConfig):
     budget: str = MISSING
     budgets: dict[str, RunsBudgetConfig] = MISSING
     aliases: dict[str, str] = field(default_factory=dict)
+    other_figures: dict[str, list[int]] = field(default_factory=dict)
     threads: Threads = 1
     train: list[str] = field(default_factory=list)
     known_problems: list[str] = field(default_factory=list)

@@ -60,24 +60,24 @@ def draw_field_of_view(axes: Axes, sight: float, half_angle: float) -> None:
     axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2))
 
 
-def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples: Array, scale: float = 1.0) -> None:
+def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples: Array) -> None:
     """Draw the boundary estimate of a side, if it is valid, and its samples [5, 2] m: hollow if they are remembered."""
     colour = LINE_COLOURS[side]
     if valid:
         curve = boundary.equidistant(CURVE_POINTS)[:, :, side, 0]
-        axes.plot(*facing_up(rows(curve / scale)).T, color=colour, lw=1.4, zorder=4.5)
+        axes.plot(*facing_up(rows(curve)).T, color=colour, lw=1.4, zorder=4.5)
     face, edge = (colour, style.BACKGROUND) if valid else (style.BACKGROUND, colour)
     axes.plot(*facing_up(samples).T, "D", ms=4.4, mfc=face, mec=edge, mew=0.8, zorder=6)
 
 
-def draw_plan(axes: Axes, plan: PathPlan, scale: float = 1.0) -> None:
-    """Draw the midpoints, path and targets of a guide's plan whose unit is `scale` of the picture's."""
+def draw_plan(axes: Axes, plan: PathPlan) -> None:
+    """Draw the midpoints, path and targets of a guide's plan."""
     pairs = int(plan.midpoint_count)
     in_use = None if pairs > 1 else 0
     selected = plan.nearest_target()[:, : int(not plan.excluded.all())]
 
     def points(places: Tensor) -> Array:
-        return facing_up(rows(places / scale)).T
+        return facing_up(rows(places)).T
 
     axes.plot(*points(plan.path.equidistant(CURVE_POINTS)[:, :in_use, 0]), color=PATH_COLOUR, lw=1.6, zorder=5)
     axes.plot(*points(plan.midpoints[:, :pairs, 0]), "x", color=style.INK, ms=3.6, mew=0.9, zorder=6)

@@ -15,7 +15,7 @@ def run(script, *arguments):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", ["world", "scan", "spline"])
+@pytest.mark.parametrize("script", ["world", "spline"])
 def test_the_script_draws_its_figure(script, tmp_path):
     assert run(script, tmp_path).splitlines()[-1] == str(tmp_path / f"{script}.png")
     assert os.listdir(tmp_path) == [f"{script}.png"]

@@ -34,6 +34,14 @@ def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
     assert "Made by `coil-reproduce table=1 budget=paper` at commit `" in pages[0]
 
 
+def test_every_figure_of_the_paper_is_either_reproduced_or_named():
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("reproduce")
+    named = [number for numbers in config.other_figures.values() for number in numbers]
+    made = [int(name.removeprefix("figure_")) for name in config.results if name.startswith("figure_")]
+    assert sorted(named + made) == list(range(1, 33))
+
+
 def test_options_reach_the_result_and_the_command_on_its_page():
     other_options = ("~results.table_5.worlds", "+results.table_4.labels=[]")
     assert outcome("figure=6", "results.figure_6.iterations=7", *other_options, "hydra.run.dir=run")[0] == 0
@@ -115,6 +123,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("", "nothing is requested; give one of table=1, table=4"),
         ("table=[1,3]", "table=3 does not exist; there are table=1, table=4"),
         ("claim=table_1", "claim=table_1 does not exist"),
+        ("figure=3", "figure=3 is a diagram, which is not reproduced; there are table=1"),
         ("claim=tabular_coal", "did you mean claim=tabular_coil?"),
         ("tabel=1", "there is no key tabel"),
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
