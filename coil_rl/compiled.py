@@ -101,6 +101,10 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
         node.meta.clear()
     graph.graph.eliminate_dead_code()
     graph.recompile()
+    memory = {argument.untyped_storage().data_ptr() for argument in arguments}
+    shared = [name for name, constant in graph.named_buffers() if constant.untyped_storage().data_ptr() in memory]
+    if shared:
+        raise UserError("this cannot be compiled, because it reads a tensor that shares its memory with another one")
     for node in graph.graph.nodes:
         if DYNAMIC in getattr(node.target, "tags", ()):
             raise UserError(f"this cannot be compiled, because {node.target} gives shapes that depend on values")

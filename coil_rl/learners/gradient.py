@@ -127,6 +127,8 @@ class GradientStep:
     def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
         """Take a step on the entries of a minibatch, for compilation; `tensors` end with those of `_state`."""
         minibatch = TensorDict(dict(zip(self.keys, tensors, strict=False)), len(tensors[0]))
+        for module in self.modules:  # TorchRL's losses keep detached parameters, which would be constants here
+            module.__dict__.get("_cache", {}).clear()
         weights, rates = numbers[: len(self.weighted)].unbind(0), numbers[len(self.weighted) :].unbind(0)
         losses = self.losses(minibatch)
         self.names = list(losses.keys())

@@ -61,6 +61,13 @@ def test_shapes_that_depend_on_values_are_refused():
         Compiled(lambda x: [x[x > 0].sum()])(torch.ones(3))
 
 
+def test_constant_that_shares_memory_with_an_argument_is_refused():
+    position = torch.ones(3)
+    part = position[1:]
+    with pytest.raises(UserError, match="shares its memory with another one"):
+        Compiled(lambda x: [x.add_(1), part * 2])(position)
+
+
 def test_missing_compiler_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv("CXX", "missing")
     monkeypatch.setenv("PATH", str(tmp_path))
