@@ -106,7 +106,7 @@ def refusal(name, *arguments):
         ("guide=zero guide.zero._target_=builtins.dict", "makes dict, not TensorDictModuleBase"),
         ("guide=zero guide.zero._target_=subprocess.run", "guide.zero: Target 'subprocess.run' is blocklisted"),
         # groups
-        ("guide=splin", "no guide=splin; guide can be bot, centre_fast, constant, controller"),
+        ("guide=splin", "no guide=splin; guide can be authors, bot, centre_fast, constant, controller"),
         ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
         ("+experiment=nope", "no experiment=nope; experiment can be anchored, coil_vs_ppo"),
         ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
@@ -148,7 +148,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
-        ("guide=splin", "no guide=splin; guide can be bot, centre_fast, constant, controller"),
+        ("guide=splin", "no guide=splin; guide can be authors, bot, centre_fast, constant, controller"),
         # command line
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
         ("=3", "'=3' has no key, write KEY=VALUE"),
