@@ -1,6 +1,6 @@
 """Parametric splines through padded batches of points (appendix A.2).
 
-The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, which is refitted when a new cone is seen.
+The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, fitted again when it sees a new cone.
 A spline is stored as its positions and second derivatives at its knots, which determine the curve between two knots.
 The cubic smoothing spline and the least-squares parabola are therefore one class with two fits. Both take `points`
 [D, K, *batch] in m, in order, K >= 2, and `count` [*batch], the number of real points of each row; other slots may hold

@@ -54,9 +54,8 @@ class TabularCoil(Result):
         self.steps = tuple(self.steps)
         if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
             raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")
-        self.learn = partial(
-            tabular.q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps
-        )
+        options: Any = {"epsilon": self.epsilon, "power": self.power, "episode_steps": self.episode_steps}
+        self.learn = partial(tabular.q_learning, **options)
         self.learn(tabular.toymaker(), 0, np.random.default_rng(0))  # checks its options
         self.guides: Mapping[str, Callable[[tabular.MDP], Array]] = {
             "optimal": optimal_guide,

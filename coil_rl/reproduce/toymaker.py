@@ -60,9 +60,8 @@ class Table1(Result):
             ),
             "Q to two decimals": pages.certain_verdict(equal == len(difference), details),
         }
-        section = pages.claims_section(
-            [{"claim": claim, "ours": ours} for claim, ours in claims.items()], {"ours": "ours"}
-        )
+        rows_of_claims = [{"claim": claim, "ours": ours} for claim, ours in claims.items()]
+        section = pages.claims_section(rows_of_claims, {"ours": "ours"})
         return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
 
 

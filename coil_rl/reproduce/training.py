@@ -152,6 +152,5 @@ def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path:
         ]
         for key in ("best", "final")
     }  # fmt: skip
-    draw_intervals(
-        panels, path, measure="return (mean of the runs)", title="Table 4: the return of the trained policies"
-    )
+    title = "Table 4: the return of the trained policies"
+    draw_intervals(panels, path, measure="return (mean of the runs)", title=title)

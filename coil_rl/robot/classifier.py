@@ -139,9 +139,7 @@ def cone_classifier(scaler: StandardScaler, machine: SVC, known: OneClassSVM) ->
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
     """Write a classifier as JSON."""
-    lines = [
-        f'  "{field.name}": {json.dumps(getattr(classifier, field.name).tolist())}' for field in fields(classifier)
-    ]
+    lines = [f'  "{part.name}": {json.dumps(getattr(classifier, part.name).tolist())}' for part in fields(classifier)]
     write_text(Path(path), "{\n" + ",\n".join(lines) + "\n}")
 
 
@@ -214,9 +212,7 @@ def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict
         for name, thick in (("thin", False), ("thick", True)):
             cells = in_range & (drive.thick.numpy() == thick)
             columns[name].append([recognised[cells].astype(float), distance[cells], visibility[cells]])
-    return {
-        name: _shares(*(np.concatenate(column) for column in zip(*rows, strict=True))) for name, rows in columns.items()
-    }
+    return {name: _shares(*map(np.concatenate, zip(*rows, strict=True))) for name, rows in columns.items()}
 
 
 def majority(label: Integers, cone: Integers, cones: int) -> Integers:

@@ -201,9 +201,7 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
     if summary.statistics:
         written = summary.statistics.channel_message_counts
         for topic, messages in contents.messages.items():
-            total = sum(
-                written.get(number, 0) for number, channel in summary.channels.items() if channel.topic == topic
-            )
+            total = sum(written.get(number, 0) for number, each in summary.channels.items() if each.topic == topic)
             read = len(messages) - before.get(topic, 0)
             contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
 

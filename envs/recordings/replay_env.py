@@ -116,14 +116,12 @@ class McapReplayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
         self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
-        before = self.memory.samples, self.memory.ever_valid
+        before = {name: getattr(self.memory, name) for name in ("samples", "ever_valid")}
         self.memory.reset(mask)
         view = self._perceive()
         # Rows that are not reset have this scan in their memory already.
-        now = self.memory.samples, self.memory.ever_valid
-        self.memory.samples, self.memory.ever_valid = (
-            torch.where(mask, x, y) for x, y in zip(now, before, strict=True)
-        )
+        for name, kept in before.items():
+            setattr(self.memory, name, torch.where(mask, getattr(self.memory, name), kept))
         return self._tensordict(view, torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
