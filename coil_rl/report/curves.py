@@ -84,9 +84,7 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
     weights.set_yticks([0, 1])
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
     weights.spines[:].set_visible(False)
-    weights.annotate(
-        "weight of the guide", (0.01, 0.01), xycoords="axes fraction", size=7, color=style.QUIET, va="bottom"
-    )
+    weights.text(0.01, 0.01, "weight of the guide", transform=weights.transAxes, size=7, color=style.QUIET)
 
 
 def draw_curve_grid(

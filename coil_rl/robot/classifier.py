@@ -99,9 +99,7 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
     try:
         predicted = cross_validate(pipeline, features, thick, cv=splits, return_indices=True, error_score="raise")
     except ValueError:
-        raise UserError(
-            "without one fold of drives only one kind of cone is left; number the drives in pairs"
-        ) from None
+        raise UserError("without one fold only one kind of cone is left; number the drives in pairs") from None
     accuracy = predicted["test_score"]
     correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
     scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
