@@ -1,5 +1,6 @@
-"""Parametric splines through padded batches of points, and the self-evolving spline (appendix A.2).
+"""Parametric splines through padded batches of points (appendix A.2).
 
+The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, fitted again when it sees a new cone.
 A spline is stored as its positions and second derivatives at its knots, which determine the curve between two knots.
 The cubic smoothing spline and the least-squares parabola are therefore one class with two fits. Both take `points`
 [D, K, *batch] in m, in order, K >= 2, and `count` [*batch], the number of real points of each row; other slots may hold
@@ -19,7 +20,7 @@ from itertools import accumulate
 from typing import Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from coil_rl.envs.constants import constant, flat_index
 from coil_rl.envs.limits import check_choice
@@ -142,51 +143,6 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
     fitted = origin + (c0 + c1 * p1 + c2 * p2)
     return Spline(knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points))
-
-
-class SelfEvolvingSpline(nn.Module):
-    """A smoothing spline that is refitted whenever points are added (definition A.2); all state is in buffers.
-
-    Of each of the `batch_size` rows the last `capacity` points are kept, at least 2; `smoothing` is in m^3.
-
-    Example:
-        >>> path = SelfEvolvingSpline(capacity=8, batch_size=1, smoothing=0.1)
-        >>> path.add(torch.tensor([[0.0, 1.0], [0.0, 2.0]]).unsqueeze(-1), torch.ones(2, 1, dtype=torch.bool))
-        >>> path.spline.sample(torch.zeros(1, 1)).flatten()
-        tensor([0., 0.])
-    """
-
-    def __init__(self, capacity: int, batch_size: int, smoothing: float, dtype: torch.dtype = torch.float32) -> None:
-        super().__init__()
-        if capacity < 2:
-            raise ValueError(f"capacity={capacity} must be at least 2")
-        self.smoothing = smoothing
-        self.points: Tensor = nn.Buffer(torch.zeros(2, capacity, batch_size, dtype=dtype))
-        self.count: Tensor = nn.Buffer(torch.zeros(batch_size, dtype=torch.long))
-
-    @property
-    def spline(self) -> Spline:
-        """Fit the spline through the points added so far."""
-        return smoothing_spline(self.points, self.count, self.smoothing)
-
-    @torch.no_grad()
-    def add(self, points: Tensor, mask: Tensor) -> None:
-        """Append the points [2, M, B], m, selected by mask [M, B], bool, in order."""
-        capacity = self.points.shape[1]
-        slots = constant(range(capacity), mask, torch.int64)
-        valid = torch.cat([slots < self.count, mask.bool()])
-        slot = valid.long().cumsum(0)
-        # Masked and surplus points are written to slot 0, which is dropped.
-        slot = torch.where(valid, slot - (slot[-1] - capacity).clamp(min=0), 0).clamp(min=0)
-        both = torch.cat([self.points, points.to(self.points.dtype)], 1)
-        room = both.new_zeros(2, capacity + 1, both.shape[2])
-        self.points = room.scatter(1, slot.expand_as(both), both)[:, 1:].contiguous()
-        self.count = (self.count + mask.sum(0)).clamp(max=capacity)
-
-    @torch.no_grad()
-    def reset(self, mask: Tensor) -> None:
-        """Remove all points of the rows selected by mask [B], bool."""
-        self.points, self.count = (state.masked_fill(mask, 0) for state in (self.points, self.count))
 
 
 def slots_in_use(count: Tensor, slots: int) -> int:

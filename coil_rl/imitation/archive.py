@@ -106,10 +106,9 @@ def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
     ):
         trees = np.ravel(part.estimators_)
         _require(len(trees) > 0, "a forest has no trees")
-        fitted = [
-            isinstance(tree, DecisionTreeRegressor) and vars(tree).get("n_features_in_") == inputs for tree in trees
-        ]
-        _require(all(fitted) and all("tree_" in vars(tree) for tree in trees), "the trees of a forest differ")
+        known = all(isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree) for tree in trees)
+        alike = known and all(vars(tree).get("n_features_in_") == inputs for tree in trees)
+        _require(alike, "the trees of a forest differ")
         boosted = isinstance(part, GradientBoostingRegressor)
         _require(not boosted or np.shape(part.estimators_) == (len(trees), 1), "boosted trees have a wrong shape")
     elif isinstance(part, HistGradientBoostingRegressor) and "_predictors" in state:

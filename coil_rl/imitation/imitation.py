@@ -83,9 +83,7 @@ class Imitation:
         available = list(spec.keys(True, True))
         if advice_key not in available:
             names = ", ".join(key for key in available if isinstance(key, str))
-            raise KeyError(
-                f"the env has no entry {advice_key}; it has {names}; put the transform GuideActions around it"
-            )
+            raise KeyError(f"the env has no entry {advice_key}; it has {names}; put GuideActions around it")
         guides, size = spec[advice_key].shape[batch_dims:]
         if not 0 <= guide < guides:
             raise ValueError(f"guide={guide} must be at least 0 and less than {guides}, the number of guides")

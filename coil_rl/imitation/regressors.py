@@ -187,9 +187,7 @@ class SklearnRegressor(Regressor):
             except Exception as error:
                 raise UserError(f"the state holds a regressor that cannot predict ({type(error).__name__})") from error
             if not usable:
-                raise UserError(
-                    f"the state holds a regressor that does not predict {self.outputs} numbers; train again"
-                )
+                raise UserError(f"the state is a regressor that does not predict {self.outputs} numbers; train again")
         self.model, self._archive = model, content
 
 

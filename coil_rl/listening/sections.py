@@ -179,9 +179,7 @@ class WholeEpisode:
         size = max(1, -(-int(data.step.max() + 1) // POINTS))
         rows = data.means(**{"from": data.step // size * size})
         strokes = style.strong_strokes(data.guides)
-        handles = [
-            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, label=guide) for guide, stroke in strokes.items()
-        ]
+        handles = [Line2D([], [], color=s.colour, ls=s.linestyle, label=guide) for guide, s in strokes.items()]
         for measure, title, label, name in drawn(data.measures):
             with style.picture(folder / name, title, handles, 3.6) as figure:
                 axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)

@@ -71,15 +71,9 @@ class Survey:
 
 
 def survey(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    sections: Sections,
-    evaluation: Evaluation,
-    *,
-    donors: int = 16,
-    seed: int = 0,
-    tick: Callable[[], Any] | None = None,
-) -> Survey:
+    env: EnvBase, policy: TensorDictModuleBase, sections: Sections, evaluation: Evaluation, *, donors: int = 16,
+    seed: int = 0, tick: Callable[[], Any] | None = None,
+) -> Survey:  # fmt: skip
     """Evaluate the deterministic agent for one episode per row of an env [B], and measure in every visited state.
 
     The agent reads `guide_action`. `donors` are as for `intervention`, the seed is theirs, and `tick` is called every
@@ -138,15 +132,9 @@ def ablations(guides: int, sections: int) -> list[Ablation]:
 
 
 def drive_ablated(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    sections: Sections,
-    evaluation: Evaluation,
-    removed: Sequence[Ablation],
-    replacement: Tensor,
-    *,
-    tick: Callable[[], Any] | None = None,
-) -> list[list[dict[str, Any]]]:
+    env: EnvBase, policy: TensorDictModuleBase, sections: Sections, evaluation: Evaluation, removed: Sequence[Ablation],
+    replacement: Tensor, *, tick: Callable[[], Any] | None = None,
+) -> list[list[dict[str, Any]]]:  # fmt: skip
     """Evaluate the deterministic agent with each ablation, all at the same time.
 
     Removed advice is replaced by a constant, such as its mean: it carries no information and is not misleading, as
@@ -159,9 +147,8 @@ def drive_ablated(
     if not removed or rows % len(removed):
         raise ValueError(f"{rows} rows cannot be divided among {len(removed)} ablations; give a multiple")
     share = rows // len(removed)
-    replaced = torch.zeros(
-        len(removed), max(1, len(sections.names)), len(replacement), dtype=torch.bool, device=env.device
-    )
+    shape = len(removed), max(1, len(sections.names)), len(replacement)
+    replaced = torch.zeros(shape, dtype=torch.bool, device=env.device)
     for index, (guide, where) in enumerate(removed):
         replaced[index, slice(None) if where is None else where, guide] = True
     replaced = replaced.repeat_interleave(share, 0)

@@ -109,7 +109,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
         folder / "annotated.mcap",
         topics=[topic for topic in (robot.scan, robot.odometry, robot.command) if topic],
         speed=robot.speed,
-        scale=robot.scale,
+        scale=OmegaConf.select(robot, "perception.scale", default=7.0),
         laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
         about={f"{name}_sha256": hashlib.sha256(content).hexdigest() for name, content in inputs.items()},
         attachments=attachments,

@@ -16,7 +16,7 @@ from coil_rl.errors import UserError, did_you_mean
 from coil_rl.programs import app
 
 if TYPE_CHECKING:
-    from coil_rl.reproduce import Result, Runs
+    from coil_rl.reproduce.result import Result, Runs
 
 KINDS = ("table", "figure", "claim")
 LAUNCHER = ("hydra/launcher=", "hydra.launcher.")
@@ -28,7 +28,8 @@ def reproduce(config: DictConfig) -> None:
     import torch
 
     from coil_rl.files import write_text
-    from coil_rl.reproduce import Result, pages
+    from coil_rl.reproduce import pages
+    from coil_rl.reproduce.result import Result
     from coil_rl.train.build import build
     from coil_rl.train.run_folder import versions
 

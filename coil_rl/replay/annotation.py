@@ -33,16 +33,9 @@ Floats = NDArray[np.floating]
 
 
 def annotate(
-    result: OpenLoop,
-    path: Path,
-    *,
-    topics: Collection[str],
-    speed: float,
-    scale: float,
-    laser_yaw: float = 0.0,
-    about: Mapping[str, str],
-    attachments: Mapping[str, bytes],
-) -> None:
+    result: OpenLoop, path: Path, *, topics: Collection[str], speed: float, scale: float, laser_yaw: float = 0.0,
+    about: Mapping[str, str], attachments: Mapping[str, bytes],
+) -> None:  # fmt: skip
     """Write a recording with the steering of each policy and the perceived cones and boundaries.
 
     Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue

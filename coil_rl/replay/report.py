@@ -95,9 +95,8 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
     strokes = style.strong_strokes(result.policies)
     if RECORDED in result.steering:
         strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHED)
-    handles: list[Artist] = [
-        Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=1.6, label=name) for name, stroke in strokes.items()
-    ]
+    lines = {name: {"color": stroke.colour, "ls": stroke.linestyle} for name, stroke in strokes.items()}
+    handles: list[Artist] = [Line2D([], [], lw=1.6, label=name, **line) for name, line in lines.items()]
     if invalid.any():
         handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary from the memory"))
     with style.picture(path, title, handles, 5.0, h_pad=0.08) as figure:
@@ -110,10 +109,9 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
             background = {"step": "mid", "transform": axes.get_xaxis_transform(), "color": style.ASPHALT, "lw": 0}
             axes.fill_between(seconds, 0, 1, where=invalid, **background)
             axes.set_axisbelow(True)
-        for name, stroke in strokes.items():
-            line = {"color": stroke.colour, "ls": stroke.linestyle, "lw": 1.1}
-            steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), **line)
-            omega_axes.plot(seconds, result.steering[name].omega, **line)
+        for name, line in lines.items():
+            steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), lw=1.1, **line)
+            omega_axes.plot(seconds, result.steering[name].omega, lw=1.1, **line)
         omega_axes.set_xlabel("time (s)")
 
 

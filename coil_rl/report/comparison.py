@@ -90,9 +90,7 @@ class Group:
         """Return reward and measures over seeds and cases, or one case: means, of minima the smallest."""
         rows = self.table if case is None else self.table.xs(self.cases[case], level="case")
         means = {"reward": float(rows["reward"].mean())}
-        return means | {
-            name: measure.pool(rows[name].tolist()) for name, measure in self.measures.items() if name in rows
-        }
+        return means | {name: each.pool(rows[name].tolist()) for name, each in self.measures.items() if name in rows}
 
     def parts(self, prefix: str) -> dict[str, float]:
         """Return the mean of each column with a prefix, PER_STEP or TERM, over the seeds and cases that have it."""
@@ -200,9 +198,7 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
         if guide.has("crashed"):
             earned = earned[~(guide.by_seed("crashed") > 0).any()]
         if len(earned):
-            references.setdefault(
-                guide.cases, rewards.where(rewards.index.isin(earned.index), earned.mean()).to_numpy()
-            )
+            references.setdefault(guide.cases, rewards.where(rewards.index.isin(earned.index), earned.mean()).values)
     return references if all(tuple(run.evaluation["case"].unique()) in references for run in runs) else {}
 
 
@@ -257,9 +253,8 @@ def _group_guides(labels: dict[str, pd.DataFrame], measures: Mapping[str, Measur
             listed = f"{', '.join(shared_by[:LABELS_IN_NAME])} and {len(shared_by) - LABELS_IN_NAME} more"
         table = pd.concat([rows.assign(seed=number) for number, rows in enumerate(results.values())])
         table = _index(f"the guide of {shared_by[0]}", table)
-        group = Group(
-            name if names.count(name) == 1 else f"{name} ({listed})", "", table, is_guide=True, measures=measures
-        )
+        unique = name if names.count(name) == 1 else f"{name} ({listed})"
+        group = Group(unique, "", table, is_guide=True, measures=measures)
         for label in shared_by:
             groups.setdefault(label, []).append(group)
     return {label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()}

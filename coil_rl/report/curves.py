@@ -28,12 +28,9 @@ AGENT = "#1a1a1a"  # the agent in `draw_phases`
 
 
 def draw_learning_curves(
-    runs: Mapping[str, Sequence[Rows]],
-    path: str | os.PathLike[str],
-    *,
-    guides: Mapping[str, float] | None = None,
+    runs: Mapping[str, Sequence[Rows]], path: str | os.PathLike[str], *, guides: Mapping[str, float] | None = None,
     title: str | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw the return of the kept policies against frames, one curve per label.
 
     Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 % t
@@ -88,9 +85,7 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
     weights.set_yticks([0, 1])
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
     weights.spines[:].set_visible(False)
-    weights.annotate(
-        "weight of the guide", (0.01, 0.01), xycoords="axes fraction", size=7, color=style.QUIET, va="bottom"
-    )
+    weights.text(0.01, 0.01, "weight of the guide", transform=weights.transAxes, size=7, color=style.QUIET)
 
 
 def draw_curve_grid(
@@ -135,12 +130,9 @@ def draw_curve_grid(
 
 
 def draw_phases(
-    rows: Sequence[Mapping[str, float]],
-    guides: Sequence[str],
-    path: str | os.PathLike[str],
-    *,
+    rows: Sequence[Mapping[str, float]], guides: Sequence[str], path: str | os.PathLike[str], *,
     title: str | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw one run of Dynamic COIL: returns, change of each guide's action, and learning rates.
 
     The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`, at least one, and

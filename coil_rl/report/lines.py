@@ -41,12 +41,9 @@ MEASURE_COLOURS = ListedColormap(mpl.colormaps["magma_r"](np.linspace(0.02, 0.88
 
 
 def draw_lines(
-    tracks: Sequence[Track],
-    lines: Mapping[str, Sequence[ArrayLike]],
-    path: str | os.PathLike[str],
-    *,
+    tracks: Sequence[Track], lines: Mapping[str, Sequence[ArrayLike]], path: str | os.PathLike[str], *,
     crashed: Mapping[str, Sequence[bool]] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Draw the lines of several drivers on several tracks, all at one scale.
 
     Args:
@@ -72,14 +69,9 @@ def draw_lines(
 
 
 def animate_lines(
-    tracks: Sequence[Track],
-    lines: Mapping[str, Sequence[ArrayLike]],
-    path: str | os.PathLike[str],
-    *,
-    rate: float,
-    crashed: Mapping[str, Sequence[bool]] | None = None,
-    seconds: float = 12.0,
-) -> None:
+    tracks: Sequence[Track], lines: Mapping[str, Sequence[ArrayLike]], path: str | os.PathLike[str], *, rate: float,
+    crashed: Mapping[str, Sequence[bool]] | None = None, seconds: float = 12.0,
+) -> None:  # fmt: skip
     """Write a GIF, 800 px wide, in which all drivers drive on all tracks at the same time; it repeats.
 
     The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the maximum duration in
@@ -91,9 +83,8 @@ def animate_lines(
     plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)], dpi=GIF_RESOLUTION)
     figure, axes, canvas = plot.figure, plot.axes, plot.canvas
     with mpl.rc_context(style.LETTERS):
-        clock = figure.text(
-            1 - style.MARGIN / style.WIDTH, 14 / figure.bbox.height, "", size=8, ha="right", va="center"
-        )
+        right = 1 - style.MARGIN / style.WIDTH
+        clock = figure.text(right, 14 / figure.bbox.height, "", size=8, ha="right", va="center")
         cars = []
         for label, index in itertools.product(driven, range(len(tracks))):
             (tail,) = axes.plot([], [], color=colours[label], lw=2.4, alpha=0.6)
@@ -131,14 +122,9 @@ def animate_lines(
 
 
 def draw_listening_map(
-    tracks: Sequence[Track],
-    lines: Sequence[ArrayLike],
-    values: Mapping[str, Sequence[ArrayLike]],
-    path: str | os.PathLike[str],
-    *,
-    label: str,
-    title: str | None = None,
-) -> None:
+    tracks: Sequence[Track], lines: Sequence[ArrayLike], values: Mapping[str, Sequence[ArrayLike]],
+    path: str | os.PathLike[str], *, label: str, title: str | None = None,
+) -> None:  # fmt: skip
     """Draw the driven lines once per guide, coloured by a measure on one colour scale.
 
     Args:

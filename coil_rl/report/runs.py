@@ -99,10 +99,8 @@ def _read_run(folder: Path) -> Run:
         with file_of_a_run(path := folder / f"{name}.json", remedy):
             saved = json.loads(path.read_text()) if path.exists() else {}
             numbers[name] = {key: float(value) for key, value in saved.items()}
-    guide_returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
-    return replace(
-        run, evaluation=evaluation, measures=measures, curve=curve, guide_returns=guide_returns, seconds=seconds
-    )
+    returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
+    return replace(run, evaluation=evaluation, measures=measures, curve=curve, guide_returns=returns, seconds=seconds)
 
 
 def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:

@@ -70,14 +70,9 @@ def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 
 @contextmanager
 def picture(
-    path: str | os.PathLike[str],
-    title: str | None,
-    handles: Sequence[Artist],
-    height: float,
-    *,
-    add_header: bool = False,
-    h_pad: float = 0.1,
-) -> Iterator[Figure]:
+    path: str | os.PathLike[str], title: str | None, handles: Sequence[Artist], height: float, *,
+    add_header: bool = False, h_pad: float = 0.1,
+) -> Iterator[Figure]:  # fmt: skip
     """Yield an empty figure with title and legend; write it when the block ends.
 
     It is 8 inches wide and `height` inches high, with `add_header` without title and legend. The suffix of the path

@@ -39,14 +39,9 @@ class TrackPlot:
     """
 
     def __init__(
-        self,
-        tracks: Sequence[Track],
-        *,
-        legend: Sequence[Line2D] = (),
-        title: str | None = None,
-        dpi: int = style.RESOLUTION,
-        groups: int = 1,
-    ) -> None:
+        self, tracks: Sequence[Track], *, legend: Sequence[Line2D] = (), title: str | None = None,
+        dpi: int = style.RESOLUTION, groups: int = 1,
+    ) -> None:  # fmt: skip
         with mpl.rc_context(style.LETTERS):
             self.figure = Figure(dpi=dpi)
             self.canvas = FigureCanvasAgg(self.figure)

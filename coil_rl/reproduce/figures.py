@@ -37,7 +37,10 @@ Panels = tuple[Mapping[str, Mapping[str, Array]], Mapping[str, Any]]
 class Drawing(Result):
     """A figure of named series of points, one panel or several; `conf/result_pages.yaml` has its words and lines."""
 
-    number: ClassVar[int]
+    number: ClassVar[int]  # an argument of the class statement
+
+    def __init_subclass__(cls, number: int = 0) -> None:
+        cls.number = number
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
@@ -69,10 +72,8 @@ class Drawing(Result):
     def _panels(self) -> Panels: ...
 
 
-class Figure10(Drawing):
+class Figure10(Drawing, number=10):
     """One term of PPO's objective against the probability ratio, for either sign of the advantage."""
-
-    number = 10
 
     def _panels(self) -> Panels:
         env = ConeTrackEnv([shipped_track("train_1")], num_envs=2)
@@ -105,24 +106,20 @@ class OnTheWay(Drawing):
         self.track, self.seconds = shipped_track(track), seconds
 
     @torch.no_grad()
-    def _panels(self) -> Panels:
+    def _drive(self) -> tuple[ConeTrackEnv, Tensor, Tensor, dict[str, Any]]:
+        """Return the env, its visible cones [1, 2, K, 2], their number [1, 2], and the numbers in the notes."""
         env, guide = ConeTrackEnv([self.track], num_envs=1), SplineGuide()
         state = env.reset()
         for _ in range(round(self.seconds * env.rate)):
             state = step_mdp(env.step(guide(state)))
-        panels, numbers = self._panels_of(env, state["cones"], state["cone_count"])
-        return panels, {"track": self.track.name, "seconds": self.seconds, **numbers}
-
-    @abstractmethod
-    def _panels_of(self, env: ConeTrackEnv, cones: Tensor, count: Tensor) -> Panels: ...
+        return env, state["cones"], state["cone_count"], {"track": self.track.name, "seconds": self.seconds}
 
 
-class Figure19(OnTheWay):
+class Figure19(OnTheWay, number=19):
     """The simulator: a car on a track, the cones that it detects, and its estimates of both boundaries."""
 
-    number = 19
-
-    def _panels_of(self, env: ConeTrackEnv, cones: Tensor, count: Tensor) -> Panels:
+    def _panels(self) -> Panels:
+        env, cones, count, numbers = self._drive()
         frame = Frame(env.pose.double())
         around = {"left cones": self.track.left, "right cones": self.track.right}
         around["middle"] = resample(self.track.middle(), 1.0)
@@ -131,13 +128,12 @@ class Figure19(OnTheWay):
         series["detected"] = np.stack([0 * seen, seen, seen + np.nan], 1).reshape(-1, 2)
         for side, samples in zip(SIDES, frame.to_car(env.samples.double())[..., 0].unbind(2), strict=True):
             series[f"estimate of the {side} boundary"] = _facing_up(samples)
-        return {"": {**series, "car": np.zeros((1, 2))}}, {"left": int(count[0, 0]), "right": int(count[0, 1])}
+        numbers |= {"left": int(count[0, 0]), "right": int(count[0, 1])}
+        return {"": {**series, "car": np.zeros((1, 2))}}, numbers
 
 
-class Figure21(Drawing):
+class Figure21(Drawing, number=21):
     """The cones of the first four training tracks."""
-
-    number = 21
 
     def _panels(self) -> Panels:
         tracks = shipped_tracks("train")[:4]
@@ -145,10 +141,8 @@ class Figure21(Drawing):
         return panels, {"lengths": ", ".join(f"{track.name} {track.length:.1f} m" for track in tracks)}
 
 
-class Figure26(Drawing):
+class Figure26(Drawing, number=26):
     """A scan of the simulated robot's LiDAR, and the cones that the robot detects in it; the robot faces up, in m."""
-
-    number = 26
 
     def _panels(self) -> Panels:
         drive, perception = simulated_drive("both", SEED), Perception(simulated_cone_classifier())
@@ -161,10 +155,8 @@ class Figure26(Drawing):
         return {"": series}, {"scan": SCAN, "sight": perception.range_max, "side": perception.bearing_max, **counts}
 
 
-class Figure30(Drawing):
+class Figure30(Drawing, number=30):
     """The steering angle that the guide advises (equation 103) against the bearing of its target, by its distance."""
-
-    number = 30
 
     def _panels(self) -> Panels:
         guide, alpha = SplineGuide(), torch.linspace(-60, 60, 121, dtype=torch.float64)
@@ -174,12 +166,11 @@ class Figure30(Drawing):
         return {"": series}, {"greatest": ", ".join(f"{beta[-1]:.1f}° at {d:g} m" for d, beta in angles.items())}
 
 
-class Figure31(OnTheWay):
+class Figure31(OnTheWay, number=31):
     """The guide's path in three steps: midpoints of pairs of cones, a spline through them, and targets on it."""
 
-    number = 31
-
-    def _panels_of(self, env: ConeTrackEnv, cones: Tensor, count: Tensor) -> Panels:
+    def _panels(self) -> Panels:
+        _, cones, count, numbers = self._drive()
         plan = SplineGuide().plan(cones, count)
         pairs = int(plan.midpoint_count)
         seen = {**_visible(cones[0], count[0]), "car": np.zeros((1, 2))}
@@ -188,7 +179,8 @@ class Figure31(OnTheWay):
         # A shorter path repeats its last target.
         targets = {"targets": np.unique(_facing_up(plan.targets[..., 0]), axis=0)}
         panels = {"midpoints": seen | midpoints, "spline": seen | midpoints | spline}
-        return panels | {"targets": seen | spline | targets}, {"pairs": pairs, "targets": len(targets["targets"])}
+        numbers |= {"pairs": pairs, "targets": len(targets["targets"])}
+        return panels | {"targets": seen | spline | targets}, numbers
 
 
 def _facing_up(points: Tensor) -> Array:

@@ -93,13 +93,9 @@ def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
 
 
 def all_results(
-    pages: Mapping[str, str | None],
-    commands: Mapping[str, str],
-    command: str,
-    note: str | None,
-    known_problems: Iterable[str],
-    not_reproduced: Iterable[str],
-) -> str:
+    pages: Mapping[str, str | None], commands: Mapping[str, str], command: str, note: str | None,
+    known_problems: Iterable[str], not_reproduced: Iterable[str],
+) -> str:  # fmt: skip
     """Return RESULTS.md, given the page (None if missing) and the command of each result, and the command of all."""
     split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), PAGES["results"]["introduction"].format(command=command)]

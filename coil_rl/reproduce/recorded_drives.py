@@ -40,11 +40,9 @@ class RecordedDrive:
 
 
 def record(
-    make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]],
-    paths: Sequence[Path],
-    notes: Mapping[str, str],
-    tick: Callable[[], Any] | None = None,
-) -> list[Recording]:
+    make_env_and_policy: Callable[[], tuple[EnvBase, TensorDictModuleBase]], paths: Sequence[Path],
+    notes: Mapping[str, str], tick: Callable[[], Any] | None = None,
+) -> list[Recording]:  # fmt: skip
     """Return recordings of a deterministic episode of each robot of an env; complete ones with equal notes are reused.
 
     The arguments are those of `record_drives`. The notes tell a driver and its robots from others. A policy that cannot

@@ -79,9 +79,7 @@ class Table6(Result):
         """Make the result, see `Result`."""
         if self.experiments or self.own:
             trained = {experiment: runs[experiment] for experiment in self.experiments}
-            selected = self.own or [
-                run for of_label in runs_by_label(self.labels, trained).values() for run in of_label
-            ]
+            selected = self.own or [run for group in runs_by_label(self.labels, trained).values() for run in group]
             self.read = self._record(selected, stem.with_name(f"{stem.name}_drives"))
             self.drives = [measure(recording) for recording in self.read]
         rows = [

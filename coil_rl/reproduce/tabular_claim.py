@@ -113,12 +113,9 @@ class TabularCoil(Result):
 
     def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:
         """Return shares and mean scores over all worlds, for one view and guide."""
-        own, coil, plain = (
-            np.array([row[key] for row in rows if row["view"] == view and row["guide"] == guide]).reshape(
-                self.worlds, len(self.steps)
-            )
-            for key in ("guide_score", "coil_score", "plain_score")
-        )
+        of_group = [row for row in rows if row["view"] == view and row["guide"] == guide]
+        scores = [[row[f"{agent}_score"] for row in of_group] for agent in ("guide", "coil", "plain")]
+        own, coil, plain = np.array(scores).reshape(3, self.worlds, len(self.steps))
         reached = (coil >= own - ROUNDING).sum(axis=0)
         shares = reached / self.worlds
         interval = binomtest(int(reached[-1]), self.worlds).proportion_ci(method="wilson")

@@ -53,16 +53,14 @@ class Table1(Result):
             f"shortfall rounds to more than {most_explained(difference)} of the printed values."
         )
         gain = Q[:, 1] - Q[:, 0]
+        gains = "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
         details = f"{equal} of {len(difference)} values, off by {largest:.4f} at most"
         claims = {
-            "Advertising is worth more in both states": pages.certain_verdict(
-                bool((gain > 0).all()), "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
-            ),
+            "Advertising is worth more in both states": pages.certain_verdict(bool((gain > 0).all()), gains),
             "Q to two decimals": pages.certain_verdict(equal == len(difference), details),
         }
-        section = pages.claims_section(
-            [{"claim": claim, "ours": ours} for claim, ours in claims.items()], {"ours": "ours"}
-        )
+        rows_of_claims = [{"claim": claim, "ours": ours} for claim, ours in claims.items()]
+        section = pages.claims_section(rows_of_claims, {"ours": "ours"})
         return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
 
 

@@ -17,6 +17,7 @@ from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, WorldsResult,
 Row = Mapping[str, Any]
 
 PAPER_RETURNS = PAGES["table_4"]["paper"]
+KEYS = ("best", "final", "guide")
 FRACTIONS = {0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
 
 
@@ -66,9 +67,7 @@ class Table4(WorldsResult):
         reference = by_label.get(self.against, {})
         table = []
         for label, by_seed in by_label.items():
-            best, final, guide = (
-                np.array([row[key] for row in by_seed.values()]) for key in ("best", "final", "guide")
-            )
+            best, final, guide = (np.array([row[key] for row in by_seed.values()]) for key in KEYS)
             common = [seed for seed in by_seed if seed in reference and label != self.against]
             ours, theirs = (np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference))
             line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
@@ -152,6 +151,5 @@ def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path:
         ]
         for key in ("best", "final")
     }  # fmt: skip
-    draw_intervals(
-        panels, path, measure="return (mean of the runs)", title="Table 4: the return of the trained policies"
-    )
+    title = "Table 4: the return of the trained policies"
+    draw_intervals(panels, path, measure="return (mean of the runs)", title=title)

@@ -18,8 +18,8 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
 from coil_rl.envs.robot.clusters import FEATURES, Array, Integers, measure, points_of, single_linkage
-from coil_rl.envs.robot.drives import Sides, SimulatedDrive, simulated_drive
-from coil_rl.envs.robot.lidar import RANGE_MIN, SimulatedLidar
+from coil_rl.envs.robot.drives import SimulatedDrive
+from coil_rl.envs.robot.lidar import RANGE_MIN
 from coil_rl.envs.robot.perception import ConeClassifier
 from coil_rl.errors import UserError
 from coil_rl.files import write_text
@@ -30,7 +30,6 @@ Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and
 FOLDS = 5
 EVERY = 4  # scans, as neighbouring scans are nearly equal
 UNUSUAL = 0.002  # upper bound of the share of training clusters that are no cones to the classifier
-BEAMS = (180, 360, 720, 1440)  # per scan, of the drives that train the shipped classifier
 RANGE = 1.0  # m
 MARGIN = 0.15  # m, points this far beyond are clustered too
 RANGE_BINS = (RANGE_MIN, 0.25, 0.5, 0.75, 1.0)  # m
@@ -100,9 +99,7 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
     try:
         predicted = cross_validate(pipeline, features, thick, cv=splits, return_indices=True, error_score="raise")
     except ValueError:
-        raise UserError(
-            "without one fold of drives only one kind of cone is left; number the drives in pairs"
-        ) from None
+        raise UserError("without one fold only one kind of cone is left; number the drives in pairs") from None
     accuracy = predicted["test_score"]
     correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
     scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
@@ -125,19 +122,6 @@ def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
     return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs))
 
 
-def train_on_simulated_drives(seeds: Sequence[int] = range(8)) -> Training:
-    """Train on a pair of simulated drives per seed, with as many beams as the next of `BEAMS`.
-
-    The result with the default seeds is the shipped classifier, `envs/robot/simulated_cones.json`.
-    """
-
-    def scans(sides: Sides, seed: int) -> Scans:
-        drive = simulated_drive(sides, seed, lidar=SimulatedLidar(BEAMS[seed % len(BEAMS)]))
-        return drive.ranges.numpy(), drive.angles.numpy()
-
-    return train_on_drives([scans("left", seed) for seed in seeds], [scans("right", seed) for seed in seeds])
-
-
 def cone_classifier(scaler: StandardScaler, machine: SVC, known: OneClassSVM) -> ConeClassifier:
     """Return the numbers of fitted machines of equal `gamma` for thick against thin cones and for any cone."""
     machines = (machine, known)
@@ -153,9 +137,7 @@ def cone_classifier(scaler: StandardScaler, machine: SVC, known: OneClassSVM) ->
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
     """Write a classifier as JSON."""
-    lines = [
-        f'  "{field.name}": {json.dumps(getattr(classifier, field.name).tolist())}' for field in fields(classifier)
-    ]
+    lines = [f'  "{part.name}": {json.dumps(getattr(classifier, part.name).tolist())}' for part in fields(classifier)]
     write_text(Path(path), "{\n" + ",\n".join(lines) + "\n}")
 
 
@@ -228,9 +210,7 @@ def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict
         for name, thick in (("thin", False), ("thick", True)):
             cells = in_range & (drive.thick.numpy() == thick)
             columns[name].append([recognised[cells].astype(float), distance[cells], visibility[cells]])
-    return {
-        name: _shares(*(np.concatenate(column) for column in zip(*rows, strict=True))) for name, rows in columns.items()
-    }
+    return {name: _shares(*map(np.concatenate, zip(*rows, strict=True))) for name, rows in columns.items()}
 
 
 def majority(label: Integers, cone: Integers, cones: int) -> Integers:

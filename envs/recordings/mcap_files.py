@@ -166,9 +166,8 @@ class RecordingWriter:
             schema = (channel.message_type, channel.language, channel.definition)
             if channel.message_type and schema not in schemas:
                 schemas[schema] = writer.register_schema(*schema)
-            channels[channel] = writer.register_channel(
-                channel.topic, channel.encoding, schemas.get(schema, 0), dict(channel.metadata)
-            )
+            about = channel.encoding, schemas.get(schema, 0), dict(channel.metadata)
+            channels[channel] = writer.register_channel(channel.topic, *about)
         for message in sorted(self._messages, key=lambda message: (message.log_time, message.channel)):
             writer.add_message(channels[message.channel], message.log_time, message.data, message.publish_time)
         writer.finish()
@@ -201,16 +200,12 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
     if summary.statistics:
         written = summary.statistics.channel_message_counts
         for topic, messages in contents.messages.items():
-            total = sum(
-                written.get(number, 0) for number, channel in summary.channels.items() if channel.topic == topic
-            )
+            total = sum(written.get(number, 0) for number, each in summary.channels.items() if each.topic == topic)
             read = len(messages) - before.get(topic, 0)
             contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
 
 
-def _records(
-    file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents
-) -> Iterator[records.McapRecord]:
+def _records(file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents) -> Iterator[Any]:
     """Yield the records of a file, of its chunks too; skip damaged chunks, and note them and an early end."""
     reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records
     while True:

@@ -183,9 +183,8 @@ def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remark
     stamps, _, _, scans = zip(*(messages[row] for row in kept), strict=True)
     points = np.array([len(scan) for scan in scans])
     if not points.any():
-        raise RecordingError(
-            f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record again."
-        )
+        problem = "no scan has a range; check that the scanner ran, and record again."
+        raise RecordingError(f"{path}, topic {topic}: {problem}")
     ranges = np.full((len(scans), points.max()), np.inf, np.float32)
     for row, scan in zip(ranges, scans, strict=True):
         row[: len(scan)] = scan

@@ -12,11 +12,11 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
 from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
-from coil_rl.envs.sight import SIGHT, Frame
+from coil_rl.envs.sight import SIGHT
 
 Perceive = Callable[[NDArray[np.float32], NDArray[np.float64]], tuple[Any, Any]]
 AnyPath = str | os.PathLike[str]
@@ -38,14 +38,11 @@ class McapReplayEnv(EnvBase):
     Args:
         recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
         perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to cones [N, 2, K, 2] in
-            the car's frame, m times `scale`, left side first, nearest first; and their number [N, 2]. Called once for
-            all scans of a recording with equal bearings.
+            the car's frame, m in the scale of the cone world, left side first, nearest first; and their number [N, 2].
+            Called once for all scans of a recording with equal bearings.
         scan, odometry, command, frame, strict: as in `read_recording`.
-        remembered: memory of a side that is not valid. "held" keeps its last numbers, as for a robot without a pose;
-            "moved" keeps its place on the ground, by odometry or commands (`Recording.poses`).
         spline, smoothing, kept_cones, max_steering: as in `ConeTrackEnv`.
         smooth: weight of the reward per unit of |a - mean of the last 20 actions|.
-        scale: factor from the robot's metres to those of the cone world.
         sight: m, range of view in the scale of the cone world.
         speed, car_length: of the robot, m/s and m.
         device: of all tensors.
@@ -65,20 +62,17 @@ class McapReplayEnv(EnvBase):
         command: str | None = "/cmd_vel",
         frame: str | None = None,
         strict: bool = False,
-        remembered: Literal["held", "moved"] = "held",
         spline: Literal["cubic", "quadratic"] = "cubic",
         smoothing: float = 0.1,
         smooth: float = -0.1,
         kept_cones: int = 16,
-        scale: float = 7.0,
         sight: float = SIGHT,
         speed: float = 0.15,
         car_length: float = 2 / 7,
         max_steering: float = 80.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        check_choice(("held", "moved"), remembered=remembered)
-        check_range(0, above=True, kept_cones=kept_cones, scale=scale, sight=sight, speed=speed, car_length=car_length)
+        check_range(0, above=True, kept_cones=kept_cones, sight=sight, speed=speed, car_length=car_length)
         check_range(0, 90, above=True, max_steering=max_steering)
         check_range(-1e6, 1e6, smooth=smooth)
         sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
@@ -91,8 +85,7 @@ class McapReplayEnv(EnvBase):
             for source in sources
         ]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
-        self.kept_cones, self.scale, self.moves = kept_cones, scale, remembered == "moved"
-        self.smooth, self.max_steering = smooth, math.radians(max_steering)
+        self.kept_cones, self.smooth, self.max_steering = kept_cones, smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         self._load(perception)
@@ -123,25 +116,19 @@ class McapReplayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
         self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
-        before = self.memory.samples, self.memory.ever_valid
+        before = {name: getattr(self.memory, name) for name in ("samples", "ever_valid")}
         self.memory.reset(mask)
         view = self._perceive()
         # Rows that are not reset have this scan in their memory already.
-        now = self.memory.samples, self.memory.ever_valid
-        self.memory.samples, self.memory.ever_valid = (
-            torch.where(mask, x, y) for x, y in zip(now, before, strict=True)
-        )
+        for name, kept in before.items():
+            setattr(self.memory, name, torch.where(mask, getattr(self.memory, name), kept))
         return self._tensordict(view, torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
-        before = self._current()
         self.steps = self.steps + 1
-        if self.moves:
-            then, now = Frame(self._pose_at(before)), Frame(self._pose_at(self._current()))
-            self.memory.samples = now.to_car(then.to_world(self.memory.samples))
         out = self._tensordict(self._perceive(), roughness)
         out["reward"] = out["info", "reward", "smooth"]
         done = (self.steps >= self.length).unsqueeze(-1)
@@ -152,18 +139,12 @@ class McapReplayEnv(EnvBase):
         """Return the index of each row's current scan among all scans [B]."""
         return self.first + torch.minimum(self.steps, self.length - 1)
 
-    def _pose_at(self, scan: Tensor) -> Tensor:
-        """Return the poses [3, B] at scans, in the scale of the cone world."""
-        x, y, heading = self.pose.index_select(0, scan).unbind(1)
-        return torch.stack([x * self.scale, y * self.scale, heading])
-
     def _perceive(self) -> dict[str, Tensor]:
         """Return the cones in the current scans, and the observation with the memory updated by them."""
         current = self._current()
         cones, count = self.cones.index_select(0, current), self.count.index_select(0, current)
-        observation, valid = self.memory.remember(
-            self.samples.index_select(3, current), self.valid.index_select(1, current)
-        )
+        found = self.samples.index_select(3, current), self.valid.index_select(1, current)
+        observation, valid = self.memory.remember(*found)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 
     def _tensordict(self, view: dict[str, Tensor], roughness: Tensor) -> TensorDict:
@@ -177,11 +158,8 @@ class McapReplayEnv(EnvBase):
             "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {
-            "steering": steering,
-            "omega": (steering * self.max_steering).sin() * (self.speed / self.car_length),
-        }
-        entries |= {"info": TensorDict(info, self.batch_size, device=self.device)}
+        entries |= {"steering": steering, "info": TensorDict(info, self.batch_size, device=self.device)}
+        entries["omega"] = (steering * self.max_steering).sin() * (self.speed / self.car_length)
         return TensorDict(entries, self.batch_size, device=self.device)
 
 

@@ -141,12 +141,9 @@ def record_labelling_drives(
 
 @torch.no_grad()
 def record_drives(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    paths: Sequence[Path],
-    about: Mapping[str, str] | None = None,
+    env: EnvBase, policy: TensorDictModuleBase, paths: Sequence[Path], about: Mapping[str, str] | None = None,
     tick: Callable[[], Any] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run a policy on B simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
 
     The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically. The entries of
@@ -193,14 +190,9 @@ def _notes(drive: Mapping[str, str], track: Track | None) -> dict[str, dict[str,
 
 
 def _write(
-    path: Path,
-    rate: float,
-    angles: Tensor,
-    ranges: Tensor,
-    poses: Tensor,
-    commands: Tensor | None,
+    path: Path, rate: float, angles: Tensor, ranges: Tensor, poses: Tensor, commands: Tensor | None,
     notes: Mapping[str, Mapping[str, str]],
-) -> None:
+) -> None:  # fmt: skip
     """Write scans [T, P] m, the poses at their starts and after [T or more, 3], and the commands after them [T, 2]."""
     times = [round(scan / rate * 1e9) for scan in range(max(len(ranges) + 1, len(poses)))]
     beams, angle_min = len(angles), float(angles[0])

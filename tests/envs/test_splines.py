@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import make_smoothing_spline
 from torch import Tensor
 
-from coil_rl.envs.splines import SelfEvolvingSpline, Spline, least_squares_parabola, smoothing_spline
+from coil_rl.envs.splines import Spline, least_squares_parabola, smoothing_spline
 
 SLOTS = 16
 FITS = {
@@ -228,51 +228,9 @@ def test_gradients_agree_with_finite_differences(fit, n: int) -> None:
     assert torch.autograd.gradcheck(lambda p, v: fit(p, count).sample(v), (points, u))
 
 
-def test_growing_point_by_point_equals_fitting_all_at_once() -> None:
-    points, count = random_batch()
-    path = SelfEvolvingSpline(SLOTS, 37, 0.3, dtype=torch.float64)
-    splines = []
-    for k in range(SLOTS):
-        path.add(points[:, k : k + 1], (k < count)[None])
-        splines.append((path.spline, path.spline.equidistant(5)))
-    for a, b in zip(tensors(path.spline), tensors(smoothing_spline(points, count, 0.3)), strict=True):
-        assert torch.equal(a, b)
-    # Splines taken earlier have not changed.
-    assert all(torch.equal(spline.equidistant(5), copy) for spline, copy in splines)
-
-
-def test_points_beyond_the_capacity_replace_the_oldest() -> None:
-    points, _ = random_batch()
-    draw = torch.Generator().manual_seed(0)
-    path = SelfEvolvingSpline(5, 37, 0.3, dtype=torch.float64)
-    added: list[list[Tensor]] = [[] for _ in range(37)]
-    for first, many in ((0, 3), (3, 1), (4, 4), (8, 8)):
-        mask = torch.rand(many, 37, generator=draw) < 0.6
-        path.add(points[:, first : first + many], mask)
-        for row in range(37):
-            added[row] += [points[:, first + k, row] for k in range(many) if mask[k, row]]
-            newest = added[row][-5:]
-            assert path.count[row] == len(newest)
-            assert not newest or torch.equal(path.points[:, : len(newest), row], torch.stack(newest, 1))
-
-
-def test_reset_removes_the_points_of_masked_rows_and_state_dict_restores_all() -> None:
-    points, count = random_batch()
-    path, restored = (SelfEvolvingSpline(SLOTS, 37, 0.3, dtype=torch.float64) for _ in range(2))
-    path.add(points, torch.arange(SLOTS)[:, None] < count)
-    restored.load_state_dict(path.state_dict())
-    assert torch.equal(restored.spline.equidistant(5), path.spline.equidistant(5))
-    masked = torch.arange(37) % 3 == 0
-    path.reset(masked)
-    for name, state in path.state_dict().items():
-        assert state[..., masked].eq(0).all()
-        assert torch.equal(state[..., ~masked], restored.state_dict()[name][..., ~masked])
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda points, count: SelfEvolvingSpline(1, 3, 0.1), "capacity=1"),
         (lambda points, count: smoothing_spline(points, count[:3], 0.1), "count"),
         (lambda points, count: least_squares_parabola(points[:, :1], count), "K >= 2"),
         (lambda points, count: smoothing_spline(points, count, -1), "smoothing=-1"),

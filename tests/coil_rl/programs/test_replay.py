@@ -25,7 +25,7 @@ from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import SCAN, TWIST_STAMPED, header, twist
 from coil_rl.guides import SplineGuide
 from coil_rl.programs.replay import _first_repeated, _run_names, _topic_name
-from coil_rl.reproduce import Table6
+from coil_rl.reproduce.robot import Table6
 
 SCANS = 15
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]

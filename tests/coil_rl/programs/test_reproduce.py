@@ -53,7 +53,7 @@ def test_options_reach_the_result_and_the_command_on_its_page():
 
 
 def test_a_further_result_is_requested_by_its_kind_and_name():
-    mine = "+results.figure_of_mine={_target_: coil_rl.reproduce.Figure6}"
+    mine = "+results.figure_of_mine={_target_: coil_rl.reproduce.toymaker.Figure6}"
     code, out, _ = outcome("figure=of_mine", mine, "hydra.run.dir=run")
     assert code == 0
     assert "Made by `coil-reproduce figure=of_mine" in out

@@ -9,8 +9,7 @@ from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.errors import UserError
-from coil_rl.reproduce import Figure25
-from coil_rl.reproduce.classifier import draw_cone_features, principal_components
+from coil_rl.reproduce.classifier import Figure25, draw_cone_features, principal_components
 from coil_rl.robot.classifier import accuracy, clusters_in_range, label_clusters, load_classifier
 
 

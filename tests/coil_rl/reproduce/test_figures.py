@@ -5,7 +5,7 @@ import pytest
 from reproduced_runs import read_csv
 
 from coil_rl.envs import robot_track, shipped_track
-from coil_rl.reproduce import Figure10, Figure19, Figure21, Figure26, Figure30, Figure31
+from coil_rl.reproduce.figures import Figure10, Figure19, Figure21, Figure26, Figure30, Figure31
 
 
 def series_of(figure, folder):

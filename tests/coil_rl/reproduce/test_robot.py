@@ -20,8 +20,7 @@ from coil_rl.envs import (
 from coil_rl.errors import UserError
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.report.runs import Run
-from coil_rl.reproduce import Table6
-from coil_rl.reproduce.robot import robot_page
+from coil_rl.reproduce.robot import Table6, robot_page
 from coil_rl.train import checkpoint
 from coil_rl.train.evaluation import evaluate_policy
 

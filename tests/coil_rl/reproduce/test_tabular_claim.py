@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from reproduced_runs import cells, read_csv
 
-from coil_rl.reproduce import TabularCoil
+from coil_rl.reproduce.tabular_claim import TabularCoil
 
 
 @pytest.fixture(scope="module")

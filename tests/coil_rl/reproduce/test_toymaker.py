@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from reproduced_runs import read_csv
 
-from coil_rl.reproduce import Figure6, Table1
-from coil_rl.reproduce.toymaker import most_explained
+from coil_rl.reproduce.toymaker import Figure6, Table1, most_explained
 
 
 def test_table_1_solves_the_bellman_equation_next_to_the_paper(tmp_path):

@@ -2,7 +2,7 @@ import pytest
 from reproduced_runs import make_runs, read_csv, row
 
 from coil_rl.errors import UserError
-from coil_rl.reproduce import Figure22, Table4
+from coil_rl.reproduce.training import Figure22, Table4
 
 
 @pytest.fixture(scope="module")

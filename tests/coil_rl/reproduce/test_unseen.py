@@ -2,7 +2,7 @@ import pandas as pd
 import pytest
 from reproduced_runs import cells, make_runs, read_csv
 
-from coil_rl.reproduce import Table5
+from coil_rl.reproduce.unseen import Table5
 
 
 @pytest.fixture(scope="module")
