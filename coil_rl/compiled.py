@@ -42,7 +42,8 @@ class Compiled:
         once: whether to compile it for the shapes of the first call only, and to run it as it is for others.
 
     Raises:
-        UserError: at a call, if there is no C++ compiler, or if the shape of a tensor depends on values.
+        UserError: at a call, if there is no C++ compiler or no place for the library, or if the shape of a tensor
+            depends on values.
     """
 
     def __init__(self, function: Callable[..., Sequence[Tensor]], once: bool = False) -> None:
@@ -123,7 +124,7 @@ def compiling() -> Iterator[None]:
 
 def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
     """Return a name for the compiled code of a graph on this machine."""
-    parts: list[Any] = [graph.code, torch.__version__, OPTIONS]
+    parts: list[Any] = [graph.code, torch.__version__, torch.get_num_threads(), OPTIONS]
     parts += [platform.node(), torch.backends.cpu.get_cpu_capability()]  # the code is for this processor
     parts += [(argument.shape, argument.stride(), argument.dtype, argument.device) for argument in arguments]
     digest = hashlib.sha256(repr(parts).encode())
@@ -137,6 +138,11 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
     """Compile a graph to a library at `path`."""
     import torch._inductor  # takes two seconds to import
 
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        remedy = "set XDG_CACHE_HOME to another folder, or take compile=false"
+        raise UserError(f"{path.parent} cannot be made for compiled code ({error.strerror}); {remedy}") from error
     tqdm.write("compiling, once for these sizes and this machine (20 to 60 s) ...", file=sys.stderr)
     examples = tuple(argument.detach() for argument in arguments)
     try:
