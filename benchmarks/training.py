@@ -125,7 +125,7 @@ def floor_rate(args: Namespace, frames: int) -> float:
 
 
 def measure_command(args: Namespace) -> list[Row]:
-    """Return the seconds of `coil-train method=coil` with its defaults, twice: the second time finds compiled code."""
+    """Return the times of two runs of `coil-train` with its defaults; the second one finds the compiled code."""
     rows = []
     for name in ("first", "second"):
         with tempfile.TemporaryDirectory() as folder:

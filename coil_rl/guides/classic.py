@@ -18,9 +18,9 @@ from coil_rl.envs.limits import check_choice
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
-    """Land as `gymnasium.envs.box2d.lunar_lander.heuristic` does: [*batch, 8] of LunarLander-v3 to an index [*batch].
+    """Return the action of Gymnasium's `lunar_lander.heuristic` for observations of LunarLander-v3, [*batch, 8].
 
-    With `continuous` the action is the power of both engines, [*batch, 2].
+    It is an index, [*batch], and with `continuous` the power of both engines, [*batch, 2].
     """
     x, y, speed, climb_rate, angle, spin, left_leg, right_leg = observation.unbind(-1)
     touches = (left_leg != 0) | (right_leg != 0)

@@ -138,7 +138,7 @@ class SplineMemoryGuide(SplineGuide):
         return torch.where(nearest.values.isinf(), constant(NOWHERE, target), target.t())
 
     def _discover(self, memory: dict[str, Tensor], frame: Frame, cones: Tensor, count: Tensor) -> None:
-        """Note the cones in view; place targets where a cone was never seen before."""
+        """Remember the cones in view, and place targets in the rows where one was never seen before."""
         slots = slots_in_use(count, self.cones)
         real = count.t() > constant(range(slots), count.t().unsqueeze(0))
         local = cones[:, :, :slots].permute(3, 2, 1, 0)
