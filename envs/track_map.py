@@ -46,51 +46,29 @@ class Location(NamedTuple):
 class TrackMap(nn.Module):
     """The static geometry of several tracks on one device, for a batch of cars that refer to tracks by index."""
 
+    cones: Tensor  # [2, slots of all sides of all tracks] m
+    starts: Tensor  # [3, tracks]
+    # A block holds the candidates of one cell in all sectors; cells without candidates share block 0.
+    block: Tensor  # [cells]
+    candidate: Tensor  # [blocks * SECTORS, most * 2], slots
+    candidate_count: Tensor  # [blocks * SECTORS], of the side with more candidates
+    near: Tensor  # [cells, N], slots of the cones that may decide the clearance
+    field: Tensor  # [nodes * 2] m, distances to the left and the right boundary
+    points: Tensor  # [8, tracks]: finish and low corner in m, last cell and last node
+    counts: Tensor  # [4, tracks]: columns and first number of the cells, and of the nodes
+
     def __init__(self, tracks: Sequence[Track], *, sight: float = SIGHT, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         if not tracks:
             raise ValueError("a track map needs at least one track, none was given")
         self.tracks = list(tracks)
-        self.slots = max(len(ring) for track in tracks for ring in (track.left, track.right)) + 1
-        cones = np.full((2, len(tracks), 2, self.slots), FAR)
-        for index, track in enumerate(tracks):
-            for side, ring in enumerate((track.left, track.right)):
-                cones[:, index, side, : len(ring)] = ring.T
-        self.cones: Tensor = _buffer(cones.reshape(2, -1), dtype)
-        self.starts: Tensor = _buffer(np.array([track.start for track in tracks]).T, dtype)
-        self._register_nearby(tracks, sight, dtype)
-        field = [boundary_distances(track, dtype) for track in tracks]
-        self.field: Tensor = _buffer(np.concatenate(field).ravel(), dtype)
-
-        # Numbers of each track, one column per track: points in m, and integers.
-        grids = [[Grid(track, edge, dtype) for track in tracks] for edge in (CELL, FIELD_CELL)]
-        finish = np.stack([track.finish for track in tracks], axis=1)
-        low = np.stack([grid.low for grid in grids[0]], axis=1)
-        shapes = [np.array([grid.shape for grid in row]).T for row in grids]
-        self.points: Tensor = _buffer(np.vstack([finish, low, *[shape - 2 for shape in shapes]]), dtype)
-        offsets = [np.cumsum(shape.prod(axis=0)) - shape.prod(axis=0) for shape in shapes]
-        self.counts: Tensor = _buffer(np.stack([*[shape[0] for shape in shapes], *offsets]), torch.int64)
+        for name, table in _tables(tuple(tracks), sight, dtype).items():
+            self.register_buffer(name, table, persistent=False)
+        self.slots = self.cones.shape[1] // (2 * len(tracks))
+        self.most = self.candidate.shape[1] // 2
 
     def __len__(self) -> int:
         return len(self.tracks)
-
-    def _register_nearby(self, tracks: Sequence[Track], sight: float, dtype: torch.dtype) -> None:
-        """Register `candidate` [blocks * SECTORS, most * 2], `candidate_count`, `block` [cells] and `near`.
-
-        A block holds the candidates of one cell in all sectors; cells without candidates share block 0. The count is
-        that of the side with more candidates.
-        """
-        used, visible, near = zip(*(nearby_cones(track, sight, dtype) for track in tracks), strict=True)
-        filled = np.concatenate(used)
-        self.block: Tensor = _buffer(np.where(filled, filled.cumsum(), 0), torch.int64)
-        candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
-        self.candidate_count: Tensor = _buffer((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16)
-        self.most, missing = candidate.shape[-1], self.slots - 1
-        slot = np.where(candidate < 0, missing, candidate) + np.array([[0], [self.slots]])
-        self.candidate: Tensor = _buffer(slot.swapaxes(-1, -2).reshape(-1, 2 * self.most), torch.int16)
-        lefts = [len(track.left) for track in tracks]
-        decisive = _stack([np.where(n < k, n, n - k + self.slots) for n, k in zip(near, lefts, strict=True)])
-        self.near: Tensor = _buffer(np.where(decisive < 0, missing, decisive), torch.int32)
 
     def locate(self, track: Tensor, position: Tensor) -> Location:
         """Locate positions [2, B] m on tracks [B]; positions off the map are moved to its edge."""
@@ -159,7 +137,44 @@ class Grid:
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-# Cached, because programs build several envs with the same tracks and these functions dominate the time of building.
+# Cached and shared, because programs build several envs with the same tracks, which takes seconds for a hundred.
+@lru_cache(maxsize=8)
+def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict[str, Tensor]:
+    """Return the buffers of a `TrackMap` by name."""
+    slots = max(len(ring) for track in tracks for ring in (track.left, track.right)) + 1
+    cones = np.full((2, len(tracks), 2, slots), FAR)
+    for index, track in enumerate(tracks):
+        for side, ring in enumerate((track.left, track.right)):
+            cones[:, index, side, : len(ring)] = ring.T
+
+    used, visible, near = zip(*(nearby_cones(track, sight, dtype) for track in tracks), strict=True)
+    filled = np.concatenate(used)
+    candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
+    slot = np.where(candidate < 0, slots - 1, candidate) + np.array([[0], [slots]])
+    lefts = [len(track.left) for track in tracks]
+    decisive = _stack([np.where(n < k, n, n - k + slots) for n, k in zip(near, lefts, strict=True)])
+
+    # Numbers of each track, one column per track: points in m, and integers.
+    grids = [[Grid(track, edge, dtype) for track in tracks] for edge in (CELL, FIELD_CELL)]
+    finish = np.stack([track.finish for track in tracks], axis=1)
+    low = np.stack([grid.low for grid in grids[0]], axis=1)
+    shapes = [np.array([grid.shape for grid in row]).T for row in grids]
+    offsets = [np.cumsum(shape.prod(axis=0)) - shape.prod(axis=0) for shape in shapes]
+    numbers: dict[str, tuple[NDArray[np.generic], torch.dtype]] = {
+        "cones": (cones.reshape(2, -1), dtype),
+        "starts": (np.array([track.start for track in tracks]).T, dtype),
+        "block": (np.where(filled, filled.cumsum(), 0), torch.int64),
+        "candidate": (slot.swapaxes(-1, -2).reshape(-1, 2 * candidate.shape[-1]), torch.int16),
+        "candidate_count": ((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16),
+        "near": (np.where(decisive < 0, slots - 1, decisive), torch.int32),
+        "field": (np.concatenate([boundary_distances(track, dtype) for track in tracks]).ravel(), dtype),
+        "points": (np.vstack([finish, low, *[shape - 2 for shape in shapes]]), dtype),
+        "counts": (np.stack([*[shape[0] for shape in shapes], *offsets]), torch.int64),
+    }
+    return {name: torch.tensor(np.ascontiguousarray(table), dtype=kind) for name, (table, kind) in numbers.items()}
+
+
+# Cached, because some sets of tracks have tracks in common.
 @lru_cache(maxsize=64)
 def nearby_cones(track: Track, sight: float, dtype: torch.dtype) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
     """Return the relevant cones of each cell of a track, by number, ascending, then -1; `sight` is in m.
@@ -209,10 +224,6 @@ def _true_columns(mask: NDArray[np.bool_]) -> Numbers:
     first = np.cumsum(counts) - counts.ravel()
     columns[(*row, np.arange(len(column)) - np.repeat(first, counts.ravel()))] = column
     return columns
-
-
-def _buffer(values: NDArray[np.generic], dtype: torch.dtype) -> nn.Buffer:
-    return nn.Buffer(torch.as_tensor(np.ascontiguousarray(values), dtype=dtype), persistent=False)
 
 
 def _batch_last(rows: Tensor) -> Tensor:

@@ -89,7 +89,12 @@ def check_used(used: Iterable[str], reason: str) -> None:
 
 
 def check_run(config: DictConfig) -> None:
-    """Check everything that a run needs; see `coil_rl.train.check.check`."""
+    """Check everything that a run needs, if it is not finished; see `coil_rl.train.check.check`."""
+    from coil_rl.train.run_folder import holds, is_evaluated
+
+    folder = Path(config.run_dir)
+    if config.get("existing") == "resume" and is_evaluated(folder) and holds(folder, config):
+        return
     from coil_rl.train.check import check
 
     check(config)

@@ -62,7 +62,11 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 
     budget = config.budgets[config.budget]
     planned = [
-        sweeps.planned(name, [*budget.every, *budget.only.get(name, []), *config.train], range(budget.seeds))
+        sweeps.planned(
+            name,
+            [*budget.every, *budget.only.get(name, []), *config.train],
+            range(budget.seeds_of.get(name, budget.seeds)),
+        )
         for name in dict.fromkeys(experiment for result in results for experiment in result.experiments)
     ]
     launcher = [word for word in HydraConfig.get().overrides.hydra if word.startswith(LAUNCHER)]

@@ -34,15 +34,15 @@ class Result(ABC):
 class WorldsResult(Result):
     """A result about runs in the main world and in variants of it.
 
-    `experiments` are in the main world, and `worlds` has an experiment by the name of each variant. The other runs are
-    compared with those of the label `against`.
+    `experiments` are in the main world, and `worlds` has those in each variant by its name. The other runs are compared
+    with those of the label `against`.
     """
 
     def __init__(
-        self, experiments: Sequence[str], worlds: Mapping[str, str] | None = None, against: str = "ppo"
+        self, experiments: Sequence[str], worlds: Mapping[str, Sequence[str]] | None = None, against: str = "ppo"
     ) -> None:
         # The main world has no name.
-        self.worlds = {"": list(experiments)} | {name: [experiment] for name, experiment in (worlds or {}).items()}
+        self.worlds = {"": list(experiments)} | {name: list(variant) for name, variant in (worlds or {}).items()}
         self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]
         self.against = against
 

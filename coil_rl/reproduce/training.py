@@ -8,17 +8,18 @@ from typing import Any
 import numpy as np
 
 from coil_rl.report import Interval, draw_intervals, draw_learning_curves, markdown_table, write_csv
-from coil_rl.report.curves import frames_until, learning, mean_curve
-from coil_rl.report.runs import GUIDE, RETURN
-from coil_rl.report.statistics import Estimate, estimate, wins
+from coil_rl.report.curves import frames_until, learning, mean_curve, points
+from coil_rl.report.runs import GUIDE, RETURN, Run
+from coil_rl.report.statistics import Array, Estimate, estimate, wins
 from coil_rl.reproduce import pages
-from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, WorldsResult, runs_by_label
+from coil_rl.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult, runs_by_label
 
 Row = Mapping[str, Any]
 
 PAPER_RETURNS = PAGES["table_4"]["paper"]
 KEYS = ("best", "final", "guide")
-FRACTIONS = {0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
+FRACTIONS = {0.1: "a tenth", 0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
+POINT = ("frames", "mean", "low", "high")  # of a curve
 
 
 class Table4(WorldsResult):
@@ -79,47 +80,103 @@ class Table4(WorldsResult):
         return sorted(table, key=lambda line: -line["best"].mean if math.isfinite(line["best"].mean) else math.inf)
 
 
-class Figure22(Result):
-    """Learning curves of the runs with some labels in one world, with the return of the first one's guide as a line."""
+class Figure22(WorldsResult):
+    """Learning curves of the runs with some labels, with the return of the guide of the first one as a line.
 
-    def __init__(self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo")) -> None:
+    A label is drawn in every world that has runs of it. Variants of the main world have pictures of their own,
+    `stem_2.png` and so on.
+    """
+
+    def __init__(
+        self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo"),
+        worlds: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__(experiments, worlds)
         if not labels:
             raise ValueError("labels=[] draws nothing; give at least one")
-        self.experiments, self.labels = list(experiments), list(labels)
+        self.labels = list(labels)
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
-        learned = {experiment: [run for run in runs[experiment] if run.curve] for experiment in self.experiments}
-        by_label = runs_by_label(self.labels, learned)
-        curves = {label: [run.curve for run in of_label] for label, of_label in by_label.items()}
-        own = [max(run.guide_returns.values()) for run in by_label[self.labels[0]] if run.guide_returns]
-        guide = float(np.mean(own)) if own else None
-        rows, table = [], []
-        for label, of_label in curves.items():
-            curve = mean_curve(of_label, RETURN)
-            rows += [
-                {"label": label, "frames": frames, "mean": mean, "low": low, "high": high}
-                for frames, mean, low, high in zip(*curve, strict=True)
-            ]
-            frames, mean, low, high = curve
-            line: dict[str, Any] = {"label": label, "runs": len(of_label)}
-            for fraction in FRACTIONS:
-                line[str(fraction)] = None
-                if len(frames):
-                    at = int(np.abs(frames - fraction * frames[-1]).argmin())
-                    ends = (low[at], high[at]) if len(of_label) > 1 else (np.nan, np.nan)
-                    line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
-            table.append(line | {"reached": None if guide is None else frames_until(frames, mean, guide)})
+        learned = {name: [run for run in runs[name] if run.curve] for name in self.experiments}
+        runs_by_label(self.labels, learned)  # each has runs in some world
+        parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[dict[str, Any]]()
+        for number, (world, experiments) in enumerate(self.worlds.items(), start=1):
+            of_world = [run for experiment in experiments for run in learned[experiment]]
+            by_label = {label: [run for run in of_world if run.label == label] for label in self.labels}
+            by_label = {label: of_label for label, of_label in by_label.items() if of_label}
+            curves = {label: [run.curve for run in of_label] for label, of_label in by_label.items()}
+            own = [max(run.guide_returns.values()) for run in next(iter(by_label.values())) if run.guide_returns]
+            guide = float(np.mean(own)) if own else math.nan
+            means = {label: mean_curve(of_label, RETURN) for label, of_label in curves.items()}
+            for label, curve in means.items():
+                values = [dict(zip(POINT, point, strict=True)) for point in zip(*curve, strict=True)]
+                rows += [{"world": world, "label": label, **point} for point in values]
+            reached = {label: _frames_to(guide, of_label) for label, of_label in by_label.items()}
+            picture = stem.with_name(f"{stem.name}_{number}.png" if world else f"{stem.name}.png")
+            title = ", ".join(filter(None, ("Figure 22: the return of the trained policies", world)))
+            draw_learning_curves(
+                curves, picture, guides={} if math.isnan(guide) else {GUIDE: guide}, title=title
+            )  # fmt: skip
+            parts += [*pages.world_heading(world), *([f"![{title}]({picture.name})"] if world else [])]
+            parts += [_curve_table(means, by_label, reached)]
+            parts += [] if math.isnan(guide) else [f"The guide alone earns {guide:.1f} in these cases."]
+            claims += self._claims(means, reached, world)
         write_csv(rows, stem.with_suffix(".csv"))
-        draw_learning_curves(
-            curves, stem.with_suffix(".png"), guides={} if guide is None else {GUIDE: guide},
-            title="Figure 22: the return of the trained policies",
-        )  # fmt: skip
-        columns = {"label": ("method", ""), "runs": ("runs", "d")}
-        columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
-        columns |= {"reached": ("frames up to the guide", ",.0f")}
-        notes = PAGES["figure_22"]["notes"].format(guide="an unknown return" if guide is None else f"{guide:.1f}")
-        return f"## Figure 22: learning curves\n\n{markdown_table(table, columns)}\n\n{notes}"
+        parts.append(PAGES["figure_22"]["notes"])
+        parts += [pages.claims_section(claims, {"ours": "ours (95 %)"})] if claims else []
+        return "\n\n".join(parts)
+
+    @staticmethod
+    def _claims(
+        means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str
+    ) -> list[dict[str, Any]]:
+        """Return the verdicts on the curves of a world."""
+        claims: list[dict[str, Any]] = []
+        for claim, driver, other in PAGES["figure_22"]["claims"]:
+            if not {driver, other} <= reached.keys():
+                continue
+            if claim == "above":
+                (frames, mean, *_), (_, others, *_) = means[driver], means[other]
+                above = (mean > others)[frames > 0]  # both begin untrained
+                ours: Any = pages.certain_verdict(bool(above.all()), f"at {above.sum()} of {len(above)} points")
+            else:
+                seeds = sorted(reached[driver].keys() & reached[other].keys())
+                more = [reached[driver][seed] - reached[other][seed] for seed in seeds]
+                ours = pages.Claim(estimate(more), "+,.0f", -1)
+            text = PAGES["figure_22"]["texts"][claim].format(driver=driver, other=other)
+            claims.append({"claim": f"{text}, {world}" if world else text, "ours": ours})
+        return claims
+
+
+def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:
+    """Return by seed the frames after which the curve of a run first reaches a level; all of them if it never does."""
+    reached = {}
+    for run in runs:
+        at, values = points(run.curve, RETURN).T
+        frames = frames_until(at, values, level)
+        reached[run.seed] = float(run.curve[-1]["frames"]) if math.isnan(frames) else frames
+    return reached
+
+
+def _curve_table(
+    means: Mapping[str, Sequence[Array]], runs: Mapping[str, Sequence[Run]],
+    reached: Mapping[str, Mapping[int, float]],
+) -> str:  # fmt: skip
+    """Return the table of the curves of a world: returns after parts of the training, and frames up to the guide."""
+    table = []
+    for label, (frames, mean, low, high) in means.items():
+        line: dict[str, Any] = {"label": label, "runs": len(runs[label])}
+        for fraction in FRACTIONS:
+            if len(frames):
+                at = int(np.abs(frames - fraction * frames[-1]).argmin())
+                ends = (low[at], high[at]) if len(runs[label]) > 1 else (np.nan, np.nan)
+                line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
+        table.append(line | {"reached": estimate(list(reached[label].values())).cell(",.0f")})
+    columns = {"label": ("method", ""), "runs": ("runs", "d")}
+    columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
+    columns |= {"reached": ("frames up to the guide (95 %)", "")}
+    return markdown_table(table, columns)
 
 
 def _paper_table(table: Sequence[Row]) -> str:

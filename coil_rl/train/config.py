@@ -230,6 +230,7 @@ class RunsBudgetConfig(NodeConfig):
     """Training runs of `coil-reproduce`: number of seeds, and overrides of all runs and of single experiments."""
 
     seeds: Annotated[int, Field(ge=1)] = MISSING
+    seeds_of: dict[str, Annotated[int, Field(ge=1)]] = field(default_factory=dict)  # by experiment, where it is another
     note: str | None = None
     every: list[str] = field(default_factory=list)
     only: dict[str, list[str]] = field(default_factory=dict)

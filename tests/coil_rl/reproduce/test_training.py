@@ -14,7 +14,7 @@ def made(tmp_path_factory):
         "other": make_runs(folder / "other", {"coil": -10.0, "ppo": 20.0}),
         "single": make_runs(folder / "single", {"alone": 0.0}, seeds=1),
     }
-    table = Table4(["main", "single"], {"another world": "other"})
+    table = Table4(["main", "single"], {"another world": ["other"]})
     return table, table.make(folder / "t", runs), folder, runs
 
 
@@ -67,9 +67,11 @@ def test_curves_are_means_of_runs_with_the_guides_return(tmp_path):
     assert float(rows["coil", 3000]["mean"]) == 341
     assert float(rows["coil", 3000]["low"]) <= 341 <= float(rows["coil", 3000]["high"])
     coil, ppo = row(page, "coil"), row(page, "ppo")
-    assert [line[4].split(" (")[0] for line in (coil, ppo)] == ["321.0", "311.0"]
-    assert [coil[-1], ppo[-1]] == ["2,000", "2,225"], "between 291 and 331"
-    assert "The guide alone earns 300.0 there." in " ".join(page.split())
+    assert [line[5].split(" (")[0] for line in (coil, ppo)] == ["321.0", "311.0"]
+    assert [line[-1].split(" (")[0] for line in (coil, ppo)] == ["2,000", "2,225"]
+    assert "The guide alone earns 300.0 in these cases." in page
+    assert row(page, "The curve of coil is above")[1] == "**held up**: at 3 of 3 points"
+    assert row(page, "coil reaches the level")[1].startswith("**held up**: -225 (")
     assert (tmp_path / "f.png").exists()
 
 

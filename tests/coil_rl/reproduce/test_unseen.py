@@ -14,7 +14,7 @@ def made(tmp_path_factory):
         "imitation": make_runs(folder / "imitation", {"oil": 5.0}, sampled=False, completed=0.5, crashed=0.5),
         "other": make_runs(folder / "other", {"coil": 80.0, "ppo": 60.0}),
     }
-    page = Table5(["main", "imitation"], {"another world": "other"}).make(folder / "t", runs)
+    page = Table5(["main", "imitation"], {"another world": ["other"]}).make(folder / "t", runs)
     assert (folder / "t.png").exists()
     return page, read_csv(folder / "t.csv")
 
