@@ -10,13 +10,14 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig, ListConfig, OmegaConf
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import write_text
+from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
@@ -32,6 +33,7 @@ from coil_rl.train.build import (
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.train.fallback import Fallback
 from coil_rl.train.measures import Measure, measures_of, summarise
+from coil_rl.transforms import GuideActions
 
 COLUMNS = {"driver": ("driver", ""), "advice": ("advice", ""), "actions": ("actions", ""), "case": ("case", "")}
 COLUMNS |= {"reward": ("reward", ".1f")}
@@ -80,9 +82,9 @@ def evaluate_run(
 ) -> None:
     """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 
-    Each guide drives each case once. An agent drives it once with deterministic actions, `evaluation.repeats` times
-    with sampled ones if it samples, once with each advice of `evaluation.advice` instead of its own, and once with a
-    `fallback`.
+    Each guide drives each case once, beside the agent where both have the same env. An agent drives it once with
+    deterministic actions, `evaluation.repeats` times with sampled ones if it samples, once with each advice of
+    `evaluation.advice` instead of its own, and once with a `fallback`.
 
     The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
     """
@@ -100,8 +102,10 @@ def evaluate_run(
         if actions == "deterministic":
             drives[f"{driver}, {advice}" if advice else driver] = result
 
-    for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
-        add(result, driver)
+    together = agent is not None and _advises_only(config)
+    if not together:
+        for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
+            add(result, driver)
     # The kinds of advice, each with the number of sampled episodes a case.
     plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)] if agent is not None else []
     plan += [(advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms]
@@ -109,16 +113,22 @@ def evaluate_run(
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         for advice, repeats in plan:
             bar.set_postfix_str(", ".join(filter(None, (config.label, advice))))
-            # Deterministic and sampling rows in one batch: the time of a step hardly depends on its size.
-            rows = torch.arange((1 + repeats) * count, device=config.device)
+            names = driver_names(config.guide) if together and not advice else []
+            # All drives in one batch: the time of a step hardly depends on its size.
+            own = (1 + repeats) * count
+            rows = torch.arange(own + len(names) * count, device=config.device)
             env = build_env(config, {**config.evaluation.env, "num_envs": len(rows)}, advice=advice)
             compile_steps(config, env)
             watching = pictures if not advice else []
             tick = partial(_tick, env, watching, bar.update)
-            result = evaluation.drive(env, agent, sampled=repeats > 0 and rows >= count, tick=tick)
+            driver = AgentAndGuides(env, agent, own, len(names)) if names else agent
+            sampled = repeats > 0 and (rows >= count) & (rows < own)
+            result = evaluation.drive(env, driver, sampled=sampled, tick=tick)
+            for name, of_guide in zip(names, result[own:].split(len(names)) if names else [], strict=True):
+                add(of_guide, name)
             add(result[:count], config.label, advice)
             if repeats:
-                add(result[count:], config.label, advice, "sampled")
+                add(result[count:own], config.label, advice, "sampled")
         if fallback is not None:
             result = evaluation.drive(build_env(config, {**config.evaluation.env, "num_envs": count}), fallback)
             add(result, f"{config.label} or guide")
@@ -137,6 +147,37 @@ def evaluate_run(
     page += [f"guide.{name} sees: {what}; it may know more than the agent." for name, what in sees]
     write_text(folder / "evaluation.md", "\n\n".join(page))
     write_csv(table, folder / "evaluation.csv")
+
+
+def _advises_only(config: DictConfig) -> bool:
+    """Return whether the env of the agent is that of its guides: all that a method adds is their advice."""
+    nodes = config.method.transforms.values()
+    advice = all(str(node.get("_target_")).endswith(f".{GuideActions.__name__}") for node in nodes)
+    return bool(nodes) and advice and not config.degrade and not config.action
+
+
+class AgentAndGuides(TensorDictModuleBase):
+    """An agent on the first rows of an env with advice, and its guides on the others, each on as many.
+
+    Args:
+        env: the env.
+        agent: writes the action.
+        count: number of rows of the agent.
+        guides: number of guides.
+    """
+
+    def __init__(self, env: EnvBase, agent: TensorDictModuleBase, count: int, guides: int) -> None:
+        self.in_keys, self.out_keys = list(agent.in_keys), ["action"]
+        super().__init__()
+        rows = torch.arange(env.batch_size[0]) - count
+        self.guides = FollowAdvice(env, (rows.clamp(min=0) // ((len(rows) - count) // guides)).tolist())
+        self.agent, self.count = agent, count
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        advised = self.guides(tensordict.copy())["action"]
+        tensordict = self.agent(tensordict)
+        return tensordict.set("action", torch.cat([tensordict["action"][: self.count], advised[self.count :]]))
 
 
 def not_worse(agent: EvaluationResult, guide: EvaluationResult, name: str) -> str:

@@ -1,10 +1,12 @@
+import csv
+
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from coil_rl.errors import UserError
-from coil_rl.train.build import build_guides
-from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides, recorded
+from coil_rl.train.build import build_env, build_guides, build_learner
+from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides, evaluate_run, recorded
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -36,6 +38,18 @@ def test_given_guides_are_not_cached(composed):
     cached, given = drive(config), drive(config, build_guides(config))
     assert given["guide spline"] is not cached["guide spline"]
     assert given["guide spline"].mean_reward == cached["guide spline"].mean_reward
+
+
+@pytest.mark.parametrize("change", ["evaluation.repeats=2", "degrade=delayed", "env.time_limit=2"])
+def test_guides_beside_an_agent_drive_as_they_do_alone(composed, change, tmp_path):
+    config = composed("guide=[spline,centre_fast]", "evaluation.gif=false", "evaluation.repeats=1", change)
+    policy = build_learner(config, build_env(config)).policy
+    evaluate_run(config, policy, tmp_path, seed=0)
+    with (tmp_path / "episodes.csv").open(newline="") as file:
+        beside = [float(row["reward"]) for row in csv.DictReader(file) if row["driver"].startswith("guide")]
+    alone = [episode["reward"] for result in drive(config).values() for episode in result.episodes]
+    assert beside == alone
+    assert len(set(beside)) == 6
 
 
 def test_evaluation_has_the_cases_and_measures_of_the_env_and_the_entries_of_its_pictures(composed):
