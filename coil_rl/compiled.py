@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -88,13 +89,19 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     Raises:
         UserError: if the shape of a tensor depends on values.
     """
-    from torch.fx.experimental.proxy_tensor import make_fx  # takes half a second to import
+    from torch.fx.experimental import proxy_tensor  # takes half a second to import
 
     before = [argument.detach().clone() for argument in arguments]
-    with compiling(), torch.random.fork_rng(), warnings.catch_warnings():
+    # Shapes of the nodes take two thirds of the time of recording, and the compiler finds them again.
+    set_meta = proxy_tensor.set_meta
+    without_shapes = patch.object(
+        proxy_tensor, "set_meta", lambda proxy, value: proxy if isinstance(value, Tensor) else set_meta(proxy, value)
+    )
+    with compiling(), without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Checks of values, as in TorchRL's distributions, are Python's decisions.
-        graph = make_fx(lambda *tensors: function(*tensors), _error_on_data_dependent_ops=False)(*arguments)
+        record_calls = proxy_tensor.make_fx(lambda *tensors: function(*tensors), _error_on_data_dependent_ops=False)
+        graph = record_calls(*arguments)
     with torch.no_grad():
         for argument, value in zip(arguments, before, strict=True):
             argument.copy_(value)

@@ -121,9 +121,9 @@ def evaluate_run(
             compile_steps(config, env)
             watching = pictures if not advice else []
             tick = partial(_tick, env, watching, bar.update)
-            driver = AgentAndGuides(env, agent, own, len(names)) if names else agent
+            policy = AgentAndGuides(env, agent, own, len(names)) if names else agent
             sampled = repeats > 0 and (rows >= count) & (rows < own)
-            result = evaluation.drive(env, driver, sampled=sampled, tick=tick)
+            result = evaluation.drive(env, policy, sampled=sampled, tick=tick)
             for name, of_guide in zip(names, result[own:].split(len(names)) if names else [], strict=True):
                 add(of_guide, name)
             add(result[:count], config.label, advice)
