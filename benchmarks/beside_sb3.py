@@ -3,8 +3,8 @@
     python -m benchmarks.beside_sb3 ppo Pendulum-v1 --frames 40000 --seeds 3
 
 prints for both the mean return of deterministic episodes with fixed seeds after the training, with the standard
-deviation over the runs, and the frames per CPU second of the training. The extra `bench` of coil-rl installs what it
-needs.
+deviation over the runs, the frames per CPU second of the training, and the gradient steps per CPU second of the updates
+alone. The extra `bench` of coil-rl installs what it needs.
 """
 
 from __future__ import annotations
@@ -50,8 +50,23 @@ CAPACITY = 50_000
 EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
 
 
-def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> Act:
-    """Train our learner and return its deterministic policy."""
+class Timed:
+    """A function whose calls are counted in CPU seconds, `seconds`."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function, self.seconds = function, 0.0
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        """Call the function."""
+        start = time.process_time()
+        try:
+            return self.function(*args, **options)
+        finally:
+            self.seconds += time.process_time() - start
+
+
+def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
+    """Train our learner and return its deterministic policy, and the gradient steps per CPU second of its updates."""
     torch.manual_seed(seed)
     env = GymnasiumEnv(env_id, values["envs"], seed=seed)
     common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")} | {"seed": seed}
@@ -74,20 +89,21 @@ def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, se
         else:
             epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
             learner = DQN(env, network=network, epsilon=epsilon, double=False, **replay)
-    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
-    for update in range(frames // rollout.frames):
-        learner.update(rollout.collect(), update * rollout.frames / frames)
+    rollout, update, steps = Rollout(env, learner.policy, values["steps"], learner.keys), Timed(learner.update), 0.0
+    for count in range(frames // rollout.frames):
+        metrics = update(rollout.collect(), count * rollout.frames / frames)
+        steps += metrics.get("minibatches", values.get("epochs", 0) * rollout.frames / values["minibatch"])
 
     def act(observation: Tensor) -> Tensor:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             action: Tensor = learner.policy(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
         return action
 
-    return act
+    return act, steps / update.seconds
 
 
-def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> Act:
-    """Train the learner of Stable-Baselines3 and return its deterministic policy."""
+def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
+    """Train the learner of Stable-Baselines3; the results are those of `ours`."""
     import stable_baselines3
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -102,7 +118,8 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
         )  # fmt: skip
     else:
         common |= {"tau": values["tau"], "learning_starts": values["starts"], "buffer_size": CAPACITY}
-        common |= {"train_freq": values["steps"], "gradient_steps": values["steps"] // values["every"]}
+        steps = values["envs"] * values["steps"] // values["every"]
+        common |= {"train_freq": values["steps"], "gradient_steps": steps}
         common["policy_kwargs"] = {"net_arch": list(values["hidden"]), "activation_fn": nn.ReLU}
         if algorithm == "sac":
             model = stable_baselines3.SAC("MlpPolicy", envs, **common)
@@ -111,8 +128,12 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
                 "MlpPolicy", envs, target_update_interval=values["every"], exploration_fraction=values["explore"],
                 exploration_final_eps=values["epsilon"], **common,
             )  # fmt: skip
+    update = model.train = Timed(model.train)
     model.learn(frames)
-    return lambda observation: torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
+    # Its PPO counts epochs.
+    steps = model._n_updates * (values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1)
+    act = lambda observation: torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])  # noqa: E731
+    return act, steps / update.seconds
 
 
 def mean_return(env_id: str, act: Act) -> float:
@@ -134,25 +155,30 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("env", help="a Gymnasium id, e.g. Pendulum-v1 or LunarLanderContinuous-v3")
     parser.add_argument("--frames", type=int, default=20_000)
     parser.add_argument("--seeds", type=int, default=3, help="runs, with the seeds 0, 1, ...")
+    parser.add_argument("--envs", type=int, help="number of envs, if not that of the algorithm")
     args = parser.parse_args(argv)
     torch.set_num_threads(1)
     values = {**VALUES[args.algorithm], **TUNED.get((args.algorithm, args.env), {})}
+    values["envs"] = args.envs or values["envs"]
     learners = {"ours": ours, "Stable-Baselines3": theirs}
     returns: dict[str, list[float]] = {name: [] for name in learners}
     rates: dict[str, list[float]] = {name: [] for name in learners}
+    steps: dict[str, list[float]] = {name: [] for name in learners}
     # In turns, so that a machine that becomes slower or faster is so for both.
     runs = list(itertools.product(range(args.seeds), learners.items()))
     for seed, (name, train) in tqdm(runs, disable=None):
         start = time.process_time()
-        act = train(args.algorithm, args.env, values, args.frames, seed)
+        act, rate = train(args.algorithm, args.env, values, args.frames, seed)
         rates[name].append(args.frames / (time.process_time() - start))
+        steps[name].append(rate)
         returns[name].append(mean_return(args.env, act))
     rows = []
     for name in learners:
         spread = statistics.stdev(returns[name]) if args.seeds > 1 else math.nan
-        rows.append([name, statistics.mean(returns[name]), spread, statistics.median(rates[name])])
+        speed = [statistics.median(numbers[name]) for numbers in (rates, steps)]
+        rows.append([name, statistics.mean(returns[name]), spread, *speed])
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
-    print(tabulate(rows, ["", "return", "sd", "frames per CPU second"], floatfmt=".0f"))
+    print(tabulate(rows, ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"], floatfmt=".0f"))
 
 
 if __name__ == "__main__":
