@@ -64,6 +64,10 @@ class Timed:
         finally:
             self.seconds += time.process_time() - start
 
+    def rate(self, count: float) -> float:
+        """Return a count per CPU second of the calls; NaN for none."""
+        return count / self.seconds if count else math.nan
+
 
 def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
     """Train our learner and return its deterministic policy, and the gradient steps per CPU second of its updates."""
@@ -99,7 +103,7 @@ def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, se
             action: Tensor = learner.policy(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
         return action
 
-    return act, steps / update.seconds
+    return act, update.rate(steps)
 
 
 def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
@@ -133,7 +137,7 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
     # Its PPO counts epochs.
     steps = model._n_updates * (values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1)
     act = lambda observation: torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])  # noqa: E731
-    return act, steps / update.seconds
+    return act, update.rate(steps)
 
 
 def mean_return(env_id: str, act: Act) -> float:
