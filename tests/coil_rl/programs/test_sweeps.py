@@ -41,7 +41,7 @@ def test_every_run_has_a_folder_with_its_fingerprint(authors):
 
 def test_override_that_fits_only_some_runs_is_refused_before_the_first_run():
     overrides = ["learner.validate=false"]
-    assert len(planned("paper_imitation", overrides).all_folders) == 4
+    assert len(planned("paper_imitation", overrides).all_folders) == 2
     with pytest.raises(UserError, match=r"there is no key learner\.validate"):
         planned("methods", overrides)
 
