@@ -365,9 +365,10 @@ class ConeTrackEnv(SeededEnv):
         if self.hold_boundary:
             rows = rows_in_use(new)
             if len(rows):
-                index = visible.index.view(visible.real.shape)[..., rows]
-                estimate = self._estimate_distinct(cones.flatten(1)[:, index], visible.count[:, rows])
-                estimate = torch.where(new[rows], estimate, samples[..., rows])
+                index = visible.index.view(visible.real.shape).index_select(-1, rows)
+                chosen = cones.flatten(1).index_select(1, index.flatten()).view(2, *index.shape)
+                estimate = self._estimate_distinct(chosen, visible.count.index_select(1, rows))
+                estimate = torch.where(new.index_select(0, rows), estimate, samples.index_select(-1, rows))
                 samples = samples.index_copy(-1, rows, estimate)
             sampled = torch.ones_like(sampled)
             return encode_samples(frame.to_car(samples), sampled, self.sight), samples, sampled
