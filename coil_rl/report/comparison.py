@@ -271,7 +271,8 @@ class Paired:
 def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
     """Compare two drivers seed by seed by the score or by a measure; a single guide has one value for all seeds.
 
-    The result is None without common cases and seeds, or if the measure has NaN.
+    A case counts for a seed if both have a number there, as lap times where both completed one. The result is None
+    without common cases and seeds, or if a seed has no such case.
     """
     if group.cases != other.cases or (other.is_guide and other.seeds is not None):
         return None
@@ -280,6 +281,8 @@ def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
         common = [number for number in ours.index if number in theirs.index]
         ours, theirs = ours.loc[common], theirs.loc[common]
     x, y = ours.to_numpy(), theirs.to_numpy()
-    if not x.size or not np.isfinite(x).all() or not np.isfinite(y).all():
+    counts = np.isfinite(x) & np.isfinite(y)
+    if not x.size or not counts.any(axis=1).all():
         return None
-    return Paired(estimate((x - y).mean(axis=1)), float(wins(x, y).mean()))
+    differences = np.where(counts, x - y, 0).sum(axis=1) / counts.sum(axis=1)
+    return Paired(estimate(differences), float(wins(x, y)[counts].mean()))
