@@ -56,6 +56,7 @@ class DQN(OffPolicy):
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
+    parts = ("policy", *OffPolicy.parts)
     minimised = reported = ("loss",)
 
     def __init__(
@@ -113,7 +114,7 @@ class DQN(OffPolicy):
             learning starts; and `epsilon`.
         """
         metrics = super().update(batch, progress)
-        epsilon = self.anchor.noise if self.anchor is not None and self.anchor.holds else self.epsilon
+        epsilon = self.anchor.noise_at if self.anchor is not None and self.anchor.holds else self.epsilon
         self.explorer.eps.fill_(epsilon(progress))
         return metrics | {"epsilon": epsilon(progress)}
 
@@ -122,12 +123,3 @@ class DQN(OffPolicy):
         """Return the mean value of the best action, 0 before learning starts."""
         value = 0.0 if minibatch is None else float(self.network(minibatch)["chosen_action_value"].mean())
         return {"value": value}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return {"policy": self.policy.state_dict()} | super().state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        super().load_state_dict(state)

@@ -14,12 +14,13 @@ from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
 
-class OffPolicy:
+class OffPolicy(Stateful):
     """Replay buffer, optimiser, target networks and update.
 
     A step is stored with the observations before and after it, advice included, because a guide with memory or
@@ -60,6 +61,7 @@ class OffPolicy:
 
     kind: ClassVar[str] = "agent"
     compilable: ClassVar[bool] = True
+    parts: ClassVar[tuple[str, ...]] = ("loss", "gradient", "generator", "pending_updates", "normaliser", "anchor")
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
 
@@ -142,7 +144,7 @@ class OffPolicy:
             self.losses,
             [list(self.loss.parameters())],
             [self.loss],
-            rate=self.learning_rate(0),
+            lambda progress: [self.learning_rate(progress)],
             eps=1e-8,
             max_grad_norm=self.max_grad_norm,
             after=self.target.step,
@@ -161,10 +163,8 @@ class OffPolicy:
             Means over the minibatches of the `reported` values, 0 before learning starts; the number of `minibatches`;
             the number of stored steps (`kept`); the learning rate; and the values of `describe`.
         """
-        for group in self.gradient.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
         self.store(batch)
-        self.gradient.decide(progress)
+        self.gradient.begin(progress)
         weights, reports, minibatch = self.loss_weights(progress), [], None
         for minibatch in self.samples():
             reports.append(self.gradient(minibatch, weights))
@@ -236,35 +236,21 @@ class OffPolicy:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""
-        return {
-            "loss": self.loss.state_dict(),
-            "gradient": self.gradient.state_dict(),
-            "buffers": [
-                {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
-                for buffer in (self.buffer, self.guide_buffer)
-            ],
-            "generator": self.generator.get_state(),
-            "pending_updates": self.pending_updates,
-            "normaliser": {} if self.normaliser is None else self.normaliser.state_dict(),
-            "anchor": self.anchor.state_dict() if self.anchor else {},
-        }
+        buffers = [
+            {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
+            for buffer in (self.buffer, self.guide_buffer)
+        ]
+        return super().state_dict() | {"buffers": buffers}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-        self.loss.load_state_dict(state["loss"])
-        self.gradient.load_state_dict(state["gradient"])
+        super().load_state_dict(state)
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if stored["steps"]:
                 steps = TensorDict.from_dict(stored["steps"], batch_size=stored["steps"]["action"].shape[:1])
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
-        self.generator.set_state(state["generator"].cpu())
-        self.pending_updates = state["pending_updates"]
-        if self.normaliser is not None:
-            self.normaliser.load_state_dict(state["normaliser"])
-        if self.anchor:
-            self.anchor.load_state_dict(state["anchor"])
 
 
 def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:

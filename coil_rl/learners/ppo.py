@@ -29,16 +29,17 @@ from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
 
 
-class PPO:
+class PPO(Stateful):
     """The PPO learner, and the base class of the other on-policy learners.
 
     COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps (`agent_acts` is false),
     the policy learns from the agent's steps only, and the critic from all. Subclasses override `build_loss`, `losses`,
-    `build_networks`, `parameter_groups` and `set_learning_rates`.
+    `build_networks`, `parameter_groups` and `learning_rates`.
 
     A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
     anew from the state that was stored in the first step of each row; then their steps are a minibatch as any other.
@@ -92,6 +93,7 @@ class PPO:
     kind: ClassVar[str] = "agent"
     with_memory: ClassVar[bool] = True
     compilable: ClassVar[bool] = True
+    parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "generator", "noise", "anchor")
 
     def __init__(
         self,
@@ -147,13 +149,12 @@ class PPO:
             self.all_losses,
             self.parameter_groups(),
             [self.policy, self.critic, self.loss],
-            rate=self.learning_rate(0),
+            self.learning_rates,
             eps=1e-5,
             max_grad_norm=max_grad_norm,
             compile=compile,
             compilable=self.compilable and self.memory is None and not self.guide_may_act,
         )
-        self.optimiser = self.gradient.optimiser
         self.generator = torch.Generator().manual_seed(seed)
         self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
         self.reward_key = unravel_key(("next", env.reward_key))
@@ -191,10 +192,9 @@ class PPO:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
         return [[*self.policy.parameters(), *self.critic.parameters()]]
 
-    def set_learning_rates(self, progress: float) -> None:
-        """Set the learning rate of each parameter group."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
+    def learning_rates(self, progress: float) -> list[float]:
+        """Return the learning rate of each parameter group."""
+        return [self.learning_rate(progress)] * len(self.gradient.groups)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts.
@@ -208,7 +208,6 @@ class PPO:
             learning rate.
         """
         rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
-        self.gradient.decide(progress)
         reports = [self.gradient(minibatch, weights) for minibatch in self.draw_minibatches(rows)]
         known = {"learning_rate": self.learning_rate(progress), "compiled": float(self.gradient.compile is True)}
         return self.gradient.means(reports) | known | self.finish(batch, progress)
@@ -226,7 +225,7 @@ class PPO:
         weights = {"loss_objective": learns, "loss_critic": 1.0}
         if getattr(self.loss, "entropy_bonus", False):
             weights["loss_entropy"] = learns
-        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
+        return weights | {f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary}
 
     def policy_waits(self, progress: float) -> bool:
         """Return whether only the critic learns."""
@@ -248,7 +247,7 @@ class PPO:
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
         """Apply the schedules and compute advantages; returns the rows to learn from, [B * T], with a memory [B, T]."""
-        self.set_learning_rates(progress)
+        self.gradient.begin(progress)
         if getattr(self.loss, "entropy_bonus", False):
             self.loss.entropy_coeff.fill_(self.entropy(progress))
         if self.reward_key != ("next", "reward"):  # several agents: their rewards are summed
@@ -302,28 +301,6 @@ class PPO:
         losses = self.losses(agent_steps)
         losses["loss_critic"] = self.loss.loss_critic(minibatch)[0].mean()
         return losses
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return {
-            "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "gradient": self.gradient.state_dict(),
-            "generator": self.generator.get_state(),
-            "noise": self.noise.state_dict() if self.noise else {},
-            "anchor": self.anchor.state_dict() if self.anchor else {},
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        self.critic.load_state_dict(state["critic"])
-        self.gradient.load_state_dict(state["gradient"])
-        self.generator.set_state(state["generator"])
-        if self.noise:
-            self.noise.load_state_dict(state["noise"])
-        if self.anchor:
-            self.anchor.load_state_dict(state["anchor"])
 
 
 class ClippedLoss(ClipPPOLoss):

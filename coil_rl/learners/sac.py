@@ -152,7 +152,7 @@ class SAC(OffPolicy):
         """Return the weights of the losses in the sum that an update minimises."""
         learns = float(self.anchor is None or not self.anchor.waits(progress))
         weights = super().loss_weights(progress) | {"loss_actor": learns}
-        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
+        return weights | {f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary}
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
