@@ -148,9 +148,8 @@ def _check_history(
 ) -> None:
     with torch.no_grad():
         data = [env.rollout(steps, break_when_any_done=False) for _ in range(1 if env.batch_size else 2)]
-    recorded: TensorDictBase = (
-        data[0] if env.batch_size else TensorDict.stack([one[: min(map(len, data))] for one in data])
-    )
+    shortest = min(map(len, data))
+    recorded: TensorDictBase = data[0] if env.batch_size else TensorDict.stack([one[:shortest] for one in data])
     if len(recorded.batch_size) != 2 or len(recorded) < 2:
         raise ValueError(f"check_guide needs an env with one batch dimension of at least 2 rows, not {env.batch_size}")
     env = TransformedEnv(_Recorded(env, recorded), GuideActions({"guide": guide}, action_key))
@@ -185,9 +184,8 @@ def _check_history(
         try:
             interrupted = advice(reset=True)
         except (IndexError, RuntimeError) as error:
-            raise ValueError(
-                f"the guide fails after a single row was reset, so it may remember in itself, not in entries: {error}"
-            ) from error
+            cause = "so it may remember in itself, not in entries"
+            raise ValueError(f"the guide fails after a single row was reset, {cause}: {error}") from error
     finally:
         hook.remove()
 
@@ -195,9 +193,8 @@ def _check_history(
         return torch.allclose(one, other, rtol=0, atol=tolerance)
 
     if not torch.equal(first, again):
-        raise ValueError(
-            "the guide's action is another one for the same history; it draws, or remembers earlier episodes"
-        )
+        cause = "it draws, or remembers earlier episodes"
+        raise ValueError(f"the guide's action is another one for the same history; {cause}")
     if not equal(interrupted[1:], first[1:]):
         raise ValueError("the guide's action for a row depends on the reset of another row")
     if not equal(interrupted[0, middle:], fresh[0, : last - middle]):

@@ -129,12 +129,11 @@ class GymnasiumEnv(SeededRows):
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of row 0, [height, width, 3]; None if there are none."""
         try:
-            picture: NDArray[np.uint8] | None = self.rows[0].env.render() if self.shown else None
+            return self.rows[0].env.render() if self.shown else None
         except errors.DependencyNotInstalled as error:
             self.shown = False
             warnings.warn(f"no pictures of the env: {error}", stacklevel=2)
             return None
-        return picture
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all envs."""
@@ -242,9 +241,8 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
     try:
         return pkgutil.resolve_name(thing)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
-        ) from error
+        problem = f"controller {name}: {thing!r} cannot be imported ({error})"
+        raise ValueError(f"{problem}; write PACKAGE.MODULE:THING") from error
 
 
 def _controller(name: str, maker: Callable[..., Any], env: Env) -> tuple[Callable[[Any], Any], Callable[[], Any]]:

@@ -48,9 +48,8 @@ class ActionSpace:
     def of_parent(cls, transform: Transform, action_key: NestedKey) -> ActionSpace:
         """Return the action space of the env of a transform, RuntimeError outside one; slow, it rebuilds the env."""
         if transform.parent is None:
-            raise RuntimeError(
-                f"{type(transform).__name__} needs the action spec of an env: use it in a TransformedEnv"
-            )
+            name = type(transform).__name__
+            raise RuntimeError(f"{name} needs the action spec of an env: use it in a TransformedEnv")
         return cls(transform.parent.full_action_spec[action_key], transform.parent.batch_dims)
 
     def vectors(self, action: Tensor) -> Tensor:

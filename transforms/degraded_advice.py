@@ -70,10 +70,9 @@ class DegradedAdvice(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `KeyError` without advice."""
         if self.key not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"{type(self).__name__} changes {self.key!r}, but the env writes {sorted(map(str, observation_spec))}; "
-                "put it behind GuideActions"
-            )
+            problem = f"{type(self).__name__} changes {self.key!r}"
+            written = sorted(map(str, observation_spec))
+            raise KeyError(f"{problem}, but the env writes {written}; put it behind GuideActions")
         return observation_spec.update(self._memory_spec(observation_spec[self.key]))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -125,51 +124,60 @@ class PartialAdvice(DegradedAdvice):
         return advice.clamp(min=0) if self.side == "left" else advice.clamp(max=0)
 
 
-class NoisyAdvice(DegradedAdvice):
-    """Advice with Gaussian noise, independent at every step.
+class _DrawnAdvice(DegradedAdvice):
+    """Base of advice with random numbers, independent at every step; the seed is that of the draws."""
 
-    Args:
-        sigma: standard deviation in action units.
-        seed: seed of the noise.
-    """
+    def __init__(self, seed: int, key: NestedKey) -> None:
+        super().__init__(key)
+        self.rng = SeededGenerator(seed)
+
+    def _draw(self, sample: Callable[..., Tensor], advice: Tensor, after_reset: bool) -> Tensor:
+        """Draw one random number for each number of the advice.
+
+        A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
+        generator: later draws then do not depend on when other rows are reset.
+        """
+        state = self.rng.generator.get_state() if after_reset else None
+        draws = sample(2, *advice.shape, generator=self.rng.generator)
+        if state is not None:
+            self.rng.generator.set_state(state)
+        return draws[int(after_reset)].to(advice)
+
+    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+        """Return the degraded advice, [*batch, n_guides, A], in a step or after a partial reset."""
+        raise NotImplementedError
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        after_reset = tensordict.get("_reset", None) is not None
+        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+
+
+class NoisyAdvice(_DrawnAdvice):
+    """Advice with Gaussian noise; `sigma` is its standard deviation in action units."""
 
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
-        super().__init__(key)
+        super().__init__(seed, key)
         if not 0 <= sigma < math.inf:
             raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
-        self.sigma, self.rng = sigma, SeededGenerator(seed)
+        self.sigma = sigma
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return advice + noise."""
-        return torch.add(advice, _draw(torch.randn, self.rng, advice, after_reset), alpha=self.sigma)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+        return torch.add(advice, self._draw(torch.randn, advice, after_reset), alpha=self.sigma)
 
 
-class RandomAdvice(DegradedAdvice):
-    """Placebo: uniform random numbers in place of the advice, independent at every step.
-
-    Args:
-        low: lower bound in action units.
-        high: upper bound.
-        seed: seed of the draws.
-    """
+class RandomAdvice(_DrawnAdvice):
+    """Placebo: uniform random numbers from `low` to `high`, in action units, in place of the advice."""
 
     def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
-        super().__init__(key)
+        super().__init__(seed, key)
         if not -math.inf < low < high < math.inf:
             raise ValueError(f"low={low} must be less than high={high}, and both finite")
-        self.low, self.range, self.rng = low, high - low, SeededGenerator(seed)
+        self.low, self.range = low, high - low
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return random numbers."""
-        return self.low + self.range * _draw(torch.rand, self.rng, advice, after_reset)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+        return self.low + self.range * self._draw(torch.rand, advice, after_reset)
 
 
 class ShuffledAdvice(DegradedAdvice):
@@ -272,19 +280,6 @@ class RemovedAdvice(DegradedAdvice):
         action = self.action_space.vectors(tensordict[self.action_key])
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
-
-
-def _draw(sample: Callable[..., Tensor], rng: SeededGenerator, advice: Tensor, after_reset: bool) -> Tensor:
-    """Draw one random number for each number of the advice.
-
-    A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
-    generator: later draws then do not depend on when other rows are reset.
-    """
-    state = rng.generator.get_state() if after_reset else None
-    draws = sample(2, *advice.shape, generator=rng.generator)
-    if state is not None:
-        rng.generator.set_state(state)
-    return draws[int(after_reset)].to(advice)
 
 
 def _finite(name: str, value: float) -> float:

@@ -243,10 +243,8 @@ class GuideActions(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice for stored data; raises a `ValueError` if a guide depends on earlier steps."""
         if self.needs_past:
-            raise ValueError(
-                f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have; "
-                "use them in a TransformedEnv"
-            )
+            problem = f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have"
+            raise ValueError(f"{problem}; use them in a TransformedEnv")
         return self._call(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -327,9 +325,8 @@ class GuideActions(Transform):
 
         Two guides of one name with a memory, or one in an env that resets its agents one by one, are a `ValueError`.
         """
-        observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
-            self.parent.batch_size, len(self.guides.names)
-        )
+        spec = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
+        observation_spec[self.out_keys[0]] = spec
         return self._add_memory(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

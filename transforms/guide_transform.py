@@ -56,10 +56,9 @@ class GuideTransform(Transform):
     def learns(self) -> bool:
         """Whether the env is used for training; RuntimeError before `env.train()` or `env.eval()`."""
         if not self._mode_is_set:
-            raise RuntimeError(
-                f"{type(self).__name__} acts in training only: call env.train() or env.eval() first, on the env that "
-                "has the transform; for an env inside SerialEnv or ParallelEnv in the function that makes it"
-            )
+            remedy = "call env.train() or env.eval() first, on the env that has the transform"
+            inside = "for an env inside SerialEnv or ParallelEnv in the function that makes it"
+            raise RuntimeError(f"{type(self).__name__} acts in training only: {remedy}; {inside}")
         return self.training
 
     def current(self, value: float | Schedule) -> float:
@@ -69,17 +68,15 @@ class GuideTransform(Transform):
         if not self.learns:
             return value(1.0)
         if self.progress is None:
-            raise RuntimeError(
-                f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run: call "
-                "coil_rl.transforms.set_progress(env, FRACTION) before each batch; for SerialEnv or ParallelEnv put "
-                "the transform around it, not inside"
-            )
+            problem = f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run"
+            remedy = "call coil_rl.transforms.set_progress(env, FRACTION) before each batch"
+            around = "for SerialEnv or ParallelEnv put the transform around it, not inside"
+            raise RuntimeError(f"{problem}: {remedy}; {around}")
         return value(self.progress)
 
     def advice(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice of the guide, [*batch, A]."""
-        advice: Tensor = tensordict[self.advice_key]
-        return advice[..., self.guide, :]
+        return tensordict[self.advice_key][..., self.guide, :]
 
     @cached_property
     def action_space(self) -> ActionSpace:
@@ -91,10 +88,8 @@ class GuideTransform(Transform):
         spec = observation_spec.get(self.advice_key, None)
         if spec is None or self.guide >= spec.shape[-2]:
             found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
-            raise KeyError(
-                f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {found}; "
-                "put GuideActions with enough guides before it"
-            )
+            problem = f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {found}"
+            raise KeyError(f"{problem}; put GuideActions with enough guides before it")
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -97,9 +97,7 @@ class Imitation:
         self.group_key = group if group in available else None
         self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
         self.validate, self.seed, self.device = validate, seed, env.device
-        self.dataset: TensorDictBase | None = None
-        if dataset is not None:
-            self.dataset = self._load(Path(dataset), env)
+        self.dataset: TensorDictBase | None = None if dataset is None else self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
@@ -144,10 +142,9 @@ class Imitation:
         for key in keys:
             shape = dataset[key].shape[1:] if key in dataset.keys(True, True) else None
             if shape != expected[key].shape[1:]:
-                raise UserError(
-                    f"{file} is a data set of another env: {key} is {'missing' if shape is None else list(shape)}, "
-                    f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
-                )
+                fault = f"{key} is {'missing' if shape is None else list(shape)}"
+                remedy = f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
+                raise UserError(f"{file} is a data set of another env: {fault}, {remedy}")
         return dataset.select(*keys).to(env.device)
 
     def state_dict(self) -> dict[str, Any]:

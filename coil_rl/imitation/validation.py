@@ -40,9 +40,8 @@ def cross_validate(
         `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`: see `scores`.
     """
     if len(x) < MIN_SAMPLES:
-        raise UserError(
-            f"{len(x)} samples are too few to validate; use at least {MIN_SAMPLES}, or learner.validate=false"
-        )
+        remedy = f"use at least {MIN_SAMPLES}, or learner.validate=false"
+        raise UserError(f"{len(x)} samples are too few to validate; {remedy}")
     rows = np.arange(len(x))
     splits: dict[str, list[Split]] = {"random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]}
     if groups is not None:

@@ -39,9 +39,7 @@ class DQN(OffPolicy):
         action_gain: initial scale of the last weights; with 0 all action values are 0.
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic actions.
         double: whether the network, not the target network, selects the next action.
-        tau: step of the target network towards the network after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average.
-        options: as for `OffPolicy`.
+        tau, ratio, options: as for `OffPolicy`.
 
     Raises:
         ValueError: for a value out of range, an env with continuous actions, or as `OffPolicy`.
@@ -79,10 +77,8 @@ class DQN(OffPolicy):
             check_range(0, 1, epsilon=self.epsilon(progress))
         spec = env.action_spec
         if spec.dtype.is_floating_point:
-            raise ValueError(
-                "DQN needs discrete actions, but this env has continuous ones; "
-                "put the transform DiscreteActions around it: action=choices"
-            )
+            remedy = "put the transform DiscreteActions around it: action=choices"
+            raise ValueError(f"DQN needs discrete actions, but this env has continuous ones; {remedy}")
         if not isinstance(spec, (Categorical, OneHot)) or len(networks.action_shape(env)) != isinstance(spec, OneHot):
             raise ValueError("DQN needs one discrete action, but this env has several at once; use PPO")
         in_keys, network = list(map(nested_key, in_keys)), without_memory(network or Mlp(hidden, "relu"), "DQN")

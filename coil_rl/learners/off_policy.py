@@ -96,25 +96,21 @@ class OffPolicy(Stateful):
         check_range(0, LARGEST_SEED, seed=seed)
         for transform in env.modules():
             if isinstance(transform, GuideTransform) and callable(getattr(transform, transform.mdp_parameter, None)):
-                raise ValueError(
-                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run, so stored steps "
-                    "would no longer show the effect of an action; make it a number, or use a learner without replay, "
-                    "such as PPO"
-                )
+                problem = f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run"
+                effect = "so stored steps would no longer show the effect of an action"
+                remedy = "make it a number, or use a learner without replay, such as PPO"
+                raise ValueError(f"{problem}, {effect}; {remedy}")
         if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
-            raise ValueError(
-                f"{type(self).__name__} needs one entry action and one entry reward, but this env has "
-                f"{', '.join(map(str, keys))}; rename them by TorchRL's RenameTransform, or use PPO"
-            )
+            needed, has = "one entry action and one entry reward", ", ".join(map(str, keys))
+            remedy = "rename them by TorchRL's RenameTransform, or use PPO"
+            raise ValueError(f"{type(self).__name__} needs {needed}, but this env has {has}; {remedy}")
         self.normaliser = normaliser(env, in_keys, normalise)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
-            raise ValueError(
-                f"prior={prior} needs steps in which a guide acts in place of the agent, as with the transform "
-                "Takeover, by an action that the agent could choose; or take prior=0"
-            )
+            needed = "steps in which a guide acts in place of the agent, as with the transform Takeover"
+            raise ValueError(f"prior={prior} needs {needed}, by an action that the agent could choose; or take prior=0")
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [*in_keys, "action", *(unravel_key(("next", key)) for key in after)]
         self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else [*self.stored_keys]
@@ -223,8 +219,7 @@ class OffPolicy(Stateful):
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and other values, scalars."""
-        losses: TensorDictBase = self.loss(minibatch)
-        return losses
+        return self.loss(minibatch)
 
     def loss_weights(self, progress: float) -> dict[str, float]:
         """Return the weights of the losses in the sum that an update minimises."""

@@ -265,10 +265,9 @@ class PPO(Stateful):
         """Yield the minibatches of all passes over the rows, each pass in a random order."""
         size = len(rows) // self.minibatches
         if self.memory is not None and size < 1:
-            raise UserError(
-                f"minibatches={self.minibatches} are more than the {len(rows)} envs, but with a memory each needs all "
-                "steps of an env; take fewer minibatches or more envs"
-            )
+            problem = f"minibatches={self.minibatches} are more than the {len(rows)} envs"
+            needed = "with a memory each needs all steps of an env"
+            raise UserError(f"{problem}, but {needed}; take fewer minibatches or more envs")
         if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
             raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {rows.numel()} frames to each")
         for _ in range(self.epochs):
@@ -285,8 +284,7 @@ class PPO(Stateful):
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
-        losses: TensorDictBase = self.loss(minibatch)
-        return losses
+        return self.loss(minibatch)
 
     def masked_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch, those of the policy for the steps in which the agent acted only."""
@@ -371,8 +369,7 @@ class Advantages:
         return batch
 
     def _values(self, states: TensorDictBase) -> Tensor:
-        value: Tensor = self.critic(states.select(*self.critic.in_keys))["state_value"]
-        return value
+        return self.critic(states.select(*self.critic.in_keys))["state_value"]
 
 
 def standardise(advantage: Tensor) -> Tensor:

@@ -49,10 +49,8 @@ class SAC(OffPolicy):
         critic_layer_norm: whether the critics normalise their layers, which bounds the values of actions never tried.
         uncertainty: whether the policy writes that of the critics, see `Critics`, for `AdaptiveMixedAction`.
         auxiliary: additional losses of the policy.
-        tau: step of the target networks towards the critics after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average.
-        options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large `max_grad_norm`:
-            otherwise the gradients of the critics dominate those of the policy.
+        tau, ratio, options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large
+            `max_grad_norm`: otherwise the gradients of the critics dominate those of the policy.
 
     Raises:
         ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
@@ -88,10 +86,8 @@ class SAC(OffPolicy):
         check_range(0, above=True, action_scale=action_scale, temperature=temperature)
         spec = env.action_spec
         if not spec.dtype.is_floating_point:
-            raise ValueError(
-                "SAC needs continuous actions, but this env has discrete ones; "
-                "use action=continuous, or a learner for discrete actions, such as DQN"
-            )
+            remedy = "use action=continuous, or a learner for discrete actions, such as DQN"
+            raise ValueError(f"SAC needs continuous actions, but this env has discrete ones; {remedy}")
         in_keys, network = list(map(nested_key, in_keys)), without_memory(network or Mlp(hidden), "SAC")
         super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         self.action_scale, self.action_gain = action_scale, action_gain

@@ -215,8 +215,7 @@ def frames_until(frames: Sequence[float] | Array, returns: Sequence[float] | Arr
 def points(run: Rows, key: str) -> Array:
     """Return frames and values [P, 2] of the rows with a finite value, sorted by frames."""
     table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
-    curve: Array = table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
-    return curve
+    return table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
 
 
 def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:

@@ -118,11 +118,8 @@ class Table6(Result):
             about = {"policy": str(own.label), "seed": str(own.seed), "run": run.folder.name}
             if (weights := weights_file(run.folder)).is_file():  # a missing file is reported when the policy is loaded
                 about["policy_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
-            yield (
-                run.folder.name,
-                about,
-                partial(lambda run, own: load_policy_in_env(run, own, make_env()), run.folder, own),
-            )
+            make = partial(lambda folder, own: load_policy_in_env(folder, own, make_env()), run.folder, own)
+            yield run.folder.name, about, make
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:

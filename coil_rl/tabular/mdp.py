@@ -78,16 +78,12 @@ class MDP:
         count, choices = self.P.shape[:2]
         if array.shape == (count,) and array.dtype.kind in "iu":
             if wrong := [s for s in range(count) if not 0 <= array[s] < choices]:
-                raise ValueError(
-                    f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}; "
-                    f"actions are 0 to {choices - 1}"
-                )
+                problem = f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}"
+                raise ValueError(f"{problem}; actions are 0 to {choices - 1}")
             return np.eye(choices)[array]
         if array.shape != (count, choices):
-            raise ValueError(
-                f"A policy is [{count}] integers, an action a state, or [{count}, {choices}] probabilities; "
-                f"got {array.dtype} of the shape {array.shape}"
-            )
+            expected = f"[{count}] integers, an action a state, or [{count}, {choices}] probabilities"
+            raise ValueError(f"A policy is {expected}; got {array.dtype} of the shape {array.shape}")
         for s in range(count):
             if (array[s] < 0).any() or not np.isclose(array[s].sum(), 1):
                 raise ValueError(f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}")
@@ -100,9 +96,8 @@ class MDP:
             where = f"state {self.states[s]}, action {self.actions[a]}"
             if valid[s, a]:
                 raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
-            raise ValueError(
-                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where}); they sum to {total[s, a]:g}"
-            )
+            problem = f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where})"
+            raise ValueError(f"{problem}; they sum to {total[s, a]:g}")
 
 
 def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:

@@ -58,10 +58,8 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
-        raise UserError(
-            f"{error.filename or folder} cannot be written ({error.strerror}); make room, and continue with "
-            f"coil-train resume={folder}"
-        ) from error
+        problem = f"{error.filename or folder} cannot be written ({error.strerror})"
+        raise UserError(f"{problem}; make room, and continue with coil-train resume={folder}") from error
     return report_outcome(folder)
 
 
@@ -162,10 +160,8 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     if getattr(learner, "anchor", None) is None:
         return None
     if SELECTION not in config.evaluation.curve.cases:
-        raise UserError(
-            f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases in which the brake drives; give it"
-        )
-
+        needed = f"evaluation.curve.cases.{SELECTION}, cases in which the brake drives"
+        raise UserError(f"learner.anchor needs {needed}; give it")
     look = config.copy()
     look.evaluation.curve.num_envs = learner.anchor.cases
 

@@ -188,7 +188,9 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
             elif type(record) is records.Schema:
                 schemas[record.id] = record
             elif type(record) is records.Channel:
-                channel = _channel(record, schemas)
+                kind = schemas.get(record.schema_id) or records.Schema(id=0, name="", encoding="", data=b"")
+                about = record.message_encoding, kind.encoding, kind.data, tuple(record.metadata.items())
+                channel = Channel(record.topic, kind.name, *about)
                 contents.channels.append(channel)
                 if topics is None or channel.topic in topics:
                     selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
@@ -230,10 +232,9 @@ def _records(file: Path, stream: BinaryIO, size: int, complete: bool, contents: 
             whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
             if whole or not (places or following):
                 reason = " ".join(str(error).split()) or type(error).__name__
-                raise RecordingError(
-                    f"{file} is damaged before byte {end} ({reason}); copy it again from where it was "
-                    "recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
-                ) from None
+                save = "save what is left with: mcap recover FILE -o OTHER.mcap"
+                remedy = f"copy it again from where it was recorded, or {save}"
+                raise RecordingError(f"{file} is damaged before byte {end} ({reason}); {remedy}.") from None
             contents.damage.append(f"byte {start}")
             if not following:
                 return
@@ -251,13 +252,6 @@ def _summary(stream: BinaryIO) -> Summary:
         return SeekingReader(stream).get_summary() or Summary()
     except Exception:  # its bytes may be anything
         return Summary()
-
-
-def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:
-    metadata, schema = tuple(record.metadata.items()), schemas.get(record.schema_id)
-    if schema is None:
-        return Channel(record.topic, "", record.message_encoding, "", b"", metadata)
-    return Channel(record.topic, schema.name, record.message_encoding, schema.encoding, schema.data, metadata)
 
 
 def _check_format(file: Path) -> tuple[int, bool]:

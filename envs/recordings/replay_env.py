@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -78,12 +79,8 @@ class McapReplayEnv(EnvBase):
         sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
-        self.recordings = [
-            source
-            if isinstance(source, Recording)
-            else read_recording(source, scan, odometry, command, frame=frame, strict=strict)
-            for source in sources
-        ]
+        read = partial(read_recording, scan=scan, odometry=odometry, command=command, frame=frame, strict=strict)
+        self.recordings = [source if isinstance(source, Recording) else read(source) for source in sources]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
         self.kept_cones, self.smooth, self.max_steering = kept_cones, smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
@@ -187,10 +184,9 @@ def _perceive(
         cones, count = map(np.asarray, perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]))
         expected = (len(rows), 2, 2)
         if cones.ndim != 4 or cones.shape[:2] + cones.shape[3:] != expected or count.shape != expected[:2]:
-            raise ValueError(
-                f"perception returned cones {cones.shape} and counts {count.shape} for {len(rows)} scans; it must "
-                f"return [{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
-            )
+            given = f"cones {cones.shape} and counts {count.shape} for {len(rows)} scans"
+            needed = f"[{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
+            raise ValueError(f"perception returned {given}; it must return {needed}")
         nearest = min(kept_cones, cones.shape[2])
         all_cones[rows, :, :nearest], all_counts[rows] = cones[:, :, :nearest], np.minimum(count, nearest)
     return all_cones, all_counts

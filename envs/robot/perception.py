@@ -188,11 +188,7 @@ class BoundaryMemory(nn.Module):
     """
 
     def __init__(
-        self,
-        batch: int,
-        spline: Literal["cubic", "quadratic"] = "cubic",
-        smoothing: float = 0.1,
-        sight: float = SIGHT,
+        self, batch: int, spline: Literal["cubic", "quadratic"] = "cubic", smoothing: float = 0.1, sight: float = SIGHT
     ) -> None:
         super().__init__()
         self.fit = spline_fit(spline, smoothing)
