@@ -38,7 +38,8 @@ class GymnasiumEnv(SeededRows):
     MultiDiscrete [B, n], and 0 or 1 for MultiBinary.
 
     A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state goes on to the bit if
-    the env is deterministic, see `SeededRows`.
+    the env is deterministic, see `SeededRows`. `rate` is the steps per second at which the env is drawn, NaN if it does
+    not say.
 
     Args:
         id: registered name; "MODULE:NAME" imports the module first.
@@ -60,9 +61,6 @@ class GymnasiumEnv(SeededRows):
         render: whether `render` gives pictures.
         device: of all tensors.
         dtype: of all floating-point tensors.
-
-    Attributes:
-        rate: steps per second at which the env is drawn, NaN if it does not say.
 
     Example:
         >>> from coil_rl.envs import GymnasiumEnv

@@ -34,9 +34,8 @@ class TrackError(ValueError):
 class Track:
     """A closed track between two rings of cones.
 
-    Raises:
-        TrackError: for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries that
-            cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
+    A `TrackError` is raised for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries
+    that cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
 
     Example:
         >>> import numpy as np

@@ -6,7 +6,6 @@ Biased, scaled, partial, delayed and noisy advice degrade a guide. Random, shuff
 
 import math
 from collections.abc import Callable
-from functools import cached_property
 from typing import Literal
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
@@ -184,11 +183,8 @@ class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
     At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
-    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`.
-
-    Args:
-        seed: seed of the draws.
-        memory_key: entry for the original advice, [*batch, 1, n_guides, A].
+    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`. The seed is that of the
+    draws, and `memory_key` the entry for the original advice, [*batch, 1, n_guides, A].
     """
 
     def __init__(
@@ -225,11 +221,9 @@ class ShuffledAdvice(DegradedAdvice):
 
 
 class DelayedAdvice(DegradedAdvice):
-    """Advice of an earlier step; at first the first advice of the episode.
+    """Advice of an earlier step, by a delay of `steps`, 0 for none; at first the first advice of the episode.
 
-    Args:
-        steps: delay; 0 for none.
-        memory_key: entry for the advice of the last `steps` steps, [*batch, steps, n_guides, A], oldest first.
+    `memory_key` is the entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest first.
     """
 
     needs_past = True
@@ -255,7 +249,7 @@ class DelayedAdvice(DegradedAdvice):
         return next_tensordict.set(self.key, memory[..., 0, :, :])
 
 
-class RemovedAdvice(DegradedAdvice):
+class RemovedAdvice(DegradedAdvice, ActionTransform):
     """Placebo: the agent's previous action in place of the advice; zeros at the start of an episode.
 
     `action_key` is the entry of the action; a discrete action becomes one-hot.
@@ -266,11 +260,6 @@ class RemovedAdvice(DegradedAdvice):
     def __init__(self, key: NestedKey = "guide_action", action_key: NestedKey = "action") -> None:
         super().__init__(key)
         self.action_key = nested_key(action_key)
-
-    @cached_property
-    def action_space(self) -> ActionSpace:
-        """Action space of the env; RuntimeError outside an env."""
-        return ActionSpace.of_parent(self, self.action_key)
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return zeros, for the first step."""

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionTransform, nested_key
 
 Schedule = Callable[[float], float]
 
 
-class GuideTransform(Transform):
+class GuideTransform(ActionTransform):
     """Base class of transforms that use the advice observed by the agent; place them after `GuideActions`.
 
     Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a schedule returns its
-    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules.
-
-    Args:
-        guide: row of the advice, [*batch, n_guides, A].
-        action_key: entry of the action.
-        advice_key: entry of the advice.
+    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules. `guide`
+    is the row of the advice, [*batch, n_guides, A]; the keys are the entries of action and advice.
     """
 
     written: tuple[str, ...] = ()  # entries that the transform adds
@@ -77,11 +72,6 @@ class GuideTransform(Transform):
     def advice(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice of the guide, [*batch, A]."""
         return tensordict[self.advice_key][..., self.guide, :]
-
-    @cached_property
-    def action_space(self) -> ActionSpace:
-        """Action space of the env; RuntimeError outside an env."""
-        return ActionSpace.of_parent(self, self.action_key)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Check that the env writes the advice; raises a `KeyError` without this row of advice."""

@@ -28,6 +28,9 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 class Imitation:
     """The imitation learner.
 
+    An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`. A data set that is
+    missing, damaged or of another env is a `UserError`.
+
     Args:
         env: the env, for its specs.
         in_keys: entries that the policy observes.
@@ -44,11 +47,6 @@ class Imitation:
         policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
         keys: entries that a batch must have.
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
-
-    Raises:
-        KeyError: if the env has no such advice or observation.
-        ValueError: if there is no such guide.
-        UserError: if the file is missing or damaged, or a data set of another env.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression

@@ -37,11 +37,8 @@ FIRST = 0.9  # probability of the advised one of several actions at weight 1
 class AnchoredHead(nn.Module):
     """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
 
-    Args:
-        head: gives the mean and the standard deviation, or the logits.
-        pull: turns advice [*batch, n_guides, A] into means or logits [*batch, n_guides, *event].
-        guides: number of guides.
-        device: of the weights.
+    `head` gives the mean and the standard deviation, or the logits. `pull` turns advice [*batch, n_guides, A] into
+    means or logits [*batch, n_guides, *event].
     """
 
     weight: Tensor
@@ -88,10 +85,9 @@ def pull_to_number(advice: Tensor, bounds: tuple[Tensor, Tensor] | None = None) 
 
 
 def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
-    """Return the pull to advised choices.
+    """Return the pull to advised choices, which are one-hot for each choice, one beside the other.
 
-    Args:
-        valid: [*event, n], whether a choice has an option; advice is one-hot for each choice, one beside the other.
+    `valid` is [*event, n], whether a choice has an option.
     """
     options = valid.sum(-1, keepdim=True).clamp_min(2)
     gain = (math.log(FIRST / (1 - FIRST)) + (options - 1).log()).expand(valid.shape).flatten()
@@ -191,8 +187,7 @@ class Anchor(Stateful):
     def set_noise(self, progress: float) -> dict[str, float]:
         """Set the standard deviation of an anchored policy that has one of its own.
 
-        Returns:
-            The metrics `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
+        The metrics are `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
         """
         scale: Tensor | None = getattr(self.head.head, "log_scale", None)
         if scale is not None and self.holds:
@@ -209,11 +204,9 @@ class Anchor(Stateful):
         return max(self.weight - self.margin, 0.0)
 
     def begin(self, look: Look, random: Tensor) -> None:
-        """Hold the best guide or opposite, or let go.
+        """Hold the best guide or opposite, or let go, after a look with the weights of `starts`.
 
-        Args:
-            look: with the weights of `starts`.
-            random: returns of random actions, [C].
+        `random` are returns of random actions, [C].
         """
         guides = len(self.head.weight)
         best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)

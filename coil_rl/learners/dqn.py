@@ -29,7 +29,8 @@ from coil_rl.transforms.action_space import nested_key
 class DQN(OffPolicy):
     """The DQN learner.
 
-    COIL is DQN with `guide_action` among `in_keys`; the advice is one-hot.
+    COIL is DQN with `guide_action` among `in_keys`; the advice is one-hot. A value out of range, an env with continuous
+    actions, and what `OffPolicy` refuses are a `ValueError`.
 
     Args:
         env: the env, with discrete actions.
@@ -40,9 +41,6 @@ class DQN(OffPolicy):
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic actions.
         double: whether the network, not the target network, selects the next action.
         tau, ratio, options: as for `OffPolicy`.
-
-    Raises:
-        ValueError: for a value out of range, an env with continuous actions, or as `OffPolicy`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -98,9 +96,8 @@ class DQN(OffPolicy):
             valued = networks.FastTensorDictModule(bonus, [self.anchor.advice_key, "action_value"], ["action_value"])
         self.policy = TensorDictSequential(*before, valued, chosen, self.explorer)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless rewards are tiny.
-        self.set_loss(
-            DQNLoss(self.network, action_space=single, double_dqn=double, delay_value=True, loss_function="l2")
-        )
+        options = {"double_dqn": double, "delay_value": True, "loss_function": "l2"}
+        self.set_loss(DQNLoss(self.network, action_space=single, **options))
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.

@@ -137,6 +137,8 @@ class PhaseSchedule:
 class DynamicCoil(PPO):
     """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
 
+    A value out of range, a guide without parameters, or guides that share parameters are a `ValueError`.
+
     Args:
         env, ppo: as for `PPO`; actions must be continuous.
         in_keys: entries that agent and critic observe; the agent also observes the advice.
@@ -145,9 +147,6 @@ class DynamicCoil(PPO):
         guide_learning_rate: of the guides, a number or a schedule.
         shrink: factor on the learning rate from each phase to the next of its kind.
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
-
-    Raises:
-        ValueError: for a value out of range, a guide without parameters, or guides that share parameters.
     """
 
     kind = "guides"

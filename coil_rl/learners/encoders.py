@@ -87,15 +87,12 @@ class ReadImage(ReadEntry):
 
 
 class ConcatObservations(nn.Module):
-    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions.
+    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions; `width` is its length.
 
     Args:
         env, in_keys: as for `entry_specs`.
         shapes: shapes of entries that the env does not write, without the batch dimensions.
         network: a `Cnn` reads entries of three dimensions; otherwise they are flattened like others.
-
-    Attributes:
-        width: D, length of the concatenated vector.
     """
 
     def __init__(
@@ -121,7 +118,7 @@ class ConcatObservations(nn.Module):
             raise ValueError(f"a convolutional network needs {needed}, but there is none; use network=mlp")
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Concatenate inputs [*batch, ...] to [*batch, D]."""
+        """Concatenate inputs [*batch, ...] to [*batch, width]."""
         flat = [entry(x) for entry, x in zip(self.entries, inputs, strict=True)]
         return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 

@@ -67,8 +67,7 @@ class GradientStep(Stateful):
     def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`.
 
-        Raises:
-            UserError: if `compile` is true and there is no C++ compiler.
+        If `compile` is true and there is no C++ compiler, that is a `UserError`.
         """
         self.steps += 1
         if self.compile is True:

@@ -38,12 +38,12 @@ class KickstartLoss:
     scale: float = 0.2  # standard deviation of the guide for the divergence, before squashing
     guide: int = 0  # index of the guide in the advice
     advice_key: NestedKey = "guide_action"  # entry with the advice, [N, n_guides, A]
-    critics: Critics | None = field(default=None, init=False)  # of the learner's policy, if the learner has such
 
     def __post_init__(self) -> None:
         check_choice(("likelihood", "divergence"), kind=self.kind)
         check_range(0, above=True, scale=self.scale)
         self.coefficient_at = schedule(self.coefficient)
+        self.critics: Critics | None = None  # of the learner's policy, if the learner has such
 
     @property
     def keys(self) -> list[NestedKey]:

@@ -38,10 +38,7 @@ DEFAULT = Mlp()
 class GlobalScaleHead(nn.Module):
     """Normal distribution with a mean from a network and a standard deviation that is the same in every state.
 
-    Args:
-        network: its outputs are the numbers of an action.
-        event: shape of an action.
-        scale: initial standard deviation.
+    The network's outputs are the numbers of an action, of shape `event`; `scale` is the initial standard deviation.
     """
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
@@ -72,10 +69,8 @@ class GaussianHead(nn.Module):
 class ChoicesHead(nn.Module):
     """Logits of several choices at once from a network, padded with minus infinity to the longest choice.
 
-    Args:
-        network: its outputs are the logits of all choices, each of as many as the longest one has.
-        event: shape of an action, one index for each choice.
-        options: number of options of each choice, of this shape.
+    The network gives logits for all choices, each of as many as the longest one has. An action has the shape `event`,
+    one index for each choice; so have the `options`, their numbers.
     """
 
     valid: Tensor
@@ -191,9 +186,8 @@ def actor(
     `ConcatObservations`. A network with a memory also writes its next state, see `Gru`. With an `anchor` the policy
     starts as its guide.
 
-    Raises:
-        ValueError: for an action of another kind, or a network with a memory that the env does not carry.
-        KeyError: if the env has no such entry, or no advice for an anchor.
+    An action of another kind, or a network with a memory that the env does not carry, is a `ValueError`; an entry that
+    the env does not have, such as the advice for an anchor, a `KeyError`.
     """
     spec, key, event = action_spec(env), env.action_key, action_shape(env)
     keys = in_keys if normaliser is None else normaliser.reads(in_keys)

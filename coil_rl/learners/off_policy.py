@@ -30,7 +30,8 @@ class OffPolicy(Stateful):
     the agent's own, since the sum is a part of the env.
 
     A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of (`minimised`) and
-    the values to report (`reported`).
+    the values to report (`reported`). A value out of range is a `ValueError`, and so is an env in which the effect or
+    the reward of an action changes over the run.
 
     Args:
         env: the env, for its device and transforms.
@@ -52,14 +53,10 @@ class OffPolicy(Stateful):
         seed: of the samples.
 
     Attributes:
-        kind, compilable: as for `PPO`.
         keys: entries that a batch must have.
-
-    Raises:
-        ValueError: for a value out of range, or if the effect or the reward of an action changes over the run.
     """
 
-    kind: ClassVar[str] = "agent"
+    kind: ClassVar[str] = "agent"  # as for `PPO`
     compilable: ClassVar[bool] = True
     parts: ClassVar[tuple[str, ...]] = ("loss", "gradient", "generator", "pending_updates", "normaliser", "anchor")
     minimised: tuple[str, ...]
@@ -137,16 +134,9 @@ class OffPolicy(Stateful):
         self.loss.make_value_estimator(gamma=self.gamma)
         self.target = SoftUpdate(self.loss, tau=self.tau)
         self.gradient = GradientStep(
-            self.losses,
-            [list(self.loss.parameters())],
-            [self.loss],
-            lambda progress: [self.learning_rate(progress)],
-            eps=1e-8,
-            max_grad_norm=self.max_grad_norm,
-            after=self.target.step,
-            compile=self.compile,
-            compilable=self.compilable,
-        )
+            self.losses, [list(loss.parameters())], [loss], lambda progress: [self.learning_rate(progress)], eps=1e-8,
+            max_grad_norm=self.max_grad_norm, after=self.target.step, compile=self.compile, compilable=self.compilable,
+        )  # fmt: skip
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.

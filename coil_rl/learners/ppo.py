@@ -44,6 +44,9 @@ class PPO(Stateful):
     A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
     anew from the state that was stored in the first step of each row; then their steps are a minibatch as any other.
 
+    A value out of range, or an action that no policy can choose, is a `ValueError`; an entry that the env does not have
+    a `KeyError`.
+
     Args:
         env: the env, for its specs.
         in_keys: entries that policy and critic observe.
@@ -69,18 +72,10 @@ class PPO(Stateful):
         seed: of the order of minibatches.
 
     Attributes:
-        kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions)
-            or "guides" (guides besides an agent).
-        with_memory: whether the learner can train a network with a memory.
-        compilable: whether the update can be compiled.
         policy: writes `action` and `action_log_prob`.
         head: the part of the policy after its memory; all of it without one.
         critic: writes `state_value`.
         keys: entries that a batch must have.
-
-    Raises:
-        ValueError: for a value out of range, or an action that no policy can choose.
-        KeyError: if the env has no such entry.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -90,9 +85,11 @@ class PPO(Stateful):
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
+    # What the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions) or
+    # "guides" (guides besides an agent).
     kind: ClassVar[str] = "agent"
-    with_memory: ClassVar[bool] = True
-    compilable: ClassVar[bool] = True
+    with_memory: ClassVar[bool] = True  # whether the learner can train a network with a memory
+    compilable: ClassVar[bool] = True  # whether the update can be compiled
     parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "generator", "noise", "anchor")
 
     def __init__(
@@ -130,7 +127,7 @@ class PPO(Stateful):
         if noise and anchor:
             raise ValueError("an anchor has its own schedule of the noise; leave out noise, or the anchor")
         self.epochs, self.minibatches = epochs, minibatches
-        self.critic_coefficient, self.auxiliary, self.noise, self.anchor = critic, list(auxiliary), noise, anchor
+        self.auxiliary, self.noise, self.anchor = list(auxiliary), noise, anchor
         in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
         if not self.with_memory:
@@ -143,18 +140,16 @@ class PPO(Stateful):
         if noise:
             noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss = self.build_loss(clip)
+        self.loss = self.build_loss(
+            clip, entropy_bonus=self.entropy(0) > 0, entropy_coeff=self.entropy(0), critic_coeff=critic,
+            loss_critic_type="l2", functional=False,
+        )  # fmt: skip
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.gradient = GradientStep(
-            self.all_losses,
-            self.parameter_groups(),
-            [self.policy, self.critic, self.loss],
-            self.learning_rates,
-            eps=1e-5,
-            max_grad_norm=max_grad_norm,
-            compile=compile,
+            self.all_losses, self.parameter_groups(), [self.policy, self.critic, self.loss], self.learning_rates,
+            eps=1e-5, max_grad_norm=max_grad_norm, compile=compile,
             compilable=self.compilable and self.memory is None and not self.guide_may_act,
-        )
+        )  # fmt: skip
         self.generator = torch.Generator().manual_seed(seed)
         self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
         self.reward_key = unravel_key(("next", env.reward_key))
@@ -174,19 +169,9 @@ class PPO(Stateful):
         policy = networks.actor(env, in_keys, network, normaliser=self.normaliser, **options)
         return policy, networks.critic(env, in_keys, network, self.normaliser)
 
-    def build_loss(self, clip: float) -> LossModule:
-        """Return TorchRL's loss of policy and critic."""
-        return ClippedLoss(
-            self.head,
-            self.critic,
-            clip_epsilon=clip,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=self.critic_coefficient,
-            loss_critic_type="l2",
-            normalize_advantage=True,
-            functional=False,
-        )
+    def build_loss(self, clip: float, **options: Any) -> LossModule:
+        """Return TorchRL's loss of policy and critic; `options` are those of any such loss."""
+        return ClippedLoss(self.head, self.critic, clip_epsilon=clip, normalize_advantage=True, **options)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
@@ -234,10 +219,8 @@ class PPO(Stateful):
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Do what follows an update: learn the statistics of the observations, and apply the noise schedule, if any.
 
-        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
-
-        Returns:
-            With a schedule the metric `noise`, the policy's standard deviation.
+        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones. With
+        a schedule the result is the metric `noise`, the policy's standard deviation.
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)

@@ -32,7 +32,8 @@ from coil_rl.transforms.action_space import nested_key
 class SAC(OffPolicy):
     """The SAC learner.
 
-    COIL is SAC with `guide_action` among `in_keys`.
+    COIL is SAC with `guide_action` among `in_keys`. A value out of range, an env with discrete actions, and what
+    `OffPolicy` refuses are a `ValueError`.
 
     Args:
         env: the env, with continuous actions.
@@ -51,9 +52,6 @@ class SAC(OffPolicy):
         auxiliary: additional losses of the policy.
         tau, ratio, options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large
             `max_grad_norm`: otherwise the gradients of the critics dominate those of the policy.
-
-    Raises:
-        ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
     """
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -95,12 +93,10 @@ class SAC(OffPolicy):
         self.actor = self.build_actor(env, in_keys, network)
         before = [] if self.normaliser is None else [self.normaliser]
         self.policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
-        criticising = replace(network, layer_norm=True) if critic_layer_norm else network
+        architectures = [replace(network, layer_norm=True) if critic_layer_norm else network] * critics
         arguments = {
             "actor_network": self.actor,
-            "qvalue_network": [
-                networks.action_critic(env, in_keys, criticising, self.normaliser) for _ in range(critics)
-            ],
+            "qvalue_network": [networks.action_critic(env, in_keys, each, self.normaliser) for each in architectures],
             "num_qvalue_nets": critics,
             "alpha_init": temperature,
             "target_entropy": float(-networks.action_shape(env).numel() if target_entropy is None else target_entropy),
@@ -162,11 +158,8 @@ class Critics(TensorDictModuleBase):
     """The critics of a loss of TorchRL, all at once; they read entries that have been normalised already.
 
     As a module it writes their uncertainty: the standard deviation of the values of an action, in the unit of the
-    return, as `("next", "uncertainty")` [*B, 1].
-
-    Args:
-        loss: it holds the critics.
-        weights: of the critics, those of the target networks perhaps; None: those that learn.
+    return, as `("next", "uncertainty")` [*B, 1]. The `weights` are perhaps those of the target networks; None: those
+    that learn.
     """
 
     def __init__(self, loss: SACLoss | REDQLoss, weights: TensorDictBase | None = None) -> None:

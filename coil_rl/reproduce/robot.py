@@ -37,11 +37,8 @@ class Table6(Result):
 
     A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide of
     the first run and the agents of all runs drive the simulated robot and are recorded next to the page; existing
-    recordings are reused.
-
-    Raises:
-        UserError: if there are no recordings, runs or experiments.
-        RecordingError: for an unusable recording.
+    recordings are reused. No recordings, runs or experiments at all are a `UserError`, an unusable recording is a
+    `RecordingError`.
     """
 
     experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings and runs

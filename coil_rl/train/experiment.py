@@ -33,15 +33,10 @@ REMEDY = "put the whole file back, or train again in another folder"  # for a da
 
 
 class Learner(Protocol):
-    """Update of a policy from batches.
+    """Update of a policy from batches."""
 
-    Attributes:
-        kind: "agent" (learns from rewards), "imitation" (from a guide's actions) or "guides" (trains guides too).
-        policy: the policy that collects the batches.
-    """
-
-    kind: ClassVar[str]
-    policy: TensorDictModuleBase
+    kind: ClassVar[str]  # "agent" (learns from rewards), "imitation" (from a guide's actions) or "guides" (trains them)
+    policy: TensorDictModuleBase  # collects the batches
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Learn from a batch [B, T] and return metrics."""
@@ -184,7 +179,9 @@ class Experiment:
         learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
         self.updates += 1
         with self._resume_hint():
-            check_losses(learned, self.updates)
+            for name, value in learned.items():
+                if not math.isfinite(value):
+                    raise UserError(f"{name} is {value} in update {self.updates}")
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
     def _probe(self, updates: int, row: Mapping[str, float]) -> dict[str, float]:
@@ -253,13 +250,6 @@ def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     watched = (tuple(key) for group in watch.values() for key in group.values())
     task = [("task_reward",)] if "task_reward" in env.observation_spec else []
     return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)]
-
-
-def check_losses(values: Mapping[str, float], update: int) -> None:
-    """Raise a `UserError` if a metric of an update is NaN or infinite."""
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise UserError(f"{name} is {value} in update {update}")
 
 
 def check_parameters(state: Any, update: int, name: str = "learner") -> None:

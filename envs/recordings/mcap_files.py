@@ -21,14 +21,13 @@ MAGIC = b"\x89MCAP0\r\n"
 # If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
 CHUNK = 128 * 1024  # bytes
 
+CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
+
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
     b"version https://git-lfs": ("a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
     b"#ROSBAG V": ("a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
-    b"SQLite format 3\0": (
-        "the SQLite storage of a ROS 2 bag",
-        "convert its folder: rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap",
-    ),
+    b"SQLite format 3\0": ("the SQLite storage of a ROS 2 bag", f"convert its folder: {CONVERT}"),
     b"\x28\xb5\x2f\xfd": ("compressed as a whole with zstd", "unpack it: zstd -d FILE -o OTHER.mcap"),
     b"\x1f\x8b": ("compressed as a whole with gzip", "unpack it first"),
     b"\x04\x22\x4d\x18": ("compressed as a whole with lz4", "unpack it first"),
@@ -288,8 +287,7 @@ def _files(path: Path) -> Iterator[Path]:
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
     listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
     if storage and storage[1] != "mcap":
-        convert = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
-        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {convert}.")
+        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}.")
     if not listed:
         raise RecordingError(f"{metadata} lists no files; {reindex}")
     for line in listed[1].splitlines():

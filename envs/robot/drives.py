@@ -124,8 +124,7 @@ def record_labelling_drives(
 ) -> dict[Sides, list[str]]:
     """Record drives to train a cone classifier, `pairs` past each side, and `both` drives past both sides to test it.
 
-    Returns:
-        The paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap` and so on. `tick` is called after each drive.
+    The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is called after each drive.
     """
     training, test = range(pairs), range(TEST_SEED, TEST_SEED + both)
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}
