@@ -152,7 +152,7 @@ class _DrawnAdvice(DegradedAdvice):
 
 
 class NoisyAdvice(_DrawnAdvice):
-    """Advice with Gaussian noise; `sigma` is its standard deviation in action units."""
+    """Advice with Gaussian noise, independent at every step; `sigma` is its standard deviation in action units."""
 
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
         super().__init__(seed, key)
@@ -166,7 +166,7 @@ class NoisyAdvice(_DrawnAdvice):
 
 
 class RandomAdvice(_DrawnAdvice):
-    """Placebo: uniform random numbers from `low` to `high`, in action units, in place of the advice."""
+    """Placebo: uniform random numbers from `low` to `high` in action units, drawn at every step, instead of advice."""
 
     def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
         super().__init__(seed, key)

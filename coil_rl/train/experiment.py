@@ -35,7 +35,7 @@ REMEDY = "put the whole file back, or train again in another folder"  # for a da
 class Learner(Protocol):
     """Update of a policy from batches."""
 
-    kind: ClassVar[str]  # "agent" (learns from rewards), "imitation" (from a guide's actions) or "guides" (trains them)
+    kind: ClassVar[str]  # "agent", "imitation" or "guides", as for `PPO`
     policy: TensorDictModuleBase  # collects the batches
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
