@@ -93,9 +93,8 @@ def _unknown_file(error: MissingConfigException) -> str:
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
     key, parent = str(error.full_key or error.key), error.parent_node
-    known = (
-        [str(name) for name in parent if name not in ("hydra", "defaults")] if isinstance(parent, DictConfig) else []
-    )
+    names = parent if isinstance(parent, DictConfig) else []
+    known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
     add = f"; +{key}=VALUE adds it" if parent is not None and OmegaConf.get_type(parent) is dict else ""
     return f"there is no key {key}; {node} has {', '.join(known)}{add}{did_you_mean(str(error.key), known)}"

@@ -18,7 +18,11 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     place, or a file in that of a parent, is a `UserError`.
     """
     path = Path(path)
-    _make_folder(path.parent)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        obstacle = next((place for place in path.parents if place.is_file()), path.parent)
+        raise UserError(f"{obstacle} is a file, but a folder is to be made there; remove it") from error
     unfinished = temporary(path)
     try:
         yield unfinished
@@ -56,14 +60,6 @@ def folder_to_disk(folder: Path) -> None:
     """Wait until the entries of a folder are on the disk."""
     if os.name != "nt":  # Windows cannot open a folder
         _to_disk(folder)
-
-
-def _make_folder(path: Path) -> None:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        obstacle = next((place for place in (path, *path.parents) if place.is_file()), path)
-        raise UserError(f"{obstacle} is a file, but a folder is to be made there; remove it") from error
 
 
 def _to_disk(path: Path) -> None:

@@ -1,7 +1,6 @@
 """Contract checks of envs, guides and transforms, for tests of your own parts."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -23,7 +22,14 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
     set_progress(env.train(), 0.0)
     check_env_specs(env)
     state = env.state_dict() if isinstance(env, TransformedEnv) else None  # of the transforms, which have no seed
-    rollout, again = (_seeded_rollout(env, steps, state) for _ in range(2))
+    rollouts = []
+    for _ in range(2):
+        if state is not None:
+            env.load_state_dict(state)
+        env.set_seed(0)
+        torch.manual_seed(0)  # of the actions
+        rollouts.append(env.rollout(steps, break_when_any_done=False))
+    rollout, again = rollouts
     for key, value in rollout.items(True, True):
         if value.is_floating_point() and not value.isfinite().all():
             raise ValueError(f"{key} holds a number that is not finite")
@@ -51,27 +57,18 @@ def _check_partial_reset(env: EnvBase) -> None:
         mask[0] = True
         return env.reset(present.set("_reset", mask))
 
-    plain, seeded, after_reset = (_second_step(env, change) for change in (lambda present: present, seed, reset))
+    def second_step(change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
+        env.set_seed(0)
+        torch.manual_seed(0)
+        present = change(step_mdp(env.step(env.rand_action(env.reset()))))
+        torch.manual_seed(0)  # of the action
+        return env.step(env.rand_action(present))["next"]
+
+    plain, seeded, after_reset = (second_step(change) for change in (lambda present: present, seed, reset))
     if (plain == seeded).all():
         for key, value in plain.items(True, True):
             if not torch.equal(value[1:], after_reset[key][1:]):
                 raise ValueError(f"resetting row 0 changed {key} of other rows in the next step")
-
-
-def _second_step(env: EnvBase, change: Callable[[TensorDictBase], TensorDictBase]) -> TensorDictBase:
-    env.set_seed(0)
-    torch.manual_seed(0)
-    present = change(step_mdp(env.step(env.rand_action(env.reset()))))
-    torch.manual_seed(0)  # of the action
-    return env.step(env.rand_action(present))["next"]
-
-
-def _seeded_rollout(env: EnvBase, steps: int, state: Any) -> TensorDictBase:
-    if state is not None:
-        env.load_state_dict(state)
-    env.set_seed(0)
-    torch.manual_seed(0)  # of the actions
-    return env.rollout(steps, break_when_any_done=False)
 
 
 def check_guide(
@@ -86,14 +83,14 @@ def check_guide(
     With an env the guide is asked through `GuideActions`, and the history is checked too: the same history gives the
     same action, an episode begins without the memory of the one before, and the reset of a row leaves the others alone.
 
+    A `ValueError` states the first property that does not hold.
+
     Args:
         guide: without random numbers.
         data: [B], written by an env; or the env, which a guide with a memory needs.
         action_key: of the action.
         tolerance: allowed effect of other rows; a network rounds differently in another batch.
         steps: number of steps in the env, of random actions.
-
-    A `ValueError` states the first property that does not hold.
     """
     action_key = nested_key(action_key)
     if action_key not in guide.out_keys:
@@ -148,9 +145,8 @@ def _check_history(
 ) -> None:
     with torch.no_grad():
         data = [env.rollout(steps, break_when_any_done=False) for _ in range(1 if env.batch_size else 2)]
-    recorded: TensorDictBase = (
-        data[0] if env.batch_size else TensorDict.stack([one[: min(map(len, data))] for one in data])
-    )
+    shortest = min(map(len, data))
+    recorded: TensorDictBase = data[0] if env.batch_size else TensorDict.stack([one[:shortest] for one in data])
     if len(recorded.batch_size) != 2 or len(recorded) < 2:
         raise ValueError(f"check_guide needs an env with one batch dimension of at least 2 rows, not {env.batch_size}")
     env = TransformedEnv(_Recorded(env, recorded), GuideActions({"guide": guide}, action_key))
@@ -185,9 +181,8 @@ def _check_history(
         try:
             interrupted = advice(reset=True)
         except (IndexError, RuntimeError) as error:
-            raise ValueError(
-                f"the guide fails after a single row was reset, so it may remember in itself, not in entries: {error}"
-            ) from error
+            cause = "so it may remember in itself, not in entries"
+            raise ValueError(f"the guide fails after a single row was reset, {cause}: {error}") from error
     finally:
         hook.remove()
 
@@ -195,9 +190,8 @@ def _check_history(
         return torch.allclose(one, other, rtol=0, atol=tolerance)
 
     if not torch.equal(first, again):
-        raise ValueError(
-            "the guide's action is another one for the same history; it draws, or remembers earlier episodes"
-        )
+        cause = "it draws, or remembers earlier episodes"
+        raise ValueError(f"the guide's action is another one for the same history; {cause}")
     if not equal(interrupted[1:], first[1:]):
         raise ValueError("the guide's action for a row depends on the reset of another row")
     if not equal(interrupted[0, middle:], fresh[0, : last - middle]):

@@ -38,7 +38,8 @@ class GymnasiumEnv(SeededRows):
     MultiDiscrete [B, n], and 0 or 1 for MultiBinary.
 
     A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state goes on to the bit if
-    the env is deterministic, see `SeededRows`.
+    the env is deterministic, see `SeededRows`. `rate` is the steps per second at which the env is drawn, NaN if it does
+    not say.
 
     Args:
         id: registered name; "MODULE:NAME" imports the module first.
@@ -60,9 +61,6 @@ class GymnasiumEnv(SeededRows):
         render: whether `render` gives pictures.
         device: of all tensors.
         dtype: of all floating-point tensors.
-
-    Attributes:
-        rate: steps per second at which the env is drawn, NaN if it does not say.
 
     Example:
         >>> from coil_rl.envs import GymnasiumEnv
@@ -129,12 +127,11 @@ class GymnasiumEnv(SeededRows):
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of row 0, [height, width, 3]; None if there are none."""
         try:
-            picture: NDArray[np.uint8] | None = self.rows[0].env.render() if self.shown else None
+            return self.rows[0].env.render() if self.shown else None
         except errors.DependencyNotInstalled as error:
             self.shown = False
             warnings.warn(f"no pictures of the env: {error}", stacklevel=2)
             return None
-        return picture
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all envs."""
@@ -242,9 +239,8 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
     try:
         return pkgutil.resolve_name(thing)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(
-            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
-        ) from error
+        problem = f"controller {name}: {thing!r} cannot be imported ({error})"
+        raise ValueError(f"{problem}; write PACKAGE.MODULE:THING") from error
 
 
 def _controller(name: str, maker: Callable[..., Any], env: Env) -> tuple[Callable[[Any], Any], Callable[[], Any]]:

@@ -75,11 +75,9 @@ def _compare(first: Tensor, second: Tensor) -> Tensor:
 
 
 def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
-    """Select each eligible entry that is in conflict with no selected one before it.
+    """Select each eligible entry [N, *batch] that is in conflict [N, N, *batch] with no selected one before it.
 
-    Args:
-        eligible: [N, *batch], bool.
-        conflict: [N, N, *batch], bool, symmetric.
+    Both are bool, and the conflicts symmetric.
     """
     selected = list(eligible.unbind(0))
     for i in range(1, len(selected)):

@@ -80,11 +80,7 @@ class Spline:
 
 
 def spline_fit(spline: Literal["cubic", "quadratic"], smoothing: float) -> Callable[[Tensor, Tensor], Spline]:
-    """Return the fit of that name: the cubic smoothing spline, or the least-squares parabola, which has no `smoothing`.
-
-    Raises:
-        ValueError: for another name.
-    """
+    """Return the fit of that name, else a `ValueError`; the least-squares parabola has no `smoothing`."""
     check_choice(("cubic", "quadratic"), spline=spline)
     return partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else least_squares_parabola
 
@@ -107,7 +103,9 @@ def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     squares = torch.addcmul(far, middle, middle, value=-1)
     diagonal = torch.add(span * constant(1 / 3, h), squares, alpha=-2)
     near = torch.addcmul(h[1:-1] * constant(1 / 6, h), side[1:-1], middle[:-1] + middle[1:], value=-1)
-    bends = _solve(diagonal, near, far[1:-1], _turns(step, per_m), real[2:-1], span * constant(1 / 4, h))
+    slope = step * per_m
+    turns = slope[:, 1:] - slope[:, :-1]  # at each inner point, Q'y: [D, K-2, *batch], at most 2
+    bends = _solve(diagonal, near, far[1:-1], turns, real[2:-1], span * constant(1 / 4, h))
 
     # Third derivative of each interval; its jumps at the knots are Q g.
     jerk = (bends[:, 1:] - bends[:, :-1]) * per_m
@@ -178,12 +176,6 @@ def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
     h = torch.maximum(square, torch.add(constant(floor, square), longest, alpha=floor)).sqrt()
     travelled = accumulate((h * second).unbind(0), torch.add, initial=torch.zeros_like(longest))
     return real, torch.stack(list(travelled)), step, h
-
-
-def _turns(step: Tensor, per_m: Tensor) -> Tensor:
-    """Return the change of slope between chords at each inner point, Q'y: [D, K-2, *batch], at most 2."""
-    slope = step * per_m
-    return slope[:, 1:] - slope[:, :-1]
 
 
 def _repeat_last(x: Tensor, real: Tensor) -> Tensor:

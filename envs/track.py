@@ -34,9 +34,8 @@ class TrackError(ValueError):
 class Track:
     """A closed track between two rings of cones.
 
-    Raises:
-        TrackError: for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries that
-            cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
+    A `TrackError` is raised for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries
+    that cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
 
     Example:
         >>> import numpy as np
@@ -187,9 +186,8 @@ def _check_cones(side: str, cones: Array) -> None:
         raise TrackError(f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; {remedy}.")
     lengths = np.linalg.norm(_edges(cones), axis=1)
     if np.ptp(cones, axis=0).max() > MAX_EXTENT or lengths.sum() > MAX_LENGTH:
-        raise TrackError(
-            f"The {side} is too large; the limits are {MAX_EXTENT:.0f} m across and {MAX_LENGTH:.0f} m long."
-        )
+        limits = f"{MAX_EXTENT:.0f} m across and {MAX_LENGTH:.0f} m long"
+        raise TrackError(f"The {side} is too large; the limits are {limits}.")
     coincident = np.flatnonzero(lengths < 1e-6)
     if len(coincident):
         first, second = coincident[0], (coincident[0] + 1) % len(cones)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TypeVar
 
 import torch
@@ -43,15 +44,6 @@ class ActionSpace:
         self.agents = self.event[:-1] if own else self.event
         first = (0,) * batch_dims
         self.bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
-
-    @classmethod
-    def of_parent(cls, transform: Transform, action_key: NestedKey) -> ActionSpace:
-        """Return the action space of the env of a transform, RuntimeError outside one; slow, it rebuilds the env."""
-        if transform.parent is None:
-            raise RuntimeError(
-                f"{type(transform).__name__} needs the action spec of an env: use it in a TransformedEnv"
-            )
-        return cls(transform.parent.full_action_spec[action_key], transform.parent.batch_dims)
 
     def vectors(self, action: Tensor) -> Tensor:
         """Convert env actions to vectors [*batch, *agents, A]."""
@@ -118,6 +110,20 @@ class ActionSpace:
             return Unbounded(shape, device=device, dtype=self.dtype)
         low, high = (bound.unsqueeze(-2).expand(shape) for bound in self.bounds)
         return Bounded(low, high, shape, device=device, dtype=self.dtype)
+
+
+class ActionTransform(Transform):
+    """Base class of transforms that use the action of their env."""
+
+    action_key: NestedKey
+
+    @cached_property
+    def action_space(self) -> ActionSpace:
+        """Action space of the env; RuntimeError outside an env."""
+        env = self.parent  # slow, TorchRL rebuilds the env
+        if env is None:
+            raise RuntimeError(f"{type(self).__name__} needs the action spec of an env: use it in a TransformedEnv")
+        return ActionSpace(env.full_action_spec[self.action_key], env.batch_dims)
 
 
 def choices_of(spec: TensorSpec) -> list[int]:

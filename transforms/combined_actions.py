@@ -53,10 +53,9 @@ class CombinedAction(GuideTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what it writes; raises a `ValueError` if discrete actions would have to be added."""
         if self.adds and not self.action_space.continuous:
-            raise ValueError(
-                f"{type(self).__name__} needs continuous actions, but this env has {self.action_space.size} discrete "
-                "ones; use Takeover, which replaces the agent's action in some steps"
-            )
+            problem = f"needs continuous actions, but this env has {self.action_space.size} discrete ones"
+            remedy = "use Takeover, which replaces the agent's action in some steps"
+            raise ValueError(f"{type(self).__name__} {problem}; {remedy}")
         return super().transform_observation_spec(observation_spec).update(self._specs())
 
     def _specs(self) -> dict[str, TensorSpec]:
@@ -133,10 +132,8 @@ class AdaptiveMixedAction(CombinedAction):
     ) -> None:  # fmt: skip
         super().__init__(**options)
         if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
-            raise ValueError(
-                f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, from 0 to 1, and "
-                f"certain={certain} at least 0 and less than uncertain={uncertain}"
-            )
+            weights = f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, from 0 to 1"
+            raise ValueError(f"{weights}, and certain={certain} at least 0 and less than uncertain={uncertain}")
         self.low, self.high, self.certain, self.uncertain = low, high, certain, uncertain
         self.warm_up, self.warm_up_high, self.rng = warm_up, warm_up_high, SeededGenerator(seed)
 
@@ -182,8 +179,7 @@ class _ActionSwitch(CombinedAction):
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
         """Return the env's action where the agent acts."""
-        action: Tensor = tensordict[self.action_key]
-        return action
+        return tensordict[self.action_key]
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
         action = self._of_agent(tensordict)
@@ -270,8 +266,7 @@ class JumpStart(_ActionSwitch):
         self.horizon, self.random = horizon, random
 
     def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
-        agent: Tensor = tensordict["guide_steps"] == 0
-        return agent
+        return tensordict["guide_steps"] == 0
 
     def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
         draw = self._draw()

@@ -6,7 +6,6 @@ Biased, scaled, partial, delayed and noisy advice degrade a guide. Random, shuff
 
 import math
 from collections.abc import Callable
-from functools import cached_property
 from typing import Literal
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
 
 
@@ -70,10 +69,9 @@ class DegradedAdvice(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `KeyError` without advice."""
         if self.key not in observation_spec.keys(True, True):
-            raise KeyError(
-                f"{type(self).__name__} changes {self.key!r}, but the env writes {sorted(map(str, observation_spec))}; "
-                "put it behind GuideActions"
-            )
+            problem = f"{type(self).__name__} changes {self.key!r}"
+            written = sorted(map(str, observation_spec))
+            raise KeyError(f"{problem}, but the env writes {written}; put it behind GuideActions")
         return observation_spec.update(self._memory_spec(observation_spec[self.key]))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -125,62 +123,68 @@ class PartialAdvice(DegradedAdvice):
         return advice.clamp(min=0) if self.side == "left" else advice.clamp(max=0)
 
 
-class NoisyAdvice(DegradedAdvice):
-    """Advice with Gaussian noise, independent at every step.
+class _DrawnAdvice(DegradedAdvice):
+    """Base of advice with random numbers, independent at every step; the seed is that of the draws."""
 
-    Args:
-        sigma: standard deviation in action units.
-        seed: seed of the noise.
-    """
+    def __init__(self, seed: int, key: NestedKey) -> None:
+        super().__init__(key)
+        self.rng = SeededGenerator(seed)
+
+    def _draw(self, sample: Callable[..., Tensor], advice: Tensor, after_reset: bool) -> Tensor:
+        """Draw one random number for each number of the advice.
+
+        A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
+        generator: later draws then do not depend on when other rows are reset.
+        """
+        state = self.rng.generator.get_state() if after_reset else None
+        draws = sample(2, *advice.shape, generator=self.rng.generator)
+        if state is not None:
+            self.rng.generator.set_state(state)
+        return draws[int(after_reset)].to(advice)
+
+    def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
+        """Return the degraded advice, [*batch, n_guides, A], in a step or after a partial reset."""
+        raise NotImplementedError
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+        after_reset = tensordict.get("_reset", None) is not None
+        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+
+
+class NoisyAdvice(_DrawnAdvice):
+    """Advice with Gaussian noise, independent at every step; `sigma` is its standard deviation in action units."""
 
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
-        super().__init__(key)
+        super().__init__(seed, key)
         if not 0 <= sigma < math.inf:
             raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
-        self.sigma, self.rng = sigma, SeededGenerator(seed)
+        self.sigma = sigma
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return advice + noise."""
-        return torch.add(advice, _draw(torch.randn, self.rng, advice, after_reset), alpha=self.sigma)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+        return torch.add(advice, self._draw(torch.randn, advice, after_reset), alpha=self.sigma)
 
 
-class RandomAdvice(DegradedAdvice):
-    """Placebo: uniform random numbers in place of the advice, independent at every step.
-
-    Args:
-        low: lower bound in action units.
-        high: upper bound.
-        seed: seed of the draws.
-    """
+class RandomAdvice(_DrawnAdvice):
+    """Placebo: uniform random numbers from `low` to `high` in action units, drawn at every step, instead of advice."""
 
     def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
-        super().__init__(key)
+        super().__init__(seed, key)
         if not -math.inf < low < high < math.inf:
             raise ValueError(f"low={low} must be less than high={high}, and both finite")
-        self.low, self.range, self.rng = low, high - low, SeededGenerator(seed)
+        self.low, self.range = low, high - low
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return random numbers."""
-        return self.low + self.range * _draw(torch.rand, self.rng, advice, after_reset)
-
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        after_reset = tensordict.get("_reset", None) is not None
-        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+        return self.low + self.range * self._draw(torch.rand, advice, after_reset)
 
 
 class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
     At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
-    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`.
-
-    Args:
-        seed: seed of the draws.
-        memory_key: entry for the original advice, [*batch, 1, n_guides, A].
+    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`. The seed is that of the
+    draws, and `memory_key` the entry for the original advice, [*batch, 1, n_guides, A].
     """
 
     def __init__(
@@ -217,11 +221,9 @@ class ShuffledAdvice(DegradedAdvice):
 
 
 class DelayedAdvice(DegradedAdvice):
-    """Advice of an earlier step; at first the first advice of the episode.
+    """Advice of an earlier step, by a delay of `steps`, 0 for none; at first the first advice of the episode.
 
-    Args:
-        steps: delay; 0 for none.
-        memory_key: entry for the advice of the last `steps` steps, [*batch, steps, n_guides, A], oldest first.
+    `memory_key` is the entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest first.
     """
 
     needs_past = True
@@ -247,7 +249,7 @@ class DelayedAdvice(DegradedAdvice):
         return next_tensordict.set(self.key, memory[..., 0, :, :])
 
 
-class RemovedAdvice(DegradedAdvice):
+class RemovedAdvice(DegradedAdvice, ActionTransform):
     """Placebo: the agent's previous action in place of the advice; zeros at the start of an episode.
 
     `action_key` is the entry of the action; a discrete action becomes one-hot.
@@ -259,11 +261,6 @@ class RemovedAdvice(DegradedAdvice):
         super().__init__(key)
         self.action_key = nested_key(action_key)
 
-    @cached_property
-    def action_space(self) -> ActionSpace:
-        """Action space of the env; RuntimeError outside an env."""
-        return ActionSpace.of_parent(self, self.action_key)
-
     def degrade(self, advice: Tensor) -> Tensor:
         """Return zeros, for the first step."""
         return torch.zeros_like(advice)
@@ -272,19 +269,6 @@ class RemovedAdvice(DegradedAdvice):
         action = self.action_space.vectors(tensordict[self.action_key])
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
-
-
-def _draw(sample: Callable[..., Tensor], rng: SeededGenerator, advice: Tensor, after_reset: bool) -> Tensor:
-    """Draw one random number for each number of the advice.
-
-    A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
-    generator: later draws then do not depend on when other rows are reset.
-    """
-    state = rng.generator.get_state() if after_reset else None
-    draws = sample(2, *advice.shape, generator=rng.generator)
-    if state is not None:
-        rng.generator.set_state(state)
-    return draws[int(after_reset)].to(advice)
 
 
 def _finite(name: str, value: float) -> float:

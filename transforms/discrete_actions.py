@@ -10,26 +10,24 @@ from tensordict import NestedKey, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import Bounded, Categorical, Composite
-from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.transforms.action_space import ActionSpace, ActionTransform
 
 
-class DiscreteActions(Transform):
+class DiscreteActions(ActionTransform):
     """Discretise the action, and round the advice to the nearest choice.
 
     The agent's action becomes the index of a choice, and the advice becomes one-hot. Place it last: the transforms
     before it and the env work in action units, with the advice as given, not rounded.
+
+    Fewer than two choices, and values that are not finite and increasing, are a `ValueError`; in an env also an action
+    of another kind, and values outside its bounds.
 
     Args:
         choices: number of choices, equally spaced from bound to bound, or the values in action units.
         action_key: entry of the action, one bounded number; becomes [*batch], int64.
         advice_key: entry of the advice, if any, [*batch, n_guides, 1]; becomes [*batch, n_guides, n], 0 or 1.
         number_key: entry for the advice in action units, [*batch, n_guides, 1].
-
-    Raises:
-        ValueError: for fewer than two choices, or values that are not finite and increasing; in an env also for an
-            action of another kind, or values outside its bounds.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -60,7 +58,7 @@ class DiscreteActions(Transform):
     @cached_property
     def values(self) -> Tensor:
         """[n], values of the choices in action units; RuntimeError outside an env."""
-        spec = ActionSpace.of_parent(self, self.action_key).spec
+        spec = self.action_space.spec
         size = spec.shape[self.parent.batch_dims :].numel()
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point or size != 1:
             kind = f"{size} numbers" if spec.dtype.is_floating_point and size != 1 else type(spec).__name__

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
 
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 
 
@@ -33,10 +33,8 @@ class Guides(TensorDictModuleBase):
         out_key: entry for the advice, [*batch, n_guides, A].
         trainable: require parameters and no memory in each guide.
 
-    Raises:
-        TypeError: if `guides` is not a mapping.
-        ValueError: without a guide, for an invalid name, or for a guide without `action_key` or parameters, or with a
-            memory that is not as in `GuideMemory`.
+    Guides that are no mapping are a `TypeError`; none, an invalid name, or a guide without `action_key` or parameters,
+    or with a memory that is not as in `GuideMemory`, are a `ValueError`.
     """
 
     def __init__(
@@ -143,7 +141,7 @@ class GuideCache:
         return advise(data) if self.advice is None else self.advice[[self.index[key] for key in keys]]
 
 
-class GuideActions(Transform):
+class GuideActions(ActionTransform):
     """Write the action of each guide into the observation.
 
     The agent is free to use the advice. A guide is any TensorDictModule that reads observations of the env and writes
@@ -193,11 +191,6 @@ class GuideActions(Transform):
         self._checked: set[str] = set()
 
     @cached_property
-    def action_space(self) -> ActionSpace:
-        """Action space of the env; RuntimeError outside an env."""
-        return ActionSpace.of_parent(self, self.action_key)
-
-    @cached_property
     def given_space(self) -> ActionSpace:
         """Action space of the env without any transforms."""
         env = self.parent.base_env
@@ -243,10 +236,8 @@ class GuideActions(Transform):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice for stored data; raises a `ValueError` if a guide depends on earlier steps."""
         if self.needs_past:
-            raise ValueError(
-                f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have; "
-                "use them in a TransformedEnv"
-            )
+            problem = f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have"
+            raise ValueError(f"{problem}; use them in a TransformedEnv")
         return self._call(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -327,9 +318,8 @@ class GuideActions(Transform):
 
         Two guides of one name with a memory, or one in an env that resets its agents one by one, are a `ValueError`.
         """
-        observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
-            self.parent.batch_size, len(self.guides.names)
-        )
+        spec = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
+        observation_spec[self.out_keys[0]] = spec
         return self._add_memory(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:

@@ -30,10 +30,8 @@ class GuideMemory:
                 if key in written:
                     self.specs[key], self.first[key] = spec[row] if row else spec, primer.default_value[key]
         if undeclared := written - self.specs.keys():
-            raise ValueError(
-                f"guide {name!r} writes {sorted(map(str, undeclared))} for its next step, but nothing says how they "
-                "begin; give it make_tensordict_primer()"
-            )
+            problem = f"guide {name!r} writes {sorted(map(str, undeclared))} for its next step"
+            raise ValueError(f"{problem}, but nothing says how they begin; give it make_tensordict_primer()")
 
     def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
         """Return the spec of the memory of all rows of an env, given their batch size and device."""

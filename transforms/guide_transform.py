@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 from torchrl.data import Composite
-from torchrl.envs import EnvBase, Transform
+from torchrl.envs import EnvBase
 
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionTransform, nested_key
 
 Schedule = Callable[[float], float]
 
 
-class GuideTransform(Transform):
+class GuideTransform(ActionTransform):
     """Base class of transforms that use the advice observed by the agent; place them after `GuideActions`.
 
     Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a schedule returns its
-    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules.
-
-    Args:
-        guide: row of the advice, [*batch, n_guides, A].
-        action_key: entry of the action.
-        advice_key: entry of the advice.
+    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules. `guide`
+    is the row of the advice, [*batch, n_guides, A]; the keys are the entries of action and advice.
     """
 
     written: tuple[str, ...] = ()  # entries that the transform adds
@@ -56,10 +51,9 @@ class GuideTransform(Transform):
     def learns(self) -> bool:
         """Whether the env is used for training; RuntimeError before `env.train()` or `env.eval()`."""
         if not self._mode_is_set:
-            raise RuntimeError(
-                f"{type(self).__name__} acts in training only: call env.train() or env.eval() first, on the env that "
-                "has the transform; for an env inside SerialEnv or ParallelEnv in the function that makes it"
-            )
+            remedy = "call env.train() or env.eval() first, on the env that has the transform"
+            inside = "for an env inside SerialEnv or ParallelEnv in the function that makes it"
+            raise RuntimeError(f"{type(self).__name__} acts in training only: {remedy}; {inside}")
         return self.training
 
     def current(self, value: float | Schedule) -> float:
@@ -69,32 +63,23 @@ class GuideTransform(Transform):
         if not self.learns:
             return value(1.0)
         if self.progress is None:
-            raise RuntimeError(
-                f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run: call "
-                "coil_rl.transforms.set_progress(env, FRACTION) before each batch; for SerialEnv or ParallelEnv put "
-                "the transform around it, not inside"
-            )
+            problem = f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run"
+            remedy = "call coil_rl.transforms.set_progress(env, FRACTION) before each batch"
+            around = "for SerialEnv or ParallelEnv put the transform around it, not inside"
+            raise RuntimeError(f"{problem}: {remedy}; {around}")
         return value(self.progress)
 
     def advice(self, tensordict: TensorDictBase) -> Tensor:
         """Return the advice of the guide, [*batch, A]."""
-        advice: Tensor = tensordict[self.advice_key]
-        return advice[..., self.guide, :]
-
-    @cached_property
-    def action_space(self) -> ActionSpace:
-        """Action space of the env; RuntimeError outside an env."""
-        return ActionSpace.of_parent(self, self.action_key)
+        return tensordict[self.advice_key][..., self.guide, :]
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Check that the env writes the advice; raises a `KeyError` without this row of advice."""
         spec = observation_spec.get(self.advice_key, None)
         if spec is None or self.guide >= spec.shape[-2]:
             found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
-            raise KeyError(
-                f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {found}; "
-                "put GuideActions with enough guides before it"
-            )
+            problem = f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {found}"
+            raise KeyError(f"{problem}; put GuideActions with enough guides before it")
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -36,7 +36,6 @@ class RewardCoupling(GuideTransform):
     """
 
     mdp_parameter = "beta"
-
     written = ("task_reward", "guide_distance")
 
     def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", **options: Any) -> None:
@@ -48,8 +47,7 @@ class RewardCoupling(GuideTransform):
     @cached_property
     def reward_key(self) -> NestedKey:
         """Entry of the env's reward, which may be nested."""
-        key: NestedKey = self.parent.reward_key
-        return key
+        return self.parent.reward_key
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict[self.reward_key]

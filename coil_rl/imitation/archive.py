@@ -30,6 +30,7 @@ from coil_rl.errors import UserError
 from coil_rl.train.trust import ESTIMATORS, PARTS
 
 CLASSES = {*(name.rpartition(".")[2] for name in ESTIMATORS), "FunctionTransformer", "LabelBinarizer", "_BinMapper"}
+FORESTS = (RandomForestRegressor, ExtraTreesRegressor, GradientBoostingRegressor)
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, partial)
 
 
@@ -99,11 +100,10 @@ def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
     inputs = state.get("n_features_in_")
     if isinstance(part, DecisionTreeRegressor) and "tree_" in state:
         _require(isinstance(part.tree_, Tree) and part.tree_.n_features == inputs, "a tree has other features")
-        _check_tree(part.tree_)
-    elif (
-        isinstance(part, (RandomForestRegressor, ExtraTreesRegressor, GradientBoostingRegressor))
-        and "estimators_" in state
-    ):
+        tree, leaf = part.tree_, part.tree_.children_left == -1
+        _check_nodes(tree.children_left, tree.children_right, leaf, tree.feature, tree.n_features)
+        _check_numbers(tree.value, tree.threshold)
+    elif isinstance(part, FORESTS) and "estimators_" in state:
         trees = np.ravel(part.estimators_)
         _require(len(trees) > 0, "a forest has no trees")
         known = all(isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree) for tree in trees)
@@ -130,12 +130,6 @@ def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
         _check_numbers(part._dual_coef_, part.support_vectors_)
     elif isinstance(part, (KNeighborsRegressor, RadiusNeighborsRegressor)) and "_fit_X" in state:
         part.fit(part._fit_X, part._y)  # finds the neighbours by a tree of its own, made from the points
-
-
-def _check_tree(tree: Tree) -> None:
-    leaf = tree.children_left == -1
-    _check_nodes(tree.children_left, tree.children_right, leaf, tree.feature, tree.n_features)
-    _check_numbers(tree.value, tree.threshold)
 
 
 def _check_nodes(left: Any, right: Any, leaf: NDArray[np.bool_], feature: Any, features: Any) -> None:

@@ -28,6 +28,9 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 class Imitation:
     """The imitation learner.
 
+    An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`. A data set that is
+    missing, damaged or of another env is a `UserError`.
+
     Args:
         env: the env, for its specs.
         in_keys: entries that the policy observes.
@@ -44,11 +47,6 @@ class Imitation:
         policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
         keys: entries that a batch must have.
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
-
-    Raises:
-        KeyError: if the env has no such advice or observation.
-        ValueError: if there is no such guide.
-        UserError: if the file is missing or damaged, or a data set of another env.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression
@@ -97,9 +95,7 @@ class Imitation:
         self.group_key = group if group in available else None
         self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
         self.validate, self.seed, self.device = validate, seed, env.device
-        self.dataset: TensorDictBase | None = None
-        if dataset is not None:
-            self.dataset = self._load(Path(dataset), env)
+        self.dataset: TensorDictBase | None = None if dataset is None else self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
@@ -144,10 +140,9 @@ class Imitation:
         for key in keys:
             shape = dataset[key].shape[1:] if key in dataset.keys(True, True) else None
             if shape != expected[key].shape[1:]:
-                raise UserError(
-                    f"{file} is a data set of another env: {key} is {'missing' if shape is None else list(shape)}, "
-                    f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
-                )
+                fault = f"{key} is {'missing' if shape is None else list(shape)}"
+                remedy = f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
+                raise UserError(f"{file} is a data set of another env: {fault}, {remedy}")
         return dataset.select(*keys).to(env.device)
 
     def state_dict(self) -> dict[str, Any]:

@@ -113,8 +113,7 @@ class NetworkRegressor(Regressor):
 
     def forward(self, x: Tensor) -> Tensor:
         """Predict y [*batch, outputs] for x [*batch, inputs]."""
-        y: Tensor = self.y_mean + self.y_scale * self.layers((x - self.x_mean) / self.x_scale)
-        return y
+        return self.y_mean + self.y_scale * self.layers((x - self.x_mean) / self.x_scale)
 
 
 class SklearnRegressor(Regressor):
@@ -144,10 +143,8 @@ class SklearnRegressor(Regressor):
     def fresh(self, inputs: int, outputs: int) -> SklearnRegressor:
         """Return an unfitted regressor, which predicts 0; raises a `ValueError` if it can predict one number only."""
         if outputs > 1 and not get_tags(self.estimator).target_tags.multi_output:
-            raise ValueError(
-                f"{self.estimator!r} predicts one number, but an action has {outputs} here; "
-                "put it into sklearn.multioutput.MultiOutputRegressor"
-            )
+            problem = f"{self.estimator!r} predicts one number, but an action has {outputs} here"
+            raise ValueError(f"{problem}; put it into sklearn.multioutput.MultiOutputRegressor")
         fresh = SklearnRegressor(self.estimator)
         fresh.inputs, fresh.outputs = inputs, outputs
         return fresh

@@ -25,6 +25,8 @@ def cross_validate(
 ) -> dict[str, float]:
     """Return the errors of fresh regressors on a random fifth of the samples and on left-out tracks.
 
+    They are `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`: see `scores`.
+
     The paper tests on random samples. Consecutive states are nearly equal, so most of these have a near copy among the
     training samples. The error on left-out tracks is an estimate of the error on a new track. Too few samples, or only
     one track, are a `UserError`.
@@ -35,14 +37,10 @@ def cross_validate(
         y: [N, outputs].
         groups: [N], the track of each sample; None: random split only.
         seed: of the random split.
-
-    Returns:
-        `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`: see `scores`.
     """
     if len(x) < MIN_SAMPLES:
-        raise UserError(
-            f"{len(x)} samples are too few to validate; use at least {MIN_SAMPLES}, or learner.validate=false"
-        )
+        remedy = f"use at least {MIN_SAMPLES}, or learner.validate=false"
+        raise UserError(f"{len(x)} samples are too few to validate; {remedy}")
     rows = np.arange(len(x))
     splits: dict[str, list[Split]] = {"random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]}
     if groups is not None:

@@ -39,17 +39,9 @@ class A2C(PPO):
         super().__init__(env, in_keys, learning_rate=learning_rate, epochs=1, clip=1.0, **options)
         self.standardise = standardise
 
-    def build_loss(self, clip: float) -> LossModule:
+    def build_loss(self, clip: float, **options: Any) -> LossModule:
         """Return TorchRL's loss of policy and critic."""
-        return A2CLoss(
-            self.head,
-            self.critic,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=self.critic_coefficient,
-            loss_critic_type="l2",
-            functional=False,
-        )
+        return A2CLoss(self.head, self.critic, **options)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]."""

@@ -36,6 +36,7 @@ class Advisor(PPO):
     """
 
     with_memory = False
+    parts = (*PPO.parts, "imitator")
 
     def __init__(
         self, env: EnvBase, in_keys: Sequence[NestedKey] = ("observation",), *,
@@ -57,15 +58,6 @@ class Advisor(PPO):
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates."""
         return [*super().parameter_groups(), [*self.imitator.parameters()]]
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return super().state_dict() | {"imitator": self.imitator.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        super().load_state_dict(state)
-        self.imitator.load_state_dict(state["imitator"])
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses as `PPO`, with weighted `loss_objective`; `weight`: the mean of w; `loss_imitation`."""

@@ -19,13 +19,14 @@ become worse, it rises.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from tensordict import NestedKey
 from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range
+from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 
 LIMIT = 0.97  # of advice before atanh, as a fraction of half the range of the action
@@ -36,11 +37,8 @@ FIRST = 0.9  # probability of the advised one of several actions at weight 1
 class AnchoredHead(nn.Module):
     """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
 
-    Args:
-        head: gives the mean and the standard deviation, or the logits.
-        pull: turns advice [*batch, n_guides, A] into means or logits [*batch, n_guides, *event].
-        guides: number of guides.
-        device: of the weights.
+    `head` gives the mean and the standard deviation, or the logits. `pull` turns advice [*batch, n_guides, A] into
+    means or logits [*batch, n_guides, *event].
     """
 
     weight: Tensor
@@ -87,10 +85,9 @@ def pull_to_number(advice: Tensor, bounds: tuple[Tensor, Tensor] | None = None) 
 
 
 def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
-    """Return the pull to advised choices.
+    """Return the pull to advised choices, which are one-hot for each choice, one beside the other.
 
-    Args:
-        valid: [*event, n], whether a choice has an option; advice is one-hot for each choice, one beside the other.
+    `valid` is [*event, n], whether a choice has an option.
     """
     options = valid.sum(-1, keepdim=True).clamp_min(2)
     gain = (math.log(FIRST / (1 - FIRST)) + (options - 1).log()).expand(valid.shape).flatten()
@@ -105,72 +102,57 @@ def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
 
 @dataclass(frozen=True)
 class Look:
-    """Drives of the training cases with some weights of the anchor.
+    """Drives of the training cases with some weights of the anchor."""
 
-    Attributes:
-        returns: [C] for each weight.
-        failures: number of failed cases for each weight.
-    """
-
-    returns: Tensor
-    failures: Sequence[int]
+    returns: Tensor  # [C] for each weight
+    failures: Sequence[int]  # number of failed cases for each weight
 
     def score(self, index: int) -> float:
         """Mean return with a weight."""
         return float(self.returns[index].mean())
 
 
-class Anchor:
+@dataclass(eq=False, kw_only=True)
+class Anchor(Stateful):
     """Start of a policy at the action of a guide, and the brake by which it lets go of it.
 
     Before training the guides, their opposites (weight -1), the first policy without a guide and random actions are
     compared in the same cases. The anchor holds if the best guide or opposite is better than the last two by more than
-    a standard error of the difference; otherwise the weight is 0, and training is COIL.
-
-    Args:
-        looks: number of looks over the run.
-        cases: C, number of cases of a look.
-        step: by which the weight falls at a look.
-        margin: by which the weight that is tried at a look is lower; at least `step`.
-        back: by which the weight rises.
-        tolerance: loss of return that is allowed for a step, as a share of the guide's return; at least half a standard
-            error of the guide's return is. Three times as much below the best look so far, the weight rises.
-        warmup: share of the run, from its start, in which only the critic learns.
-        noise: standard deviation of an anchored policy that has one of its own, of PPO and the like; with DQN the
-            probability of a random action. A number or a schedule.
-        advice_key: entry with the advice, [*batch, n_guides, A].
+    a standard error of the difference; otherwise the weight is 0, and training is COIL. A value out of range is a
+    `ValueError`.
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
         unit: of rewards in the updates of PPO and the like, the largest mean return, without its sign, of the first
             policy, one without a guide and random actions; 1 without an anchor. A critic starts near 0, and would
             follow returns of hundreds for most of the run.
-
-    Raises:
-        ValueError: for a value out of range.
     """
 
-    def __init__(
-        self,
-        *,
-        looks: int = 24,
-        cases: int = 24,
-        step: float = 0.05,
-        margin: float = 0.3,
-        back: float = 0.1,
-        tolerance: float = 0.01,
-        warmup: float = 0.05,
-        noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5),
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        check_range(1, looks=looks)
-        check_range(2, cases=cases)
-        check_range(0, 1, step=step, back=back, tolerance=tolerance, warmup=warmup)
-        check_range(step, 1, margin=margin)
-        self.looks, self.cases, self.tolerance = looks, cases, tolerance
-        self.step, self.margin, self.back = step, margin, back
-        self.warmup, self.noise, self.advice_key = warmup, schedule(noise), advice_key
-        check_range(0, above=True, noise=self.noise(0))
+    parts: ClassVar[tuple[str, ...]] = (
+        "holds", "guide", "sign", "unit", "guide_return", "guide_failures", "allowed", "best",
+    )  # fmt: skip
+
+    looks: int = 24  # number of looks over the run
+    cases: int = 24  # C, number of cases of a look
+    step: float = 0.05  # by which the weight falls at a look
+    margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
+    back: float = 0.1  # by which the weight rises
+    # Loss of return that is allowed for a step, as a share of the guide's return; at least half a standard error of
+    # the guide's return is. Three times as much below the best look so far, the weight rises.
+    tolerance: float = 0.01
+    warmup: float = 0.05  # share of the run, from its start, in which only the critic learns
+    # Standard deviation of an anchored policy that has one of its own, of PPO and the like; with DQN the probability
+    # of a random action.
+    noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5)
+    advice_key: NestedKey = "guide_action"  # entry with the advice, [*batch, n_guides, A]
+
+    def __post_init__(self) -> None:
+        check_range(1, looks=self.looks)
+        check_range(2, cases=self.cases)
+        check_range(0, 1, step=self.step, back=self.back, tolerance=self.tolerance, warmup=self.warmup)
+        check_range(self.step, 1, margin=self.margin)
+        self.noise_at = schedule(self.noise)
+        check_range(0, above=True, noise=self.noise_at(0))
         self.holds = True
         self.guide_return = self.allowed = self.best = math.nan
         self.guide = self.guide_failures = 0
@@ -205,12 +187,11 @@ class Anchor:
     def set_noise(self, progress: float) -> dict[str, float]:
         """Set the standard deviation of an anchored policy that has one of its own.
 
-        Returns:
-            The metrics `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
+        The metrics are `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
         """
         scale: Tensor | None = getattr(self.head.head, "log_scale", None)
         if scale is not None and self.holds:
-            scale.fill_(math.log(self.noise(progress)))
+            scale.fill_(math.log(self.noise_at(progress)))
         return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
 
     def due(self, update: int, updates: int) -> bool:
@@ -223,11 +204,9 @@ class Anchor:
         return max(self.weight - self.margin, 0.0)
 
     def begin(self, look: Look, random: Tensor) -> None:
-        """Hold the best guide or opposite, or let go.
+        """Hold the best guide or opposite, or let go, after a look with the weights of `starts`.
 
-        Args:
-            look: with the weights of `starts`.
-            random: returns of random actions, [C].
+        `random` are returns of random actions, [C].
         """
         guides = len(self.head.weight)
         best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)
@@ -252,16 +231,6 @@ class Anchor:
             self.head.weight.copy_(self.weights(min(self.weight + self.back, 1.0)))
         elif look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
             self.head.weight.copy_(self.weights(max(self.weight - self.step, 0.0)))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return what the next look depends on, besides the policy."""
-        names = ("holds", "guide", "sign", "unit", "guide_return", "guide_failures", "allowed", "best")
-        return {name: getattr(self, name) for name in names}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        for name, value in state.items():
-            setattr(self, name, value)
 
 
 def standard_error(values: Tensor) -> Tensor:

@@ -29,7 +29,8 @@ from coil_rl.transforms.action_space import nested_key
 class DQN(OffPolicy):
     """The DQN learner.
 
-    COIL is DQN with `guide_action` among `in_keys`; the advice is one-hot.
+    COIL is DQN with `guide_action` among `in_keys`; the advice is one-hot. A value out of range, an env with continuous
+    actions, and what `OffPolicy` refuses are a `ValueError`.
 
     Args:
         env: the env, with discrete actions.
@@ -39,12 +40,7 @@ class DQN(OffPolicy):
         action_gain: initial scale of the last weights; with 0 all action values are 0.
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic actions.
         double: whether the network, not the target network, selects the next action.
-        tau: step of the target network towards the network after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average.
-        options: as for `OffPolicy`.
-
-    Raises:
-        ValueError: for a value out of range, an env with continuous actions, or as `OffPolicy`.
+        tau, ratio, options: as for `OffPolicy`.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -56,6 +52,7 @@ class DQN(OffPolicy):
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
 
+    parts = ("policy", *OffPolicy.parts)
     minimised = reported = ("loss",)
 
     def __init__(
@@ -78,10 +75,8 @@ class DQN(OffPolicy):
             check_range(0, 1, epsilon=self.epsilon(progress))
         spec = env.action_spec
         if spec.dtype.is_floating_point:
-            raise ValueError(
-                "DQN needs discrete actions, but this env has continuous ones; "
-                "put the transform DiscreteActions around it: action=choices"
-            )
+            remedy = "put the transform DiscreteActions around it: action=choices"
+            raise ValueError(f"DQN needs discrete actions, but this env has continuous ones; {remedy}")
         if not isinstance(spec, (Categorical, OneHot)) or len(networks.action_shape(env)) != isinstance(spec, OneHot):
             raise ValueError("DQN needs one discrete action, but this env has several at once; use PPO")
         in_keys, network = list(map(nested_key, in_keys)), without_memory(network or Mlp(hidden, "relu"), "DQN")
@@ -101,9 +96,8 @@ class DQN(OffPolicy):
             valued = networks.FastTensorDictModule(bonus, [self.anchor.advice_key, "action_value"], ["action_value"])
         self.policy = TensorDictSequential(*before, valued, chosen, self.explorer)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless rewards are tiny.
-        self.set_loss(
-            DQNLoss(self.network, action_space=single, double_dqn=double, delay_value=True, loss_function="l2")
-        )
+        options = {"double_dqn": double, "delay_value": True, "loss_function": "l2"}
+        self.set_loss(DQNLoss(self.network, action_space=single, **options))
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.
@@ -113,7 +107,7 @@ class DQN(OffPolicy):
             learning starts; and `epsilon`.
         """
         metrics = super().update(batch, progress)
-        epsilon = self.anchor.noise if self.anchor is not None and self.anchor.holds else self.epsilon
+        epsilon = self.anchor.noise_at if self.anchor is not None and self.anchor.holds else self.epsilon
         self.explorer.eps.fill_(epsilon(progress))
         return metrics | {"epsilon": epsilon(progress)}
 
@@ -122,12 +116,3 @@ class DQN(OffPolicy):
         """Return the mean value of the best action, 0 before learning starts."""
         value = 0.0 if minibatch is None else float(self.network(minibatch)["chosen_action_value"].mean())
         return {"value": value}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return {"policy": self.policy.state_dict()} | super().state_dict()
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        super().load_state_dict(state)

@@ -6,7 +6,7 @@ PPO loss and a smaller learning rate. The learning rate shrinks from each phase 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import KW_ONLY, astuple, dataclass
 from typing import Any, Literal
 
 import torch
@@ -76,40 +76,27 @@ class AtConvergence:
         return since >= self.evaluations
 
 
+@dataclass(eq=False)
 class PhaseSchedule:
-    """The order of the phases.
+    """The order of the phases; `phase` is the current one, `number` its number, from 0."""
 
-    Args:
-        guides: n, number of guides.
-        order: "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the agent only;
-            "guide": one guide after the other, never the agent.
-        choice: of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at random.
-        agent_phase: stop rule of phases in which the agent learns.
-        guide_phase: stop rule of the other phases.
-        seed: of the stochastic choice.
+    guides: int  # n, number of guides
+    _: KW_ONLY
+    # "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the agent only; "guide":
+    # one guide after the other, never the agent.
+    order: Literal["alternate", "joint", "agent", "guide"] = "alternate"
+    # Of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at random.
+    choice: Literal["sequential", "stochastic"] = "sequential"
+    agent_phase: StopRule = AfterFrames(131_072)  # of phases in which the agent learns
+    guide_phase: StopRule = AfterFrames(65_536)  # of the other phases
+    seed: int = 0  # of the stochastic choice
 
-    Attributes:
-        phase: the current phase.
-        number: of the current phase, from 0.
-    """
-
-    def __init__(
-        self,
-        guides: int,
-        *,
-        order: Literal["alternate", "joint", "agent", "guide"] = "alternate",
-        choice: Literal["sequential", "stochastic"] = "sequential",
-        agent_phase: StopRule = AfterFrames(131_072),
-        guide_phase: StopRule = AfterFrames(65_536),
-        seed: int = 0,
-    ) -> None:
-        check_choice(("alternate", "joint", "agent", "guide"), order=order)
-        check_choice(("sequential", "stochastic"), choice=choice)
-        check_range(1, guides=guides)
-        check_range(0, LARGEST_SEED, seed=seed)
-        self.guides, self.order, self.choice = guides, order, choice
-        self.agent_phase, self.guide_phase = agent_phase, guide_phase
-        self.generator = torch.Generator().manual_seed(seed)
+    def __post_init__(self) -> None:
+        check_choice(("alternate", "joint", "agent", "guide"), order=self.order)
+        check_choice(("sequential", "stochastic"), choice=self.choice)
+        check_range(1, guides=self.guides)
+        check_range(0, LARGEST_SEED, seed=self.seed)
+        self.generator = torch.Generator().manual_seed(self.seed)
         self.number, self.frames = 0, 0
         self.rewards: list[float] = []
         self.phase = self._next()
@@ -150,6 +137,8 @@ class PhaseSchedule:
 class DynamicCoil(PPO):
     """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
 
+    A value out of range, a guide without parameters, or guides that share parameters are a `ValueError`.
+
     Args:
         env, ppo: as for `PPO`; actions must be continuous.
         in_keys: entries that agent and critic observe; the agent also observes the advice.
@@ -158,12 +147,10 @@ class DynamicCoil(PPO):
         guide_learning_rate: of the guides, a number or a schedule.
         shrink: factor on the learning rate from each phase to the next of its kind.
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
-
-    Raises:
-        ValueError: for a value out of range, a guide without parameters, or guides that share parameters.
     """
 
     kind = "guides"
+    parts = (*PPO.parts, "phases")
     with_memory = compilable = False  # some networks are frozen in each phase
 
     def __init__(
@@ -219,12 +206,12 @@ class DynamicCoil(PPO):
         guides = [guide if index in phase.guides else 0.0 for index in range(len(self.guides))]
         return [agent * factor if phase.agent else 0.0, agent if critic_learns else 0.0, *guides]
 
-    def set_learning_rates(self, progress: float) -> None:
-        """Set the learning rates of this phase, and freeze the networks that do not learn."""
-        for group, rate in zip(self.optimiser.param_groups, self.learning_rates(progress), strict=True):
-            group["lr"] = rate
-            for parameter in group["params"]:
+    def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
+        """Freeze the networks that do not learn in this phase, and do what `PPO` does."""
+        for group, rate in zip(self.gradient.groups, self.learning_rates(progress), strict=True):
+            for parameter in group:
                 parameter.requires_grad_(rate > 0)
+        return super().prepare(batch, progress)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts; arguments as for `PPO.update`.
@@ -250,12 +237,3 @@ class DynamicCoil(PPO):
                 before = functional_call(guide, initial, (observed.copy(),))["action"]
                 metrics[f"moved_{name}"] = float((guide(observed)["action"] - before).abs().mean())
         return metrics
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return super().state_dict() | {"phases": self.phases.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        super().load_state_dict(state)
-        self.phases.load_state_dict(state["phases"])

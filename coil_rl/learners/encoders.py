@@ -16,7 +16,7 @@ from coil_rl.envs.limits import check_choice, check_range
 
 ACTIVATIONS: Mapping[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 Shapes = Mapping[NestedKey, torch.Size]
-STATE, IS_INIT = "policy_state", "is_init"  # what an env carries for a network with a memory
+STATE = "policy_state"  # what an env carries for a network with a memory
 
 
 def entry_specs(env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None) -> list[TensorSpec]:
@@ -87,21 +87,19 @@ class ReadImage(ReadEntry):
 
 
 class ConcatObservations(nn.Module):
-    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions.
+    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions; `width` is its length.
 
     Args:
         env, in_keys: as for `entry_specs`.
         shapes: shapes of entries that the env does not write, without the batch dimensions.
-        images: reads entries of three dimensions; None: they are flattened like others.
-
-    Attributes:
-        width: D, length of the concatenated vector.
+        network: a `Cnn` reads entries of three dimensions; otherwise they are flattened like others.
     """
 
     def __init__(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None, images: "Cnn | None" = None
+        self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None, network: "Mlp | None" = None
     ) -> None:
         super().__init__()
+        images = network if isinstance(network, Cnn) else None
         entries, dims = list[ReadEntry](), len(env.batch_size)
         for key, spec in zip(in_keys, entry_specs(env, in_keys, shapes), strict=True):
             entry = ReadEntry(spec, dims)
@@ -109,21 +107,18 @@ class ConcatObservations(nn.Module):
                 try:
                     entry = ReadImage(spec, dims, images)
                 except RuntimeError as error:
-                    raise ValueError(
-                        f"the image {key} of shape {list(entry.shape)} is too small for kernels="
-                        f"{list(images.kernels)} with strides={list(images.strides)}; take smaller or fewer ones"
-                    ) from error
+                    layers = f"kernels={list(images.kernels)} with strides={list(images.strides)}"
+                    problem = f"the image {key} of shape {list(entry.shape)} is too small for {layers}"
+                    raise ValueError(f"{problem}; take smaller or fewer ones") from error
             entries.append(entry)
         self.entries = nn.ModuleList(entries)
         self.width = sum(entry.width for entry in entries)
         if images and not any(isinstance(entry, ReadImage) for entry in entries):
-            raise ValueError(
-                f"a convolutional network needs an image among {', '.join(map(str, in_keys))}, an entry of three "
-                "dimensions, but there is none; use network=mlp"
-            )
+            needed = f"an image among {', '.join(map(str, in_keys))}, an entry of three dimensions"
+            raise ValueError(f"a convolutional network needs {needed}, but there is none; use network=mlp")
 
     def forward(self, *inputs: Tensor) -> Tensor:
-        """Concatenate inputs [*batch, ...] to [*batch, D]."""
+        """Concatenate inputs [*batch, ...] to [*batch, width]."""
         flat = [entry(x) for entry, x in zip(self.entries, inputs, strict=True)]
         return torch.cat(flat, -1) if len(flat) > 1 else flat[0]
 
@@ -144,10 +139,6 @@ class Mlp:
         check_range(0, 16, hidden_layers=len(self.hidden))
         for width in self.hidden:
             check_range(1, 4096, hidden=width)
-
-    def observations(self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None) -> ConcatObservations:
-        """Return the part that turns entries into one vector."""
-        return ConcatObservations(env, in_keys, shapes)
 
     def layers(self, inputs: int, outputs: int, gain: float, device: torch.device | None = None) -> MLP:
         """Return the layers after it; `gain` scales the initial weights of the last one."""
@@ -191,10 +182,6 @@ class Cnn(Mlp):
             for number in getattr(self, name):
                 check_range(1, 4096, **{name: number})
 
-    def observations(self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None) -> ConcatObservations:
-        """Return the part that turns entries into one vector."""
-        return ConcatObservations(env, in_keys, shapes, self)
-
 
 @dataclass(frozen=True)
 class Gru(Mlp):
@@ -228,15 +215,14 @@ class Gru(Mlp):
 
     def env_transforms(self) -> list[Transform]:
         """Return transforms by which an env marks the starts of episodes and carries the state, as TorchRL expects."""
-        return [InitTracker(IS_INIT), TensorDictPrimer({STATE: Unbounded((1, self.state))}, expand_specs=True)]
+        return [InitTracker(), TensorDictPrimer({STATE: Unbounded((1, self.state))}, expand_specs=True)]
 
 
 def without_memory(network: Mlp, learner: str) -> Mlp:
     """Return the network of a learner that cannot train a memory; raises a `ValueError` for one that has a memory."""
     if isinstance(network, Gru):
-        raise ValueError(
-            f"{learner} cannot train a network with a memory; take network=mlp, or learner=ppo, a2c or reinforce"
-        )
+        remedy = "take network=mlp, or learner=ppo, a2c or reinforce"
+        raise ValueError(f"{learner} cannot train a network with a memory; {remedy}")
     return network
 
 
@@ -262,7 +248,7 @@ class ObservationNetwork(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        self.concat = network.observations(env, in_keys, shapes)
+        self.concat = ConcatObservations(env, in_keys, shapes, network)
         self.layers = network.layers(self.concat.width, outputs, gain, env.device)
         self.dtype = dtype or torch.get_default_dtype()
 

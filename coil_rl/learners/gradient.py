@@ -3,7 +3,8 @@
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Literal
+from dataclasses import KW_ONLY, dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -12,51 +13,41 @@ from torch import Tensor, nn
 from coil_rl.compiled import Compiled
 from coil_rl.envs.limits import check_choice
 from coil_rl.errors import UserError
+from coil_rl.learners.state import Stateful
 
 ENOUGH = 2_000  # steps of a run, for which compilation pays in the second run of the same sizes
 
 
-class GradientStep:
+@dataclass(eq=False)
+class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
 
-    Args:
-        losses: returns scalars by name for a minibatch.
-        groups: parameters, grouped by learning rate.
-        modules: hold the tensors that the losses read, besides the parameters.
-        rate: initial learning rate.
-        eps: of Adam.
-        max_grad_norm: gradients are scaled down to this norm, over all parameters together.
-        after: what follows each step.
-        compile: whether to compile the step, which changes the last digits; "auto": after the first update with any, if
-            the run will have 2,000 steps or more.
-        compilable: whether it can be compiled.
-
-    Raises:
-        ValueError: for another value of `compile`, or true if it cannot be compiled.
+    Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`.
     """
 
-    NUMBERS = ("steps", "begun", "compile")
+    parts: ClassVar[tuple[str, ...]] = ("adam", "steps", "begun", "compile")
 
-    def __init__(
-        self,
-        losses: Callable[[TensorDictBase], TensorDictBase],
-        groups: Sequence[Sequence[nn.Parameter]],
-        modules: Sequence[nn.Module],
-        *,
-        rate: float,
-        eps: float,
-        max_grad_norm: float,
-        after: Callable[[], Any] | None = None,
-        compile: bool | Literal["auto"] = "auto",
-        compilable: bool = True,
-    ) -> None:
-        check_choice(("true", "false", "auto"), compile=str(compile).lower())
-        if compile is True and not compilable:
+    losses: Callable[[TensorDictBase], TensorDictBase]  # returns scalars by name for a minibatch
+    groups: Sequence[Sequence[nn.Parameter]]  # parameters, grouped by learning rate
+    modules: Sequence[nn.Module]  # hold the tensors that the losses read, besides the parameters
+    rates: Callable[[float], Sequence[float]]  # learning rates of the groups by the progress of the run
+    _: KW_ONLY
+    eps: float  # of Adam
+    max_grad_norm: float  # gradients are scaled down to this norm, over all parameters together
+    after: Callable[[], Any] | None = None  # what follows each step
+    # Whether to compile the step, which changes the last digits; "auto": after the first update with any, if the run
+    # will have 2,000 steps or more.
+    compile: bool | Literal["auto"] = "auto"
+    compilable: bool = True  # whether it can be compiled
+
+    def __post_init__(self) -> None:
+        check_choice(("true", "false", "auto"), compile=str(self.compile).lower())
+        self.required = self.compile is True
+        if self.required and not self.compilable:
             raise ValueError("compile=true: this learner's update depends on data in its shapes; take compile=auto")
-        self.losses, self.modules, self.max_grad_norm, self.after = losses, modules, max_grad_norm, after
-        self.parameters = [parameter for group in groups for parameter in group]
-        self.optimiser = torch.optim.Adam([{"params": group} for group in groups], rate, eps=eps, fused=True)
-        self.compile, self.required = compile if compilable else False, compile is True
+        self.compile = self.compile if self.compilable else False
+        self.parameters = [parameter for group in self.groups for parameter in group]
+        self.adam = torch.optim.Adam([{"params": group} for group in self.groups], eps=self.eps, fused=True)
         self.compiled = Compiled(self._on_tensors)
         self.steps, self.begun = 0, 0.0  # progress of the run at the first step
         self.names: list[str] = []  # of the losses
@@ -64,8 +55,10 @@ class GradientStep:
         self.weighted: list[str] = []
         self.state: list[Tensor] = []  # all tensors that a step reads, besides its minibatch
 
-    def decide(self, progress: float) -> None:
-        """Decide for "auto", at the second update that takes steps; `progress` is that of the run before an update."""
+    def begin(self, progress: float) -> None:
+        """Set the learning rates of an update, and decide for "auto" at the second update that takes steps."""
+        for group, rate in zip(self.adam.param_groups, self.rates(progress), strict=True):
+            group["lr"] = rate
         if not self.steps:
             self.begun = progress
         elif self.compile == "auto" and progress > self.begun:
@@ -74,8 +67,7 @@ class GradientStep:
     def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`.
 
-        Raises:
-            UserError: if `compile` is true and there is no C++ compiler.
+        If `compile` is true and there is no C++ compiler, that is a `UserError`.
         """
         self.steps += 1
         if self.compile is True:
@@ -93,7 +85,7 @@ class GradientStep:
 
     def _compiled(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         self.keys, self.weighted = list(minibatch.keys(True, True)), list(weights)
-        rates = [group["lr"] for group in self.optimiser.param_groups]
+        rates = [group["lr"] for group in self.adam.param_groups]
         numbers = torch.tensor([*weights.values(), *rates], device=minibatch.device)
         self.state = self.state or self._state()
         (values,) = self.compiled(numbers, *(minibatch[key] for key in self.keys), *self.state)
@@ -105,7 +97,10 @@ class GradientStep:
             parameter.grad = None
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm)
-        self.optimiser.step()
+        self._step()
+
+    def _step(self) -> None:
+        self.adam.step()
         if self.after is not None:
             self.after()
 
@@ -115,7 +110,7 @@ class GradientStep:
         return {name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)}
 
     def _state(self) -> list[Tensor]:
-        state = self.optimiser.state
+        state = self.adam.state
         for parameter in self.parameters:
             if parameter not in state:  # as Adam does at the first step
                 moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
@@ -138,15 +133,13 @@ class GradientStep:
             for parameter, gradient in zip(self.parameters, gradients, strict=True):
                 parameter.grad = gradient
             torch.nn.utils.clip_grad_norm_(self.parameters, self.max_grad_norm, foreach=False)
-            self.optimiser.step()
-            if self.after is not None:
-                self.after()
+            self._step()
         return [_vector(losses)]
 
     @contextmanager
     def _traceable(self, rates: Sequence[Tensor]) -> Iterator[None]:
         """Let the optimiser use learning rates that are tensors, and single operations."""
-        groups = self.optimiser.param_groups
+        groups = self.adam.param_groups
         before = [dict(group) for group in groups]
         for group, rate in zip(groups, rates, strict=True):
             group.update(lr=rate, fused=False, foreach=False, capturable=True)
@@ -158,17 +151,10 @@ class GradientStep:
             for parameter in self.parameters:
                 parameter.grad = None
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state of the optimiser, the number of steps, and whether they are compiled."""
-        numbers = {name: getattr(self, name) for name in self.NUMBERS}
-        return {"adam": self.optimiser.state_dict(), **numbers}
-
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`."""
-        self.optimiser.load_state_dict(state["adam"])
+        super().load_state_dict(state)
         self.state = []
-        for name in self.NUMBERS:
-            setattr(self, name, state[name])
 
 
 def _vector(losses: TensorDictBase) -> Tensor:

@@ -31,7 +31,9 @@ ADVICE = "guide_action"
 
 
 class IBRL(SAC):
-    """The IBRL learner; the env writes `guide_action`, which the networks need not observe.
+    """The IBRL learner; the env writes `guide_action` (else a `KeyError`), which the networks need not observe.
+
+    What `SAC` refuses, an option that it does not take, and `edit` for an action without bounds are a `ValueError`.
 
     Args:
         env: the env, with continuous actions and advice.
@@ -42,10 +44,6 @@ class IBRL(SAC):
             action, as in EXPO; 0: there is none.
         guide: row of the advice.
         options: as for `SAC`, without `target_critics` and `uncertainty`.
-
-    Raises:
-        ValueError: as `SAC`, for an option that it does not take, or with `edit` for an action without bounds.
-        KeyError: if the env writes no advice.
     """
 
     reported = (*SAC.reported, "guide_share")

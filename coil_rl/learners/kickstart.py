@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,35 +22,28 @@ if TYPE_CHECKING:
 EDGE = 1e-3  # minimum distance of a guide's action from the bounds, as a fraction of half the range
 
 
+@dataclass(eq=False)
 class KickstartLoss:
     """Auxiliary loss of a policy: its distance from the action g of a guide. The metric is `loss_NAME`.
 
     An unknown kind, or a scale that is not positive, is a `ValueError`.
-
-    Args:
-        coefficient: of the loss, a number or a schedule.
-        kind: "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) || pi), which also
-            trains the standard deviation of the policy. For bounded actions both normal distributions are squashed.
-        scale: standard deviation of the guide for the divergence, before squashing.
-        guide: index of the guide in the advice.
-        advice_key: entry with the advice, [N, n_guides, A].
     """
 
-    name = "guide"
-    critics: Critics | None = None  # of the learner's policy, if the learner has such
+    name: ClassVar[str] = "guide"
 
-    def __init__(
-        self,
-        coefficient: float | Schedule = Linear(1.0, 0.0, until=0.5),
-        kind: Literal["likelihood", "divergence"] = "likelihood",
-        scale: float = 0.2,
-        guide: int = 0,
-        advice_key: NestedKey = "guide_action",
-    ) -> None:
-        check_choice(("likelihood", "divergence"), kind=kind)
-        check_range(0, above=True, scale=scale)
-        self.coefficient, self.kind, self.scale, self.guide = schedule(coefficient), kind, scale, guide
-        self.advice_key = advice_key
+    coefficient: float | Schedule = Linear(1.0, 0.0, until=0.5)  # of the loss
+    # "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) || pi), which also trains the
+    # standard deviation of the policy. For bounded actions both normal distributions are squashed.
+    kind: Literal["likelihood", "divergence"] = "likelihood"
+    scale: float = 0.2  # standard deviation of the guide for the divergence, before squashing
+    guide: int = 0  # index of the guide in the advice
+    advice_key: NestedKey = "guide_action"  # entry with the advice, [N, n_guides, A]
+
+    def __post_init__(self) -> None:
+        check_choice(("likelihood", "divergence"), kind=self.kind)
+        check_range(0, above=True, scale=self.scale)
+        self.coefficient_at = schedule(self.coefficient)
+        self.critics: Critics | None = None  # of the learner's policy, if the learner has such
 
     @property
     def keys(self) -> list[NestedKey]:
@@ -82,6 +76,7 @@ class KickstartLoss:
         return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1)
 
 
+@dataclass(eq=False)
 class FilteredKickstartLoss(KickstartLoss):
     """As `KickstartLoss`, weighted by the critics' opinion of g, for learners with action values, such as SAC.
 
@@ -90,9 +85,7 @@ class FilteredKickstartLoss(KickstartLoss):
     Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)). Other arguments are those of `KickstartLoss`.
     """
 
-    def __init__(self, *, soft: bool = False, **options: Any) -> None:
-        super().__init__(**options)
-        self.soft = soft
+    soft: bool = field(default=False, kw_only=True)
 
     @property
     def keys(self) -> list[NestedKey]:

@@ -28,7 +28,7 @@ from torchrl.modules import (
 )
 
 from coil_rl.learners.anchor import Anchor, AnchoredHead, pull_to_choice, pull_to_number
-from coil_rl.learners.encoders import IS_INIT, STATE, Gru, Mlp, ObservationNetwork, Shapes, entry_specs
+from coil_rl.learners.encoders import STATE, ConcatObservations, Gru, Mlp, ObservationNetwork, Shapes, entry_specs
 from coil_rl.learners.normaliser import Normaliser
 
 UNCLIPPED, REMEMBERED = "unclipped_action", "remembered"
@@ -38,10 +38,7 @@ DEFAULT = Mlp()
 class GlobalScaleHead(nn.Module):
     """Normal distribution with a mean from a network and a standard deviation that is the same in every state.
 
-    Args:
-        network: its outputs are the numbers of an action.
-        event: shape of an action.
-        scale: initial standard deviation.
+    The network's outputs are the numbers of an action, of shape `event`; `scale` is the initial standard deviation.
     """
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
@@ -72,10 +69,8 @@ class GaussianHead(nn.Module):
 class ChoicesHead(nn.Module):
     """Logits of several choices at once from a network, padded with minus infinity to the longest choice.
 
-    Args:
-        network: its outputs are the logits of all choices, each of as many as the longest one has.
-        event: shape of an action, one index for each choice.
-        options: number of options of each choice, of this shape.
+    The network gives logits for all choices, each of as many as the longest one has. An action has the shape `event`,
+    one index for each choice; so have the `options`, their numbers.
     """
 
     valid: Tensor
@@ -103,8 +98,7 @@ class Choices(Independent):
     @property
     def deterministic_sample(self) -> Tensor:
         """The most probable choices."""
-        mode: Tensor = self.base_dist.mode
-        return mode
+        return self.base_dist.mode
 
 
 def shaped(vectors: Tensor, event: torch.Size) -> Tensor:
@@ -161,10 +155,9 @@ def action_spec(env: EnvBase) -> TensorSpec:
     numbers = isinstance(spec, (Bounded, Unbounded)) and spec.dtype.is_floating_point
     options = isinstance(spec, (Categorical, MultiCategorical, OneHot)) and not isinstance(spec, MultiOneHot)
     if not (numbers or options):
-        raise ValueError(
-            f"the action of this env is {type(spec).__name__} of {spec.dtype}, but a policy chooses numbers (Bounded, "
-            "Unbounded), one of several options (Categorical, OneHot) or several such (MultiCategorical); transform it"
-        )
+        known = "numbers (Bounded, Unbounded), one of several options (Categorical, OneHot) or several such"
+        given = f"the action of this env is {type(spec).__name__} of {spec.dtype}"
+        raise ValueError(f"{given}, but a policy chooses {known} (MultiCategorical); transform it")
     return spec
 
 
@@ -193,9 +186,8 @@ def actor(
     `ConcatObservations`. A network with a memory also writes its next state, see `Gru`. With an `anchor` the policy
     starts as its guide.
 
-    Raises:
-        ValueError: for an action of another kind, or a network with a memory that the env does not carry.
-        KeyError: if the env has no such entry, or no advice for an anchor.
+    An action of another kind, or a network with a memory that the env does not carry, is a `ValueError`; an entry that
+    the env does not have, such as the advice for an anchor, a `KeyError`.
     """
     spec, key, event = action_spec(env), env.action_key, action_shape(env)
     keys = in_keys if normaliser is None else normaliser.reads(in_keys)
@@ -256,14 +248,13 @@ def memory(
     state is a `ValueError`.
     """
     carried = {key: spec.shape[len(env.batch_size) :] for key, spec in env.observation_spec.items(True, True)}
-    if IS_INIT not in carried or carried.get(STATE) != (1, network.state):
-        raise ValueError(
-            "the env does not carry the memory of the network; put the network's env_transforms() around the env"
-        )
-    entries = network.observations(env, in_keys, shapes)
+    if "is_init" not in carried or carried.get(STATE) != (1, network.state):
+        remedy = "put the network's env_transforms() around the env"
+        raise ValueError(f"the env does not carry the memory of the network; {remedy}")
+    entries = ConcatObservations(env, in_keys, shapes)
     gru = GRUModule(
         entries.width, network.state, device=env.device,
-        in_keys=["concatenated", STATE, IS_INIT], out_keys=[REMEMBERED, ("next", STATE)],
+        in_keys=["concatenated", STATE, "is_init"], out_keys=[REMEMBERED, ("next", STATE)],
     )  # fmt: skip
     return [FastTensorDictModule(entries, read, ["concatenated"]), gru]
 
@@ -281,15 +272,13 @@ def split_memory(
 
 def action_shape(env: EnvBase) -> torch.Size:
     """Return the shape of an action of an env without the batch dimensions."""
-    shape: torch.Size = env.full_action_spec[env.action_key].shape[len(env.batch_size) :]
-    return shape
+    return env.full_action_spec[env.action_key].shape[len(env.batch_size) :]
 
 
 def option_counts(spec: Categorical | MultiCategorical, event: torch.Size) -> Tensor:
     """Return the number of options of each choice of an action, [*event]."""
     if isinstance(spec, MultiCategorical):
-        counts: Tensor = spec.nvec.reshape(-1, event[-1])[0].expand(event)
-        return counts.to(spec.device)
+        return spec.nvec.reshape(-1, event[-1])[0].expand(event).to(spec.device)
     return torch.full(event, spec.space.n, device=spec.device)
 
 

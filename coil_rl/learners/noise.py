@@ -1,10 +1,9 @@
 """A schedule of the exploration noise that begins when the failures of training have stopped."""
 
 import math
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
-from typing import Any
+from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -12,16 +11,19 @@ from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners.networks import GlobalScaleHead
+from coil_rl.learners.state import Stateful
 from coil_rl.transforms.action_space import nested_key
 
 
 @dataclass(eq=False)
-class NoiseDecay:
+class NoiseDecay(Stateful):
     """Upper limit of the standard deviation of a policy, which decays exponentially once episodes no longer fail.
 
     The agent needs the noise until it can do its task. Later it only makes the actions rough. A value out of range is a
     `ValueError`.
     """
+
+    parts: ClassVar[tuple[str, ...]] = ("failures", "begin")
 
     end: float = 0.05  # limit at the end of the run, before squashing
     _: KW_ONLY
@@ -34,8 +36,8 @@ class NoiseDecay:
         check_range(0, 1, tolerance=self.tolerance)
         check_range(1, episodes=self.episodes)
         self.key: NestedKey = unravel_key(("next", nested_key(self.failure)))
-        self.failures: deque[bool] = deque(maxlen=self.episodes)
-        self.begin: tuple[float, float] | None = None  # progress and standard deviation
+        self.failures: list[bool] = []  # of the last episodes
+        self.begin: tuple[float, ...] = ()  # progress and standard deviation; empty before the decay
         self.scales: list[Tensor] = []  # logarithms of the standard deviations
 
     def attach(self, policy: nn.Module) -> None:
@@ -47,12 +49,12 @@ class NoiseDecay:
     @torch.no_grad()
     def apply(self, batch: TensorDictBase, progress: float) -> float:
         """Limit the noise after an update from a batch, and return the mean standard deviation of the policy."""
-        self.failures.extend(batch[self.key][batch["next", "done"]].tolist())
+        self.failures = (self.failures + batch[self.key][batch["next", "done"]].tolist())[-self.episodes :]
         scale = float(torch.cat(self.scales).exp().mean())
-        full = len(self.failures) == self.failures.maxlen
-        if self.begin is None and full and sum(self.failures) <= self.tolerance * len(self.failures):
+        full = len(self.failures) == self.episodes
+        if not self.begin and full and sum(self.failures) <= self.tolerance * self.episodes:
             self.begin = progress, scale
-        if self.begin is None:
+        if not self.begin:
             return scale
         since, first = self.begin
         share = (progress - since) / (1 - since) if since < 1 else 1.0
@@ -60,13 +62,3 @@ class NoiseDecay:
         for log_scale in self.scales:
             log_scale.clamp_(max=math.log(limit))
         return min(scale, limit)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return whether the last episodes failed, and when the decay began."""
-        return {"failures": list(self.failures), "begin": self.begin}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
-        self.failures.clear()
-        self.failures.extend(state["failures"])
-        self.begin = state["begin"]

@@ -97,9 +97,8 @@ def normaliser(env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Seq
     if not isinstance(normalise, bool):
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
-            raise ValueError(
-                f"normalise: {', '.join(unread)} is not observed; observed are {', '.join(map(str, in_keys))}"
-            )
+            observed = ", ".join(map(str, in_keys))
+            raise ValueError(f"normalise: {', '.join(unread)} is not observed; observed are {observed}")
     else:
         advice, batch_dims = advice_keys(env), len(env.batch_size)
         chosen = [

@@ -14,12 +14,13 @@ from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
 
-class OffPolicy:
+class OffPolicy(Stateful):
     """Replay buffer, optimiser, target networks and update.
 
     A step is stored with the observations before and after it, advice included, because a guide with memory or
@@ -29,7 +30,8 @@ class OffPolicy:
     the agent's own, since the sum is a part of the env.
 
     A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of (`minimised`) and
-    the values to report (`reported`).
+    the values to report (`reported`). A value out of range is a `ValueError`, and so is an env in which the effect or
+    the reward of an action changes over the run.
 
     Args:
         env: the env, for its device and transforms.
@@ -51,15 +53,12 @@ class OffPolicy:
         seed: of the samples.
 
     Attributes:
-        kind, compilable: as for `PPO`.
         keys: entries that a batch must have.
-
-    Raises:
-        ValueError: for a value out of range, or if the effect or the reward of an action changes over the run.
     """
 
-    kind: ClassVar[str] = "agent"
+    kind: ClassVar[str] = "agent"  # as for `PPO`
     compilable: ClassVar[bool] = True
+    parts: ClassVar[tuple[str, ...]] = ("loss", "gradient", "generator", "pending_updates", "normaliser", "anchor")
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
 
@@ -94,25 +93,21 @@ class OffPolicy:
         check_range(0, LARGEST_SEED, seed=seed)
         for transform in env.modules():
             if isinstance(transform, GuideTransform) and callable(getattr(transform, transform.mdp_parameter, None)):
-                raise ValueError(
-                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run, so stored steps "
-                    "would no longer show the effect of an action; make it a number, or use a learner without replay, "
-                    "such as PPO"
-                )
+                problem = f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run"
+                effect = "so stored steps would no longer show the effect of an action"
+                remedy = "make it a number, or use a learner without replay, such as PPO"
+                raise ValueError(f"{problem}, {effect}; {remedy}")
         if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
-            raise ValueError(
-                f"{type(self).__name__} needs one entry action and one entry reward, but this env has "
-                f"{', '.join(map(str, keys))}; rename them by TorchRL's RenameTransform, or use PPO"
-            )
+            needed, has = "one entry action and one entry reward", ", ".join(map(str, keys))
+            remedy = "rename them by TorchRL's RenameTransform, or use PPO"
+            raise ValueError(f"{type(self).__name__} needs {needed}, but this env has {has}; {remedy}")
         self.normaliser = normaliser(env, in_keys, normalise)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
-            raise ValueError(
-                f"prior={prior} needs steps in which a guide acts in place of the agent, as with the transform "
-                "Takeover, by an action that the agent could choose; or take prior=0"
-            )
+            needed = "steps in which a guide acts in place of the agent, as with the transform Takeover"
+            raise ValueError(f"prior={prior} needs {needed}, by an action that the agent could choose; or take prior=0")
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [*in_keys, "action", *(unravel_key(("next", key)) for key in after)]
         self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else [*self.stored_keys]
@@ -139,16 +134,9 @@ class OffPolicy:
         self.loss.make_value_estimator(gamma=self.gamma)
         self.target = SoftUpdate(self.loss, tau=self.tau)
         self.gradient = GradientStep(
-            self.losses,
-            [list(self.loss.parameters())],
-            [self.loss],
-            rate=self.learning_rate(0),
-            eps=1e-8,
-            max_grad_norm=self.max_grad_norm,
-            after=self.target.step,
-            compile=self.compile,
-            compilable=self.compilable,
-        )
+            self.losses, [list(loss.parameters())], [loss], lambda progress: [self.learning_rate(progress)], eps=1e-8,
+            max_grad_norm=self.max_grad_norm, after=self.target.step, compile=self.compile, compilable=self.compilable,
+        )  # fmt: skip
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.
@@ -161,10 +149,8 @@ class OffPolicy:
             Means over the minibatches of the `reported` values, 0 before learning starts; the number of `minibatches`;
             the number of stored steps (`kept`); the learning rate; and the values of `describe`.
         """
-        for group in self.gradient.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
         self.store(batch)
-        self.gradient.decide(progress)
+        self.gradient.begin(progress)
         weights, reports, minibatch = self.loss_weights(progress), [], None
         for minibatch in self.samples():
             reports.append(self.gradient(minibatch, weights))
@@ -223,8 +209,7 @@ class OffPolicy:
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and other values, scalars."""
-        losses: TensorDictBase = self.loss(minibatch)
-        return losses
+        return self.loss(minibatch)
 
     def loss_weights(self, progress: float) -> dict[str, float]:
         """Return the weights of the losses in the sum that an update minimises."""
@@ -236,35 +221,21 @@ class OffPolicy:
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""
-        return {
-            "loss": self.loss.state_dict(),
-            "gradient": self.gradient.state_dict(),
-            "buffers": [
-                {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
-                for buffer in (self.buffer, self.guide_buffer)
-            ],
-            "generator": self.generator.get_state(),
-            "pending_updates": self.pending_updates,
-            "normaliser": {} if self.normaliser is None else self.normaliser.state_dict(),
-            "anchor": self.anchor.state_dict() if self.anchor else {},
-        }
+        buffers = [
+            {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
+            for buffer in (self.buffer, self.guide_buffer)
+        ]
+        return super().state_dict() | {"buffers": buffers}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-        self.loss.load_state_dict(state["loss"])
-        self.gradient.load_state_dict(state["gradient"])
+        super().load_state_dict(state)
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if stored["steps"]:
                 steps = TensorDict.from_dict(stored["steps"], batch_size=stored["steps"]["action"].shape[:1])
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
-        self.generator.set_state(state["generator"].cpu())
-        self.pending_updates = state["pending_updates"]
-        if self.normaliser is not None:
-            self.normaliser.load_state_dict(state["normaliser"])
-        if self.anchor:
-            self.anchor.load_state_dict(state["anchor"])
 
 
 def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:

@@ -29,19 +29,23 @@ from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
 
 
-class PPO:
+class PPO(Stateful):
     """The PPO learner, and the base class of the other on-policy learners.
 
     COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps (`agent_acts` is false),
     the policy learns from the agent's steps only, and the critic from all. Subclasses override `build_loss`, `losses`,
-    `build_networks`, `parameter_groups` and `set_learning_rates`.
+    `build_networks`, `parameter_groups` and `learning_rates`.
 
     A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
     anew from the state that was stored in the first step of each row; then their steps are a minibatch as any other.
+
+    A value out of range, or an action that no policy can choose, is a `ValueError`; an entry that the env does not have
+    a `KeyError`.
 
     Args:
         env: the env, for its specs.
@@ -68,18 +72,10 @@ class PPO:
         seed: of the order of minibatches.
 
     Attributes:
-        kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions)
-            or "guides" (guides besides an agent).
-        with_memory: whether the learner can train a network with a memory.
-        compilable: whether the update can be compiled.
         policy: writes `action` and `action_log_prob`.
         head: the part of the policy after its memory; all of it without one.
         critic: writes `state_value`.
         keys: entries that a batch must have.
-
-    Raises:
-        ValueError: for a value out of range, or an action that no policy can choose.
-        KeyError: if the env has no such entry.
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -89,9 +85,12 @@ class PPO:
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
+    # What the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions) or
+    # "guides" (guides besides an agent).
     kind: ClassVar[str] = "agent"
-    with_memory: ClassVar[bool] = True
-    compilable: ClassVar[bool] = True
+    with_memory: ClassVar[bool] = True  # whether the learner can train a network with a memory
+    compilable: ClassVar[bool] = True  # whether the update can be compiled
+    parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "generator", "noise", "anchor")
 
     def __init__(
         self,
@@ -128,7 +127,7 @@ class PPO:
         if noise and anchor:
             raise ValueError("an anchor has its own schedule of the noise; leave out noise, or the anchor")
         self.epochs, self.minibatches = epochs, minibatches
-        self.critic_coefficient, self.auxiliary, self.noise, self.anchor = critic, list(auxiliary), noise, anchor
+        self.auxiliary, self.noise, self.anchor = list(auxiliary), noise, anchor
         in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
         if not self.with_memory:
@@ -141,19 +140,16 @@ class PPO:
         if noise:
             noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
-        self.loss = self.build_loss(clip)
+        self.loss = self.build_loss(
+            clip, entropy_bonus=self.entropy(0) > 0, entropy_coeff=self.entropy(0), critic_coeff=critic,
+            loss_critic_type="l2", functional=False,
+        )  # fmt: skip
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.gradient = GradientStep(
-            self.all_losses,
-            self.parameter_groups(),
-            [self.policy, self.critic, self.loss],
-            rate=self.learning_rate(0),
-            eps=1e-5,
-            max_grad_norm=max_grad_norm,
-            compile=compile,
+            self.all_losses, self.parameter_groups(), [self.policy, self.critic, self.loss], self.learning_rates,
+            eps=1e-5, max_grad_norm=max_grad_norm, compile=compile,
             compilable=self.compilable and self.memory is None and not self.guide_may_act,
-        )
-        self.optimiser = self.gradient.optimiser
+        )  # fmt: skip
         self.generator = torch.Generator().manual_seed(seed)
         self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
         self.reward_key = unravel_key(("next", env.reward_key))
@@ -173,28 +169,17 @@ class PPO:
         policy = networks.actor(env, in_keys, network, normaliser=self.normaliser, **options)
         return policy, networks.critic(env, in_keys, network, self.normaliser)
 
-    def build_loss(self, clip: float) -> LossModule:
-        """Return TorchRL's loss of policy and critic."""
-        return ClippedLoss(
-            self.head,
-            self.critic,
-            clip_epsilon=clip,
-            entropy_bonus=self.entropy(0) > 0,
-            entropy_coeff=self.entropy(0),
-            critic_coeff=self.critic_coefficient,
-            loss_critic_type="l2",
-            normalize_advantage=True,
-            functional=False,
-        )
+    def build_loss(self, clip: float, **options: Any) -> LossModule:
+        """Return TorchRL's loss of policy and critic; `options` are those of any such loss."""
+        return ClippedLoss(self.head, self.critic, clip_epsilon=clip, normalize_advantage=True, **options)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
         return [[*self.policy.parameters(), *self.critic.parameters()]]
 
-    def set_learning_rates(self, progress: float) -> None:
-        """Set the learning rate of each parameter group."""
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.learning_rate(progress)
+    def learning_rates(self, progress: float) -> list[float]:
+        """Return the learning rate of each parameter group."""
+        return [self.learning_rate(progress)] * len(self.gradient.groups)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Learn from a batch of rollouts.
@@ -208,7 +193,6 @@ class PPO:
             learning rate.
         """
         rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
-        self.gradient.decide(progress)
         reports = [self.gradient(minibatch, weights) for minibatch in self.draw_minibatches(rows)]
         known = {"learning_rate": self.learning_rate(progress), "compiled": float(self.gradient.compile is True)}
         return self.gradient.means(reports) | known | self.finish(batch, progress)
@@ -226,7 +210,7 @@ class PPO:
         weights = {"loss_objective": learns, "loss_critic": 1.0}
         if getattr(self.loss, "entropy_bonus", False):
             weights["loss_entropy"] = learns
-        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
+        return weights | {f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary}
 
     def policy_waits(self, progress: float) -> bool:
         """Return whether only the critic learns."""
@@ -235,10 +219,8 @@ class PPO:
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Do what follows an update: learn the statistics of the observations, and apply the noise schedule, if any.
 
-        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
-
-        Returns:
-            With a schedule the metric `noise`, the policy's standard deviation.
+        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones. With
+        a schedule the result is the metric `noise`, the policy's standard deviation.
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)
@@ -248,7 +230,7 @@ class PPO:
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
         """Apply the schedules and compute advantages; returns the rows to learn from, [B * T], with a memory [B, T]."""
-        self.set_learning_rates(progress)
+        self.gradient.begin(progress)
         if getattr(self.loss, "entropy_bonus", False):
             self.loss.entropy_coeff.fill_(self.entropy(progress))
         if self.reward_key != ("next", "reward"):  # several agents: their rewards are summed
@@ -266,10 +248,9 @@ class PPO:
         """Yield the minibatches of all passes over the rows, each pass in a random order."""
         size = len(rows) // self.minibatches
         if self.memory is not None and size < 1:
-            raise UserError(
-                f"minibatches={self.minibatches} are more than the {len(rows)} envs, but with a memory each needs all "
-                "steps of an env; take fewer minibatches or more envs"
-            )
+            problem = f"minibatches={self.minibatches} are more than the {len(rows)} envs"
+            needed = "with a memory each needs all steps of an env"
+            raise UserError(f"{problem}, but {needed}; take fewer minibatches or more envs")
         if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
             raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {rows.numel()} frames to each")
         for _ in range(self.epochs):
@@ -286,8 +267,7 @@ class PPO:
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: scalars, with `loss_objective` and `loss_critic`."""
-        losses: TensorDictBase = self.loss(minibatch)
-        return losses
+        return self.loss(minibatch)
 
     def masked_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch, those of the policy for the steps in which the agent acted only."""
@@ -302,28 +282,6 @@ class PPO:
         losses = self.losses(agent_steps)
         losses["loss_critic"] = self.loss.loss_critic(minibatch)[0].mean()
         return losses
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything the next update depends on besides its batch."""
-        return {
-            "policy": self.policy.state_dict(),
-            "critic": self.critic.state_dict(),
-            "gradient": self.gradient.state_dict(),
-            "generator": self.generator.get_state(),
-            "noise": self.noise.state_dict() if self.noise else {},
-            "anchor": self.anchor.state_dict() if self.anchor else {},
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        self.critic.load_state_dict(state["critic"])
-        self.gradient.load_state_dict(state["gradient"])
-        self.generator.set_state(state["generator"])
-        if self.noise:
-            self.noise.load_state_dict(state["noise"])
-        if self.anchor:
-            self.anchor.load_state_dict(state["anchor"])
 
 
 class ClippedLoss(ClipPPOLoss):
@@ -394,8 +352,7 @@ class Advantages:
         return batch
 
     def _values(self, states: TensorDictBase) -> Tensor:
-        value: Tensor = self.critic(states.select(*self.critic.in_keys))["state_value"]
-        return value
+        return self.critic(states.select(*self.critic.in_keys))["state_value"]
 
 
 def standardise(advantage: Tensor) -> Tensor:

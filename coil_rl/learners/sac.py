@@ -32,7 +32,8 @@ from coil_rl.transforms.action_space import nested_key
 class SAC(OffPolicy):
     """The SAC learner.
 
-    COIL is SAC with `guide_action` among `in_keys`.
+    COIL is SAC with `guide_action` among `in_keys`. A value out of range, an env with discrete actions, and what
+    `OffPolicy` refuses are a `ValueError`.
 
     Args:
         env: the env, with continuous actions.
@@ -49,13 +50,8 @@ class SAC(OffPolicy):
         critic_layer_norm: whether the critics normalise their layers, which bounds the values of actions never tried.
         uncertainty: whether the policy writes that of the critics, see `Critics`, for `AdaptiveMixedAction`.
         auxiliary: additional losses of the policy.
-        tau: step of the target networks towards the critics after each minibatch, as a fraction.
-        ratio: how often a step is sampled, on average.
-        options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large `max_grad_norm`:
-            otherwise the gradients of the critics dominate those of the policy.
-
-    Raises:
-        ValueError: for a value out of range, an env with discrete actions, or as `OffPolicy`.
+        tau, ratio, options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use a large
+            `max_grad_norm`: otherwise the gradients of the critics dominate those of the policy.
     """
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -88,10 +84,8 @@ class SAC(OffPolicy):
         check_range(0, above=True, action_scale=action_scale, temperature=temperature)
         spec = env.action_spec
         if not spec.dtype.is_floating_point:
-            raise ValueError(
-                "SAC needs continuous actions, but this env has discrete ones; "
-                "use action=continuous, or a learner for discrete actions, such as DQN"
-            )
+            remedy = "use action=continuous, or a learner for discrete actions, such as DQN"
+            raise ValueError(f"SAC needs continuous actions, but this env has discrete ones; {remedy}")
         in_keys, network = list(map(nested_key, in_keys)), without_memory(network or Mlp(hidden), "SAC")
         super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         self.action_scale, self.action_gain = action_scale, action_gain
@@ -99,12 +93,10 @@ class SAC(OffPolicy):
         self.actor = self.build_actor(env, in_keys, network)
         before = [] if self.normaliser is None else [self.normaliser]
         self.policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
-        criticising = replace(network, layer_norm=True) if critic_layer_norm else network
+        architectures = [replace(network, layer_norm=True) if critic_layer_norm else network] * critics
         arguments = {
             "actor_network": self.actor,
-            "qvalue_network": [
-                networks.action_critic(env, in_keys, criticising, self.normaliser) for _ in range(critics)
-            ],
+            "qvalue_network": [networks.action_critic(env, in_keys, each, self.normaliser) for each in architectures],
             "num_qvalue_nets": critics,
             "alpha_init": temperature,
             "target_entropy": float(-networks.action_shape(env).numel() if target_entropy is None else target_entropy),
@@ -152,7 +144,7 @@ class SAC(OffPolicy):
         """Return the weights of the losses in the sum that an update minimises."""
         learns = float(self.anchor is None or not self.anchor.waits(progress))
         weights = super().loss_weights(progress) | {"loss_actor": learns}
-        return weights | {f"loss_{each.name}": learns * each.coefficient(progress) for each in self.auxiliary}
+        return weights | {f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary}
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
@@ -166,11 +158,8 @@ class Critics(TensorDictModuleBase):
     """The critics of a loss of TorchRL, all at once; they read entries that have been normalised already.
 
     As a module it writes their uncertainty: the standard deviation of the values of an action, in the unit of the
-    return, as `("next", "uncertainty")` [*B, 1].
-
-    Args:
-        loss: it holds the critics.
-        weights: of the critics, those of the target networks perhaps; None: those that learn.
+    return, as `("next", "uncertainty")` [*B, 1]. The `weights` are perhaps those of the target networks; None: those
+    that learn.
     """
 
     def __init__(self, loss: SACLoss | REDQLoss, weights: TensorDictBase | None = None) -> None:

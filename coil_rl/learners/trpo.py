@@ -102,7 +102,7 @@ class TRPO(PPO):
             losses = {"loss_objective": total}
             for auxiliary in self.auxiliary:
                 losses[f"loss_{auxiliary.name}"] = loss = auxiliary(self.policy, rows)
-                total = total + auxiliary.coefficient(progress) * loss
+                total = total + auxiliary.coefficient_at(progress) * loss
             return total, kl_divergence(before, unsquashed(after)).mean(), losses
 
         loss, divergence, losses = evaluate()

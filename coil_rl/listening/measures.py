@@ -48,16 +48,14 @@ def intervention(
 
     Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a likely advice without
     information on this state; the advice of other guides stays. Donors come from all states, not from other cars at
-    the same time, because deterministic cars on one track are in the same state at the same time.
+    the same time, because deterministic cars on one track are in the same state at the same time. The change is
+    [N, n_guides] in action units; 0 if the advice has no influence.
 
     Args:
         act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
         donors: number of replacements per state and guide, at least 1.
         generator: of the donors, on the CPU.
-
-    Returns:
-        [N, n_guides] in action units; 0 if the advice has no influence.
     """
     advice = states[ADVICE]
     action, change = _act(act, states, advice), torch.zeros_like(advice[..., 0])

@@ -66,8 +66,39 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
     return section
 
 
+class WholeEpisode:
+    """No sections, the base class of what divides an episode; the pictures show each measure along the steps."""
+
+    names: ClassVar[tuple[str, ...]] = ()  # of the sections
+    record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that `draw` needs, by name
+
+    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
+        """Return where the rows of a state [B] are, [B, ...] each, besides the step."""
+        return {}
+
+    def section(self, place: TensorDictBase) -> Tensor:
+        """Return the index of the section of each place [B], entries as `locate` returns them."""
+        return torch.zeros(place.batch_size, dtype=torch.int64, device=place.device)
+
+    def draw(self, data: Survey, folder: Path) -> None:
+        """Draw the mean of each measure against the step; write the numbers as `listening.csv`, the last file."""
+        size = max(1, -(-int(data.step.max() + 1) // POINTS))
+        rows = data.means(**{"from": data.step // size * size})
+        strokes = style.strong_strokes(data.guides)
+        handles = [Line2D([], [], color=s.colour, ls=s.linestyle, label=guide) for guide, s in strokes.items()]
+        for measure, title, label, name in drawn(data.measures):
+            with style.picture(folder / name, title, handles, 3.6) as figure:
+                axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
+                style.lighten(axes)
+                for guide, stroke in strokes.items():
+                    own = [row for row in rows if row["guide"] == guide]
+                    x, y = [row["from"] for row in own], [row[measure] for row in own]
+                    axes.plot(x, y, color=stroke.colour, ls=stroke.linestyle, lw=1.5)
+        write_csv(rows, folder / "listening.csv")
+
+
 @dataclass(eq=False)
-class TrackSections:
+class TrackSections(WholeEpisode):
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
     The env writes `info` with the index of the `track` and the `pose` of each car, as `ConeTrackEnv` does.
@@ -158,34 +189,3 @@ class TrackSections:
         total = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).sum()
         count = min(len(line), max(1, round(total / self.bin)))
         return np.arange(len(line)) * count // len(line)
-
-
-class WholeEpisode:
-    """No sections; the pictures show each measure along the steps of the episodes."""
-
-    names: tuple[str, ...] = ()
-    record: ClassVar[Mapping[str, NestedKey]] = {}
-
-    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
-        """Return nothing: the step is known."""
-        return {}
-
-    def section(self, place: TensorDictBase) -> Tensor:
-        """Return 0 for each place."""
-        return torch.zeros(place.batch_size, dtype=torch.int64, device=place.device)
-
-    def draw(self, data: Survey, folder: Path) -> None:
-        """Draw the mean of each measure against the step, and write the numbers as `listening.csv`."""
-        size = max(1, -(-int(data.step.max() + 1) // POINTS))
-        rows = data.means(**{"from": data.step // size * size})
-        strokes = style.strong_strokes(data.guides)
-        handles = [Line2D([], [], color=s.colour, ls=s.linestyle, label=guide) for guide, s in strokes.items()]
-        for measure, title, label, name in drawn(data.measures):
-            with style.picture(folder / name, title, handles, 3.6) as figure:
-                axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
-                style.lighten(axes)
-                for guide, stroke in strokes.items():
-                    own = [row for row in rows if row["guide"] == guide]
-                    x, y = [row["from"] for row in own], [row[measure] for row in own]
-                    axes.plot(x, y, color=stroke.colour, ls=stroke.linestyle, lw=1.5)
-        write_csv(rows, folder / "listening.csv")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
@@ -23,25 +22,12 @@ from coil_rl.train.measures import summarise
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace
 
+if TYPE_CHECKING:
+    from coil_rl.listening.sections import WholeEpisode
+
 Array = NDArray[np.float64]
 
 EVERYWHERE = "everywhere"
-
-
-class Sections(Protocol):
-    """Division of the states of an env into sections, and the pictures of a survey."""
-
-    names: tuple[str, ...]  # of the sections
-    record: ClassVar[Mapping[str, NestedKey]]  # entries of every step that `draw` needs, by name
-
-    def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
-        """Return where the rows of a state [B] are, [B, ...] each."""
-
-    def section(self, place: TensorDictBase) -> Tensor:
-        """Return the index of the section of each place [B], entries as `locate` returns them."""
-
-    def draw(self, data: Survey, folder: Path) -> None:
-        """Write tables and pictures of the places; `listening.csv` is the last file."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +37,7 @@ class Survey:
     guides: list[str]  # names, one per slot of the advice
     result: EvaluationResult
     step: NDArray[np.int64]  # [N], of the episode
-    place: dict[str, NDArray[Any]]  # as `Sections.locate` returns it, [N, ...]
+    place: dict[str, NDArray[Any]]  # as `WholeEpisode.locate` returns it, [N, ...]
     section: NDArray[np.int64]  # [N], index of the section
     advice: Tensor  # [N, n_guides, A]
     measures: dict[str, Array]  # agreement, intervention and gradient, [N, n_guides] each
@@ -71,7 +57,7 @@ class Survey:
 
 
 def survey(
-    env: EnvBase, policy: TensorDictModuleBase, sections: Sections, evaluation: Evaluation, *, donors: int = 16,
+    env: EnvBase, policy: TensorDictModuleBase, sections: WholeEpisode, evaluation: Evaluation, *, donors: int = 16,
     seed: int = 0, tick: Callable[[], Any] | None = None,
 ) -> Survey:  # fmt: skip
     """Evaluate the deterministic agent for one episode per row of an env [B], and measure in every visited state.
@@ -132,8 +118,8 @@ def ablations(guides: int, sections: int) -> list[Ablation]:
 
 
 def drive_ablated(
-    env: EnvBase, policy: TensorDictModuleBase, sections: Sections, evaluation: Evaluation, removed: Sequence[Ablation],
-    replacement: Tensor, *, tick: Callable[[], Any] | None = None,
+    env: EnvBase, policy: TensorDictModuleBase, sections: WholeEpisode, evaluation: Evaluation,
+    removed: Sequence[Ablation], replacement: Tensor, *, tick: Callable[[], Any] | None = None,
 ) -> list[list[dict[str, Any]]]:  # fmt: skip
     """Evaluate the deterministic agent with each ablation, all at the same time.
 
@@ -163,7 +149,10 @@ def drive_ablated(
 
 
 def table_by_section(
-    data: Survey, sections: Sections, evaluation: Evaluation, ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]]
+    data: Survey,
+    sections: WholeEpisode,
+    evaluation: Evaluation,
+    ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]],
 ) -> list[dict[str, Any]]:
     """Return one row per guide everywhere and in each section: means over states, and the effect of its removal.
 

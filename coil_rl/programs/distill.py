@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from omegaconf import DictConfig
 
@@ -11,6 +10,7 @@ from coil_rl.programs import app
 
 def distill(config: DictConfig) -> float:
     """Train the missing proxies of all guides, and return the lowest mean test reward of a proxy."""
+    from coil_rl.report.runs import read_runs
     from coil_rl.report.table import TABLES, markdown_table
     from coil_rl.train import distillation
     from coil_rl.train.build import build_guides
@@ -20,24 +20,17 @@ def distill(config: DictConfig) -> float:
     for name in build_guides(config):
         proxy_config = distillation.proxy_config(config, name)
         reward = run(proxy_config, wait=True)
-        table.append({"guide": name, "reward": reward, **_measures(Path(proxy_config.run_dir))})
+        (finished,) = read_runs([Path(proxy_config.run_dir)])
+        learned = {name.removeprefix("learner/"): value for name, value in finished.curve[-1].items()}
+        means = finished.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
+        guide, proxy = means.iloc[0], means.iloc[-1]
+        row = {"guide": name, "reward": reward, "guide_reward": guide["reward"], "completed": proxy["completed"]}
+        table.append(learned | row | {"folder": str(finished.folder)})
     print(markdown_table(table, TABLES["proxies"]["columns"]))
-    worst = min(table, key=lambda row: float(row["reward"]))
-    print(
-        f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:.1f}, "
-        f"that of its guide {worst['guide_reward']:.1f}"
-    )
+    worst = min(table, key=lambda row: row["reward"])
+    lowest = f"the lowest mean reward is {worst['reward']:.1f}, that of its guide {worst['guide_reward']:.1f}"
+    print(f"distill: made {len(table)}; {lowest}")
     return float(worst["reward"])
-
-
-def _measures(folder: Path) -> dict[str, Any]:
-    from coil_rl.report.runs import read_runs
-
-    (run,) = read_runs([folder])
-    learned = {name.removeprefix("learner/"): value for name, value in run.curve[-1].items()}
-    means = run.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
-    rewards = {"guide_reward": float(means["reward"].iloc[0]), "completed": float(means["completed"].iloc[-1])}
-    return learned | rewards | {"folder": str(folder)}
 
 
 def check(config: DictConfig) -> None:

@@ -14,13 +14,7 @@ from coil_rl.programs import app
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
 OF_A_RUN = ("run", "track", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
-OWN = (
-    "repeats",
-    "policy",
-    "gif",
-    "advice",
-    "fallback",
-)  # keys of `evaluation` that belong to the command, not to the run
+OWN = ("repeats", "policy", "gif", "advice", "fallback")  # keys of `evaluation` of the command, not of the run
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 if TYPE_CHECKING:

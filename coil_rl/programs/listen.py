@@ -37,7 +37,7 @@ def listen(config: DictConfig) -> None:
     except ValueError as error:
         raise UserError(f"the agent of run={config.run} does not use advice: {error}") from error
     node = run.evaluation.sections
-    sections: surveys.Sections = build(node, "evaluation.sections") if node else WholeEpisode()
+    sections: WholeEpisode = build(node, "evaluation.sections") if node else WholeEpisode()
     evaluation = build_evaluation(run, sections.record)
     rows = len(evaluation.cases) * run.evaluation.repeats
     folder.mkdir(parents=True, exist_ok=True)

@@ -33,10 +33,8 @@ def report(config: DictConfig) -> None:
     runs = read_runs(folders)
     finished = [run for run in runs if run.finished]
     if not finished:
-        raise UserError(
-            f"none of the runs in folder={config.folder} is finished; continue one with "
-            f"coil-train resume={runs[0].folder}, or repeat the command that started them"
-        )
+        remedy = f"continue one with coil-train resume={runs[0].folder}, or repeat the command that started them"
+        raise UserError(f"none of the runs in folder={config.folder} is finished; {remedy}")
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}

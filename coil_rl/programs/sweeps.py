@@ -66,10 +66,8 @@ def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
     count = f"{len(sweep.missing)} of {len(sweep.all_folders)} runs are missing"
     print(f"{sweep.experiment}: {count}\n{shlex.join(['coil-train', *command])}", file=sys.stderr)
     if code := start(command):
-        raise UserError(
-            f"the sweep of {sweep.experiment} ended with exit code {code}, see above; "
-            "correct the cause and give the same command again: finished runs are kept"
-        )
+        remedy = "correct the cause and give the same command again: finished runs are kept"
+        raise UserError(f"the sweep of {sweep.experiment} ended with exit code {code}, see above; {remedy}")
     if missing := sweep.missing:
         raise UserError(f"{len(missing)} runs of {sweep.experiment} are still missing, the first is {missing[0]}")
 

@@ -32,9 +32,8 @@ def resume(folder: Path) -> float:
     config = read_config(folder, "resume")
     folder = folder.absolute()
     if link := next((path for path in folder.rglob("*") if path.is_symlink()), None):
-        raise UserError(
-            f"{link} is a link, so that the run could write outside of its folder; put the file in its place"
-        )
+        problem = "is a link, so that the run could write outside of its folder"
+        raise UserError(f"{link} {problem}; put the file in its place")
     config.run_dir = str(folder)
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
@@ -58,9 +57,8 @@ def main() -> None:
     with app.program("train"):
         trust = [argument for argument in arguments if argument.startswith("trust=")]
         if others := " ".join(argument for argument in arguments if argument not in (resumed, *trust)):
-            raise UserError(
-                f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml; leave out {others}"
-            )
+            problem = f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml"
+            raise UserError(f"{problem}; leave out {others}")
         trust_packages(OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(trust)).trust)
         resume(Path(resumed.removeprefix("resume=")).expanduser())
 

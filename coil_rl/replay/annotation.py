@@ -2,8 +2,9 @@
 
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -57,9 +58,8 @@ def annotate(
     contents = read_messages(recording.path, [*topics, *TRANSFORMS])
     times = recording.log_time.tolist()
     with RecordingWriter(path) as writer:
-        for messages in contents.messages.values():
-            for message in messages:
-                writer.copy(message)
+        for message in chain.from_iterable(contents.messages.values()):
+            writer.copy(message)
         for name, entries in contents.notes.items():
             if name != ROSBAG2:
                 writer.describe(name, entries)
@@ -89,30 +89,22 @@ def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale
         cone_markers = [{"header": top, "action": DELETE_ALL}]
         line_markers = [{"header": top, "action": DELETE_ALL}]
         for side, name in enumerate(SIDES):
-            cone_markers += _cone_markers(top, name, cones[row, side, : result.count[row, side]])
+            size = {"x": DIAMETERS[name], "y": DIAMETERS[name], "z": CONE_HEIGHT}
+            for number, (x, y) in enumerate(cones[row, side, : result.count[row, side]].tolist()):
+                pose = {"position": {"x": x, "y": y, "z": CONE_HEIGHT / 2}, "orientation": {"w": 1.0}}
+                cone_markers.append(_marker(top, name, CYLINDER, 1.0, id=number, pose=pose, scale=size))
             if ever_valid[row, side]:
                 opacity = 1.0 if result.valid[row, side] else FADED
-                line_markers.append(_line_marker(top, name, lines[row, side], opacity))
+                points = [{"x": x, "y": y} for x, y in lines[row, side].tolist()]
+                pose, size = {"orientation": {"w": 1.0}}, {"x": LINE_WIDTH}
+                line_markers.append(_marker(top, name, LINE_STRIP, opacity, pose=pose, scale=size, points=points))
         writer.add("/coil/cones", MARKERS, time, {"markers": cone_markers})
         writer.add("/coil/boundary", MARKERS, time, {"markers": line_markers})
         writer.add("/coil/valid", BOOL, time, {"data": bool(result.both_valid[row])})
 
 
-def _cone_markers(top: dict[str, Any], side: str, positions: Floats) -> Iterator[dict[str, Any]]:
-    size = {"x": DIAMETERS[side], "y": DIAMETERS[side], "z": CONE_HEIGHT}
-    for number, (x, y) in enumerate(positions.tolist()):
-        pose = {"position": {"x": x, "y": y, "z": CONE_HEIGHT / 2}, "orientation": {"w": 1.0}}
-        colour = COLOURS[side] | {"a": 1.0}
-        yield {
-            "header": top, "ns": side, "id": number, "type": CYLINDER, "pose": pose, "scale": size, "color": colour,
-        }  # fmt: skip
-
-
-def _line_marker(top: dict[str, Any], side: str, points: Floats, opacity: float) -> dict[str, Any]:
-    return {
-        "header": top, "ns": side, "type": LINE_STRIP, "pose": {"orientation": {"w": 1.0}}, "scale": {"x": LINE_WIDTH},
-        "color": COLOURS[side] | {"a": opacity}, "points": [{"x": x, "y": y} for x, y in points.tolist()],
-    }  # fmt: skip
+def _marker(top: dict[str, Any], side: str, kind: int, opacity: float, **fields: Any) -> dict[str, Any]:
+    return {"header": top, "ns": side, "type": kind, "color": COLOURS[side] | {"a": opacity}, **fields}
 
 
 def _boundaries(observation: Floats) -> Floats:

@@ -21,12 +21,11 @@ MOST = 0.5  # share of the clusters
 def describe(result: OpenLoop) -> str:
     """Return a section of Markdown about one recording."""
     columns = {"policy": ("policy", ""), "smoothness": ("smoothness", ".3f"), "omega": ("omega (rad/s)", ".3f")}
-    frame = pd.DataFrame(
-        {
-            name: {"smoothness": _mean(steering.smoothness), "omega": _mean(np.abs(steering.omega))}
-            for name, steering in result.steering.items()
-        }
-    ).T
+    steering = result.steering.items()
+    frame = pd.DataFrame({
+        "smoothness": {name: pd.Series(each.smoothness).mean() for name, each in steering},
+        "omega": {name: pd.Series(each.omega).abs().mean() for name, each in steering},
+    })  # fmt: skip
     if len(frame) > 1:
         distances = disagreement(result)
         frame = frame.join(distances.mask(np.eye(len(distances), dtype=bool)).add_prefix("from "))
@@ -113,8 +112,3 @@ def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str 
             steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), lw=1.1, **line)
             omega_axes.plot(seconds, result.steering[name].omega, lw=1.1, **line)
         omega_axes.set_xlabel("time (s)")
-
-
-def _mean(values: np.ndarray) -> float:
-    """Return the mean without NaN; NaN without any number."""
-    return float(pd.Series(values).mean())

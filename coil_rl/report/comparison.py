@@ -207,10 +207,9 @@ def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
     first: dict[int, Run] = {}
     for run in runs:
         if run.seed in first:
-            raise UserError(
-                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {run.label}; "
-                "remove one from the folder, or give different runs their own labels (coil-train label=TEXT)"
-            )
+            problem = f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {run.label}"
+            remedy = "remove one from the folder, or give different runs their own labels (coil-train label=TEXT)"
+            raise UserError(f"{problem}; {remedy}")
         first[run.seed] = run
     return pd.concat([run.evaluation.assign(seed=run.seed) for run in runs])
 
@@ -219,10 +218,9 @@ def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
     """Index the evaluations of one driver by seed and case."""
     cases = rows.groupby("seed")["case"].agg(tuple).unique()
     if len(cases) > 1:
-        raise UserError(
-            f"runs of {name} were evaluated in different cases ({', '.join(cases[0])}, and {', '.join(cases[1])}); "
-            "evaluate them on the same ones, or give them their own labels (coil-train label=TEXT)"
-        )
+        different = f"{', '.join(cases[0])}, and {', '.join(cases[1])}"
+        remedy = "evaluate them on the same ones, or give them their own labels (coil-train label=TEXT)"
+        raise UserError(f"runs of {name} were evaluated in different cases ({different}); {remedy}")
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 

@@ -96,26 +96,22 @@ def draw_curve_grid(
     `runs` are as in `draw_learning_curves`; `guides` are the mean returns of the guides by label.
     """
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    columns = min(GRID_COLUMNS, len(runs))
+    columns, colour = min(GRID_COLUMNS, len(runs)), style.AGENTS[0]
     rows = -(-len(runs) // columns)
-    handles: list[Artist] = [
-        Line2D([], [], color=style.AGENTS[0], lw=1.5, label="mean of the runs"),
-        Patch(color=style.AGENTS[0], alpha=0.25, lw=0, label="95 % interval of the mean"),
-        Line2D([], [], color=style.KERB, lw=0.6, label="the others"),
-    ]
-    if guides:
-        handles.append(Line2D([], [], color=style.GUIDES[0], ls=style.DASHED, lw=1.0, label="its guide"))
-    height = 0.35 + GRID_ROW_HEIGHT * rows
-    with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
+    guide_line: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.0}
+    handles: list[Artist] = [Line2D([], [], color=colour, lw=1.5, label="mean of the runs")]
+    handles.append(Patch(color=colour, alpha=0.25, lw=0, label="95 % interval of the mean"))
+    handles.append(Line2D([], [], color=style.KERB, lw=0.6, label="the others"))
+    handles += [Line2D([], [], label="its guide", **guide_line)] if guides else []
+    with style.picture(path, None, handles, 0.35 + GRID_ROW_HEIGHT * rows, add_header=True, h_pad=0.08) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
-            for other, (other_frames, other_mean, _, _) in curves.items():
-                if other != label:
-                    axes.plot(other_frames, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
-            axes.fill_between(frames, low, high, color=style.AGENTS[0], alpha=0.25, lw=0, zorder=2.1)
-            axes.plot(frames, mean, color=style.AGENTS[0], lw=1.5, zorder=2.2)
+            for other_frames, other_mean, *_ in curves.values():  # its own is drawn over
+                axes.plot(other_frames, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
+            axes.fill_between(frames, low, high, color=colour, alpha=0.25, lw=0, zorder=2.1)
+            axes.plot(frames, mean, color=colour, lw=1.5, zorder=2.2)
             if guides and label in guides:
-                axes.axhline(guides[label], color=style.GUIDES[0], ls=style.DASHED, lw=1.0)
+                axes.axhline(guides[label], **guide_line)
             axes.set_title(f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label, size=9, loc="left")
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(left=0)
@@ -151,13 +147,24 @@ def draw_phases(
         for name, colour in colours.items():
             top.plot(*points(rows, f"guide/{name}").T, color=colour, **alone)
             middle.plot(frames, _column(updates, f"learner/moved_{name}"), color=colour, lw=1.4)
-        _draw_rates(bottom, frames, updates, list(colours.values()))
+        learner = _column(updates, "learner/guide")  # index of the guide that learns; their number for all of them
+        guide_rate = _column(updates, "learner/guide_learning_rate")
+        rates = {AGENT: _column(updates, "learner/learning_rate")}
+        for index, colour in enumerate(colours.values()):
+            rates[colour] = np.where((learner == index) | (learner == len(colours)), guide_rate, np.nan)
+        edges = np.concatenate([[0.0], frames])
+        for colour, values in rates.items():
+            bottom.stairs(np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None)
+        bottom.set_yscale("log")
+        bottom.yaxis.set_major_formatter("{x:g}")
         for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
             axes.set_ylabel(label)
             style.lighten(axes)
             axes.margins(x=0)
             axes.set_xlim(left=0)
-            _shade_phases(axes, frames, updates, list(colours.values()))
+            for start, end, index in zip(edges, frames, learner.astype(int), strict=False):
+                if 0 <= index < len(colours):
+                    axes.axvspan(start, end, color=list(colours.values())[index], alpha=0.12, lw=0)
         middle.set_ylim(bottom=0)
         bottom.set_xlabel("frames")
         bottom.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -215,31 +222,8 @@ def frames_until(frames: Sequence[float] | Array, returns: Sequence[float] | Arr
 def points(run: Rows, key: str) -> Array:
     """Return frames and values [P, 2] of the rows with a finite value, sorted by frames."""
     table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
-    curve: Array = table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
-    return curve
+    return table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
 
 
 def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:
     return np.array([row.get(key, np.nan) for row in rows], dtype=np.float64)
-
-
-def _draw_rates(axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]) -> None:
-    learner = _column(rows, "learner/guide")  # index of the guide that learns; len(colours) for all of them
-    guide_rate = _column(rows, "learner/guide_learning_rate")
-    rates = {AGENT: _column(rows, "learner/learning_rate")}
-    for index, colour in enumerate(colours):
-        rates[colour] = np.where((learner == index) | (learner == len(colours)), guide_rate, np.nan)
-    edges = np.concatenate([[0.0], frames])
-    for colour, values in rates.items():
-        axes.stairs(np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None)
-    axes.set_yscale("log")
-    axes.yaxis.set_major_formatter("{x:g}")
-
-
-def _shade_phases(axes: Axes, frames: Array, rows: Sequence[Mapping[str, float]], colours: Sequence[str]) -> None:
-    start = 0.0
-    for frame, row in zip(frames, rows, strict=True):
-        index = int(row["learner/guide"])
-        if 0 <= index < len(colours):
-            axes.axvspan(start, float(frame), color=colours[index], alpha=0.12, lw=0)
-        start = float(frame)

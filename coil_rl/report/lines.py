@@ -14,7 +14,6 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import ListedColormap, Normalize
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal
 from matplotlib.patheffects import Stroke as StrokeEffect
@@ -154,22 +153,17 @@ def draw_listening_map(
                 lw=4.0, capstyle="round", zorder=4, path_effects=rim,
             )
         )  # fmt: skip
-    _draw_colour_bar(plot.figure, colours, label)
-    style.save(plot.figure, path)
-
-
-def _draw_colour_bar(figure: Figure, colours: ScalarMappable, label: str) -> None:
-    """Draw a horizontal colour bar in the lower right corner."""
-    with mpl.rc_context(style.LETTERS):
-        width, height = figure.get_size_inches()
+    with mpl.rc_context(style.LETTERS):  # a colour bar in the lower right corner
+        width, height = plot.figure.get_size_inches()
         left, bottom, bar_width, bar_height = width - style.MARGIN - 0.34 - 2.2, 0.13, 2.2, 0.11
-        axes = figure.add_axes((left / width, bottom / height, bar_width / width, bar_height / height))
-        bar = figure.colorbar(colours, cax=axes, orientation="horizontal")
+        axes = plot.figure.add_axes((left / width, bottom / height, bar_width / width, bar_height / height))
+        bar = plot.figure.colorbar(colours, cax=axes, orientation="horizontal")
         bar.outline.set_visible(False)
         bar.set_ticks([])
         middle = (bottom + bar_height / 2) / height
-        figure.text((left - 0.07) / width, middle, f"{label}  0", size=8, ha="right", va="center")
-        axes.text(1.03, 0.5, f"{colours.norm.vmax:.2g}", size=8, va="center", transform=axes.transAxes)
+        plot.figure.text((left - 0.07) / width, middle, f"{label}  0", size=8, ha="right", va="center")
+        axes.text(1.03, 0.5, f"{highest:.2g}", size=8, va="center", transform=axes.transAxes)
+    style.save(plot.figure, path)
 
 
 def _crash_handle(ended: Mapping[str, Sequence[bool]]) -> list[Line2D]:

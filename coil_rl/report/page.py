@@ -14,8 +14,6 @@ from coil_rl.report.table import TABLES, markdown_table
 MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 
-NEEDS_GUIDE = {"needs_guide": ("guide at test time", "")}
-
 
 def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
     """Return the section for one kind of actions; `rows` are `comparison.table(against)`."""
@@ -36,12 +34,10 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
         for name, measure in measures.items()
         if measure.title and name not in ("completed", "crashed") and not name.startswith(PER_STEP)
     }
-    columns |= NEEDS_GUIDE
+    columns["needs_guide"] = ("guide at test time", "")
     table = markdown_table(with_cells(rows, spec), columns)
-    parts = [
-        *_parts(comparison, TERM, "term of the reward", ".1f"),
-        *_parts(comparison, PER_STEP, "reward of a step", ".3f"),
-    ]
+    parts = _parts(comparison, TERM, "term of the reward", ".1f")
+    parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     return "\n\n".join([f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")])
 
 

@@ -82,10 +82,8 @@ def _read_run(folder: Path) -> Run:
         measures = measures_of({name: node for name, node in nodes.items()})
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split("\n    full_key")[0].split())
-        raise UserError(
-            f"{path} has no valid label, seed and method.needs_guide ({problem}); "
-            "restore the file that coil-train wrote, or remove the run from the folder"
-        ) from error
+        remedy = "restore the file that coil-train wrote, or remove the run from the folder"
+        raise UserError(f"{path} has no valid label, seed and method.needs_guide ({problem}); {remedy}") from error
     path = folder / "evaluation.csv"
     if not path.exists():
         return run
@@ -122,8 +120,7 @@ def read_curve(file: Path | BinaryIO) -> list[dict[str, float]]:
     frame = _read_csv(file).astype(float)
     if not np.isfinite(frame.get("frames", np.nan)).all():
         raise ValueError("not every row has its number of frames")
-    rows: list[dict[str, float]] = frame.to_dict("records")
-    return rows
+    return frame.to_dict("records")
 
 
 def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:

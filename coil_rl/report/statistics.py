@@ -92,5 +92,4 @@ def wins(x: ArrayLike, y: ArrayLike) -> Array:
     x is [seeds, cases]; y is the same, or [1, cases] for a score shared by all seeds.
     """
     first, second = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    won: Array = (first > second) + 0.5 * (first == second)
-    return won
+    return (first > second) + 0.5 * (first == second)

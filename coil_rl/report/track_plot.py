@@ -54,7 +54,10 @@ class TrackPlot:
             fits = [width / sizes[row, 0].sum() for width, row in zip(widths, rows, strict=True)]
             self.scale = float(min(*fits, MAX_TRACK_HEIGHT / sizes[:, 1].max()))  # inches per metre
             self.figure.set_size_inches(style.WIDTH, 3.0)
-            header = style.draw_header(self.figure, [*legend, *_cone_handles()], title) + 0.12
+            cone: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": style.INK, "mew": 0.4}
+            colours = {"left cones": style.LEFT_CONE, "right cones": style.RIGHT_CONE}
+            cones = [Line2D([], [], mfc=colour, label=label, **cone) for label, colour in colours.items()]
+            header = style.draw_header(self.figure, [*legend, *cones], title) + 0.12
             heights = [NAME_HEIGHT + self.scale * float(sizes[row, 1].max()) for row in rows]
             height = header + sum(heights) + GAP * (len(rows) - 1) + 0.34
             height = round(height * dpi) / dpi  # whole pixels, for video players and GIF readers
@@ -75,23 +78,15 @@ class TrackPlot:
                     _draw_track(self.axes, tracks[index], self.offsets[index], self.scale)
                     left += width + free
                 top += row_height + GAP
-            self._draw_scale_bar()
+            x, y = self._metres(style.MARGIN, height - 0.14)
+            bar = 10 if 10 * self.scale <= style.WIDTH / 2 else 1  # m
+            ends = np.array([0.04, 0, 0, 0.04]) / self.scale
+            self.axes.plot([x, x, x + bar, x + bar], ends + y, color=style.INK, lw=1)
+            self.axes.text(x + bar + 0.07 / self.scale, y, f"{bar} m", size=8, va="center")
 
     def _metres(self, right: float, down: float) -> Array:
         """Convert inches from the upper left corner to coordinates of the axes."""
         return np.array([right, self.figure.get_size_inches()[1] - down]) / self.scale
-
-    def _draw_scale_bar(self) -> None:
-        x, y = self._metres(style.MARGIN, self.figure.get_size_inches()[1] - 0.14)
-        bar = 10 if 10 * self.scale <= style.WIDTH / 2 else 1  # m
-        self.axes.plot([x, x, x + bar, x + bar], np.array([0.04, 0, 0, 0.04]) / self.scale + y, color=style.INK, lw=1)
-        self.axes.text(x + bar + 0.07 / self.scale, y, f"{bar} m", size=8, va="center")
-
-
-def _cone_handles() -> list[Line2D]:
-    cone: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": style.INK, "mew": 0.4}
-    colours = {"left cones": style.LEFT_CONE, "right cones": style.RIGHT_CONE}
-    return [Line2D([], [], mfc=colour, label=label, **cone) for label, colour in colours.items()]
 
 
 def _draw_track(axes: Axes, track: Track, offset: Array, scale: float) -> None:

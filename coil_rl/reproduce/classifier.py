@@ -28,11 +28,8 @@ ARROW_LENGTH = 2.2  # of a standard deviation of a feature, on the axes of the p
 class Figure25(Result):
     """Cone classifier, trained on recordings past cones of one side and tested on recordings past both sides.
 
-    The classifier is saved as `cones.json` next to the picture. Without recordings, drives are simulated.
-
-    Raises:
-        ValueError: for numbers out of range, or recordings of one side only.
-        RecordingError: for an unusable recording.
+    The classifier is saved as `cones.json` next to the picture. Without recordings, drives are simulated. Numbers out
+    of range, or recordings of one side only, are a `ValueError`, an unusable recording is a `RecordingError`.
     """
 
     left: Sequence[str] = ()  # recordings past thin cones only, on the left; at least two

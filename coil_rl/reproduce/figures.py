@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -35,23 +35,22 @@ Panels = tuple[Mapping[str, Mapping[str, Array]], Mapping[str, Any]]
 
 
 class Drawing(Result):
-    """A figure of named series of points, one panel or several; `conf/result_pages.yaml` has its words and lines."""
+    """A figure of named series of points, one panel or several; `conf/result_pages.yaml` has its words and lines.
 
-    number: ClassVar[int]  # an argument of the class statement
-
-    def __init_subclass__(cls, number: int = 0) -> None:
-        cls.number = number
+    Its number is in the name of the class.
+    """
 
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result, see `Result`."""
-        page = PAGES[f"figure_{self.number}"]
+        number = type(self).__name__.removeprefix("Figure")
+        page = PAGES[f"figure_{number}"]
         panels, numbers = self._panels()
         names = list(dict.fromkeys(chain.from_iterable(panels.values())))
         lines: dict[str, Any] = {name: {"color": stroke.colour} for name, stroke in style.strong_strokes(names).items()}
         for name, (colour, line) in page.get("lines", {}).items():
             lines[name] = {"color": getattr(style, colour, colour), "mec": style.INK, "mew": 0.4, **line}
         handles = [Line2D([], [], label=name, **lines[name]) for name in names]
-        title, rows = f"Figure {self.number}: {page['title']}", page.get("rows", 1)
+        title, rows = f"Figure {number}: {page['title']}", page.get("rows", 1)
         with style.picture(stem.with_suffix(".png"), title, handles, page["height"]) as figure:
             grid = figure.subplots(rows, len(panels) // rows, squeeze=False)
             for axes, (heading, series) in zip(grid.flat, panels.items(), strict=True):
@@ -72,7 +71,7 @@ class Drawing(Result):
     def _panels(self) -> Panels: ...
 
 
-class Figure10(Drawing, number=10):
+class Figure10(Drawing):
     """One term of PPO's objective against the probability ratio, for either sign of the advantage."""
 
     def _panels(self) -> Panels:
@@ -115,7 +114,7 @@ class OnTheWay(Drawing):
         return env, state["cones"], state["cone_count"], {"track": self.track.name, "seconds": self.seconds}
 
 
-class Figure19(OnTheWay, number=19):
+class Figure19(OnTheWay):
     """The simulator: a car on a track, the cones that it detects, and its estimates of both boundaries."""
 
     def _panels(self) -> Panels:
@@ -132,7 +131,7 @@ class Figure19(OnTheWay, number=19):
         return {"": {**series, "car": np.zeros((1, 2))}}, numbers
 
 
-class Figure21(Drawing, number=21):
+class Figure21(Drawing):
     """The cones of the first four training tracks."""
 
     def _panels(self) -> Panels:
@@ -141,7 +140,7 @@ class Figure21(Drawing, number=21):
         return panels, {"lengths": ", ".join(f"{track.name} {track.length:.1f} m" for track in tracks)}
 
 
-class Figure26(Drawing, number=26):
+class Figure26(Drawing):
     """A scan of the simulated robot's LiDAR, and the cones that the robot detects in it; the robot faces up, in m."""
 
     def _panels(self) -> Panels:
@@ -155,7 +154,7 @@ class Figure26(Drawing, number=26):
         return {"": series}, {"scan": SCAN, "sight": perception.range_max, "side": perception.bearing_max, **counts}
 
 
-class Figure30(Drawing, number=30):
+class Figure30(Drawing):
     """The steering angle that the guide advises (equation 103) against the bearing of its target, by its distance."""
 
     def _panels(self) -> Panels:
@@ -166,7 +165,7 @@ class Figure30(Drawing, number=30):
         return {"": series}, {"greatest": ", ".join(f"{beta[-1]:.1f}° at {d:g} m" for d, beta in angles.items())}
 
 
-class Figure31(OnTheWay, number=31):
+class Figure31(OnTheWay):
     """The guide's path in three steps: midpoints of pairs of cones, a spline through them, and targets on it."""
 
     def _panels(self) -> Panels:

@@ -64,14 +64,8 @@ def page(text: str, name: str, note: str | None, origin: str) -> str:
     `text` begins with the heading; `name` is the stem of the result's files.
     """
     heading, _, rest = text.partition("\n")
-    parts = [
-        heading,
-        *_warning(note),
-        f"![{heading.lstrip('# ')}]({name}.png)",
-        rest.strip(),
-        f"{FOOTER}{origin}</sub>",
-    ]
-    return "\n\n".join(parts) + "\n"
+    picture = f"![{heading.lstrip('# ')}]({name}.png)"
+    return "\n\n".join([heading, *_warning(note), picture, rest.strip(), f"{FOOTER}{origin}</sub>"]) + "\n"
 
 
 def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
@@ -86,10 +80,8 @@ def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
             labels.setdefault(int(run.curve[-1]["frames"]), {})[run.label] = None
     frames = "; ".join(f"{count:,} ({', '.join(names)})" for count, names in labels.items())
     commits = dict.fromkeys(_commit(_run_commit(run.folder)) for run in runs)
-    return (
-        f"{made} {len(runs)} runs with the seeds {', '.join(map(str, seeds))}, made at commit {', '.join(commits)}. "
-        f"Training frames: {frames or 'none'}."
-    )
+    about_runs = f"{len(runs)} runs with the seeds {', '.join(map(str, seeds))}, made at commit {', '.join(commits)}"
+    return f"{made} {about_runs}. Training frames: {frames or 'none'}."
 
 
 def all_results(
@@ -100,11 +92,8 @@ def all_results(
     split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), PAGES["results"]["introduction"].format(command=command)]
     if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:
-        parts += [
-            "## What held up, and what did not",
-            PAGES["results"]["verdicts"].format(seeds=SIGN_FLIP_SEEDS),
-            *claims,
-        ]
+        verdicts = PAGES["results"]["verdicts"].format(seeds=SIGN_FLIP_SEEDS)
+        parts += ["## What held up, and what did not", verdicts, *claims]
     parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
     if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(missing)]

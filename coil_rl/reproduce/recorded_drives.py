@@ -65,7 +65,12 @@ def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     invalid track in the notes is a `RecordingError`.
     """
     notes = recording.notes.get(SIMULATED, {})
-    poses, seconds = _timed_poses(recording)
+    if recording.odometry is None:
+        poses, seconds = recording.poses(), recording.seconds
+    else:  # all of its poses, not only those of the scans
+        poses, log_time, stamp = recording.odometry
+        clock = stamp if (np.diff(stamp) > 0).all() else log_time
+        seconds = (clock - clock[0]) / 1e9
     completed = laps(poses, seconds)
     row: dict[str, Any] = {
         "method": method or notes.get("policy", recording.path.stem), "seed": notes.get("seed"),
@@ -147,12 +152,3 @@ def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], colour: str) -> Non
 
 def _dot(marker: str, colour: str, label: str) -> Line2D:
     return Line2D([], [], ls="", marker=marker, ms=5, mfc=colour, mec=style.INK, mew=0.4, label=label)
-
-
-def _timed_poses(recording: Recording) -> tuple[Array, Array]:
-    """Return poses [M, 3] and times [M] s: those of the odometry, or of the scans if there is none."""
-    if recording.odometry is None:
-        return recording.poses(), recording.seconds
-    poses, log_time, stamp = recording.odometry
-    clock = stamp if (np.diff(stamp) > 0).all() else log_time
-    return poses, (clock - clock[0]) / 1e9

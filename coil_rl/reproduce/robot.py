@@ -37,11 +37,8 @@ class Table6(Result):
 
     A driver's name is the `policy` in its recording's notes, or else the file name. Without recordings, the guide of
     the first run and the agents of all runs drive the simulated robot and are recorded next to the page; existing
-    recordings are reused.
-
-    Raises:
-        UserError: if there are no recordings, runs or experiments.
-        RecordingError: for an unusable recording.
+    recordings are reused. No recordings, runs or experiments at all are a `UserError`, an unusable recording is a
+    `RecordingError`.
     """
 
     experiments: Sequence[str] = ()  # experiments whose agents drive if there are no recordings and runs
@@ -118,11 +115,8 @@ class Table6(Result):
             about = {"policy": str(own.label), "seed": str(own.seed), "run": run.folder.name}
             if (weights := weights_file(run.folder)).is_file():  # a missing file is reported when the policy is loaded
                 about["policy_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
-            yield (
-                run.folder.name,
-                about,
-                partial(lambda run, own: load_policy_in_env(run, own, make_env()), run.folder, own),
-            )
+            make = partial(lambda folder, own: load_policy_in_env(folder, own, make_env()), run.folder, own)
+            yield run.folder.name, about, make
 
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:

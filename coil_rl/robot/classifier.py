@@ -104,7 +104,13 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
     correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
     scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
     known = OneClassSVM(nu=UNUSUAL, gamma=machine.gamma).fit(scaler.transform(features))
-    return Training(cone_classifier(scaler, machine, known), accuracy, correct, len(features))
+    machines = (machine, known)
+    support = np.concatenate([each.support_vectors_ for each in machines])
+    weights = block_diag(*(each.dual_coef_ for each in machines))
+    intercept = np.concatenate([each.intercept_ for each in machines])
+    # The value of gamma="scale" has no public name.
+    classifier = ConeClassifier(scaler.mean_, scaler.scale_, support, weights, intercept, float(machine._gamma))
+    return Training(classifier, accuracy, correct, len(features))
 
 
 def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
@@ -120,19 +126,6 @@ def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
     features = np.concatenate([thin, thick])
     is_thick = np.arange(len(features)) >= len(thin)
     return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs))
-
-
-def cone_classifier(scaler: StandardScaler, machine: SVC, known: OneClassSVM) -> ConeClassifier:
-    """Return the numbers of fitted machines of equal `gamma` for thick against thin cones and for any cone."""
-    machines = (machine, known)
-    return ConeClassifier(
-        mean=scaler.mean_,
-        scale=scaler.scale_,
-        support=np.concatenate([each.support_vectors_ for each in machines]),
-        weights=block_diag(*(each.dual_coef_ for each in machines)),
-        intercept=np.concatenate([each.intercept_ for each in machines]),
-        gamma=float(machine._gamma),  # the value of "scale" has no public name
-    )
 
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
@@ -175,7 +168,9 @@ def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE
         points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
         label = single_linkage(points)
         clusters = measure(points, label)
-        cone = majority(label, drive.hit.numpy()[points.scan, points.beam], drive.cones.shape[1])[clusters.label]
+        votes = np.zeros((int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64)  # last: no cone
+        np.add.at(votes, (label, drive.hit.numpy()[points.scan, points.beam]), 1)
+        cone = np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)[clusters.label]
         distance = np.hypot(*clusters.centroid.T)
         rows = (distance <= max_distance) & (cone >= 0)
         cone, scan = cone[rows], clusters.scan[rows]
@@ -187,8 +182,7 @@ def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE
 
 def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
     """Return the share of correctly classified clusters of cones: `all`, by range, and by visibility of the cone."""
-    correct = classifier.classify(labelled.features) == labelled.thick
-    return _shares(correct, labelled.distance, labelled.visibility)
+    return _shares(classifier.classify(labelled.features) == labelled.thick, labelled.distance, labelled.visibility)
 
 
 def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict[str, dict[str, Share]]:
@@ -211,13 +205,6 @@ def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict
             cells = in_range & (drive.thick.numpy() == thick)
             columns[name].append([recognised[cells].astype(float), distance[cells], visibility[cells]])
     return {name: _shares(*map(np.concatenate, zip(*rows, strict=True))) for name, rows in columns.items()}
-
-
-def majority(label: Integers, cone: Integers, cones: int) -> Integers:
-    """Return the cone of most points of each label, -1 for none; `label` and `cone` [M] are those of each point."""
-    votes = np.zeros((int(label.max(initial=-1)) + 1, cones + 1), dtype=np.int64)
-    np.add.at(votes, (label, cone), 1)
-    return np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:

@@ -61,13 +61,12 @@ def sample_transitions(
     """Sample N = `steps` consecutive transitions of a policy, actions [S] or their probabilities [S, A]."""
     choices = _cumulative(mdp.probabilities(policy)).tolist()
     world = Simulator(mdp, rng, episode_steps)
-    integers, reward = np.zeros((3, steps), dtype=np.int64), np.zeros(steps)
-    for n in range(steps):
+    rows = []
+    for _ in range(steps):
         state = world.state
         action = bisect_right(choices[state], rng.random())
-        reward[n], next_state = world.step(action)
-        integers[:, n] = state, action, next_state
-    return Transitions(state=integers[0], action=integers[1], reward=reward, next_state=integers[2])
+        rows.append((state, action, *world.step(action)))
+    return Transitions(*map(np.array, zip(*rows, strict=True)))
 
 
 class ModelEstimate:
@@ -99,10 +98,8 @@ class ModelEstimate:
         missing = np.argwhere(self.counts.sum(axis=2) == 0)
         if len(missing):
             state, action = missing[0]
-            raise ValueError(
-                f"action {action} has no sample in state {state}, nor have {len(missing) - 1} other pairs; "
-                "add transitions of a policy that takes every action"
-            )
+            problem = f"action {action} has no sample in state {state}, nor have {len(missing) - 1} other pairs"
+            raise ValueError(f"{problem}; add transitions of a policy that takes every action")
         return MDP(self.P, self.R, gamma)
 
 

@@ -53,7 +53,14 @@ class MDP:
         count, choices = self.P.shape[:2]
         self.states = _names("states", states, count)
         self.actions = _names("actions", actions, choices)
-        self._check_model()
+        total = self.P.sum(axis=2)
+        valid = np.isclose(total, 1, rtol=0, atol=1e-9) & (self.P >= 0).all(axis=2)
+        for s, a in np.argwhere(~valid | ~np.isfinite(self.R).all(axis=2)):
+            where = f"state {self.states[s]}, action {self.actions[a]}"
+            if valid[s, a]:
+                raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
+            problem = f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where})"
+            raise ValueError(f"{problem}; they sum to {total[s, a]:g}")
         self.start: Array = np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
         if self.start.shape != (count,) or (self.start < 0).any() or not np.isclose(self.start.sum(), 1):
             raise ValueError(f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}")
@@ -78,31 +85,16 @@ class MDP:
         count, choices = self.P.shape[:2]
         if array.shape == (count,) and array.dtype.kind in "iu":
             if wrong := [s for s in range(count) if not 0 <= array[s] < choices]:
-                raise ValueError(
-                    f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}; "
-                    f"actions are 0 to {choices - 1}"
-                )
+                problem = f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}"
+                raise ValueError(f"{problem}; actions are 0 to {choices - 1}")
             return np.eye(choices)[array]
         if array.shape != (count, choices):
-            raise ValueError(
-                f"A policy is [{count}] integers, an action a state, or [{count}, {choices}] probabilities; "
-                f"got {array.dtype} of the shape {array.shape}"
-            )
+            expected = f"[{count}] integers, an action a state, or [{count}, {choices}] probabilities"
+            raise ValueError(f"A policy is {expected}; got {array.dtype} of the shape {array.shape}")
         for s in range(count):
             if (array[s] < 0).any() or not np.isclose(array[s].sum(), 1):
                 raise ValueError(f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}")
         return array.astype(np.float64)
-
-    def _check_model(self) -> None:
-        total = self.P.sum(axis=2)
-        valid = np.isclose(total, 1, rtol=0, atol=1e-9) & (self.P >= 0).all(axis=2)
-        for s, a in np.argwhere(~valid | ~np.isfinite(self.R).all(axis=2)):
-            where = f"state {self.states[s]}, action {self.actions[a]}"
-            if valid[s, a]:
-                raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
-            raise ValueError(
-                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where}); they sum to {total[s, a]:g}"
-            )
 
 
 def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """The brake of an anchored policy: drives in fixed cases of the training decide how much of its guide it keeps."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
@@ -15,27 +16,17 @@ from coil_rl.train.evaluation import Totals, episodes
 from coil_rl.train.measures import Measure
 
 
+@dataclass(eq=False)
 class Brake:
-    """Decides before training and at each look of a run how strongly the policy is anchored; a `Probe`.
+    """Decides before training and at each look of a run how strongly the policy is anchored; a `Probe`."""
 
-    Args:
-        anchor: of the policy.
-        policy: of the learner; copies of it act.
-        build: makes an env with all cases for a number of policies.
-        failure: measure that is true for an episode that failed, if there is one.
-    """
+    anchor: Anchor  # of the policy
+    policy: TensorDictModuleBase  # of the learner; copies of it act
+    build: Callable[[int], EnvBase]  # makes an env with all cases for a number of policies
+    failure: Measure | None = None  # measure that is true for an episode that failed, if there is one
 
-    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")
-
-    def __init__(
-        self,
-        anchor: Anchor,
-        policy: TensorDictModuleBase,
-        build: Callable[[int], EnvBase],
-        failure: Measure | None = None,
-    ) -> None:
-        self.anchor, self.policy, self.build = anchor, policy, build
-        self.measures = {"return": Measure("episode_reward", "last")} | ({"failure": failure} if failure else {})
+    def __post_init__(self) -> None:
+        self.names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether there is a look after an update."""
@@ -43,23 +34,18 @@ class Brake:
 
     def __call__(self, update: int) -> dict[str, float]:
         """Look, decide, and return the numbers by name."""
-        look = self._begin() if update == 0 else self._decide()
+        if update == 0:
+            look = self._look(self.anchor.starts())
+            env = self.build(1)
+            with torch.random.fork_rng():
+                torch.manual_seed(0)
+                random = self._drive(env, env.rand_action)["return"]
+            self.anchor.begin(look, random)
+        else:
+            look = self._look([self.anchor.weights(weight) for weight in (self.anchor.weight, self.anchor.lower())])
+            self.anchor.decide(look)
         numbers = (look.score(0), look.score(1), *map(float, look.failures[:2]))
         return dict(zip(self.names, numbers, strict=True))
-
-    def _begin(self) -> Look:
-        look = self._look(self.anchor.starts())
-        env = self.build(1)
-        with torch.random.fork_rng():
-            torch.manual_seed(0)
-            random = self._drive(env, env.rand_action)["return"]
-        self.anchor.begin(look, random)
-        return look
-
-    def _decide(self) -> Look:
-        look = self._look([self.anchor.weights(weight) for weight in (self.anchor.weight, self.anchor.lower())])
-        self.anchor.decide(look)
-        return look
 
     def _look(self, weights: Sequence[Tensor]) -> Look:
         """Drive all cases with each of some weights of the guides."""
@@ -73,7 +59,8 @@ class Brake:
 
     @torch.no_grad()
     def _drive(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Tensor]:
-        totals = Totals(self.measures)
+        failure = {"failure": self.failure} if self.failure else {}
+        totals = Totals({"return": Measure("episode_reward", "last")} | failure)
         with tqdm(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
             for after, running in episodes(env, policy, tick=bar.update):
                 totals.add(after, running)

@@ -51,8 +51,10 @@ def check_parts(config: DictConfig) -> None:
     check_values(config)
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
-    if has_agent:
-        _check_learner_kind(config)
+    if has_agent and (kind := build.learner_kind(config)) != config.method.learner:
+        learner, (purpose, example) = config.learner["_target_"].rpartition(".")[2], KINDS[config.method.learner]
+        needed = f"method={config.method.name} needs a learner that {purpose}, such as learner={example}"
+        raise UserError(f"{needed}, but {learner} is one that {KINDS[kind][0]}")
     cases, record = len(build_evaluation(config).cases), recorded(build_pictures(config))
     if trains or OmegaConf.select(config, "run") is None:
         _check_drivers(config, cases, record.values())
@@ -101,23 +103,11 @@ def _unknown_key(config: DictConfig, *path: str) -> str:
     return f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}{did_you_mean(key, known)}"
 
 
-def _check_learner_kind(config: DictConfig) -> None:
-    kind, (purpose, example) = build.learner_kind(config), KINDS[config.method.learner]
-    if kind != config.method.learner:
-        learner = config.learner["_target_"].rpartition(".")[2]
-        raise UserError(
-            f"method={config.method.name} needs a learner that {purpose}, such as learner={example}, "
-            f"but {learner} is one that {KINDS[kind][0]}"
-        )
-
-
 def _check_drivers(config: DictConfig, cases: int, recorded: Iterable[NestedKey]) -> None:
     name = config.env.get("_target_", "it")
     if "num_envs" not in config.env:
-        raise UserError(
-            f"env: {name} has no key num_envs, so no policy can act in it; choose another env "
-            "(for the actions of policies on a recording: coil-replay recording=FILE)"
-        )
+        hint = "(for the actions of policies on a recording: coil-replay recording=FILE)"
+        raise UserError(f"env: {name} has no key num_envs, so no policy can act in it; choose another env {hint}")
     build.check_node(config.env, "env")
     env = build.build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
     check_measures(config, env)
@@ -146,10 +136,8 @@ def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
     specs = (env.observation_spec, env.full_reward_spec, env.full_done_spec)
     known = {_dotted(each): each for spec in specs for each in spec.keys(True)} | {EPISODE_REWARD: EPISODE_REWARD}
     if _dotted(key) not in known:
-        raise UserError(
-            f"{name}={_dotted(key)} is no entry of the env; it has "
-            f"{', '.join(sorted(known))}{did_you_mean(_dotted(key), known)}"
-        )
+        has = f"{', '.join(sorted(known))}{did_you_mean(_dotted(key), known)}"
+        raise UserError(f"{name}={_dotted(key)} is no entry of the env; it has {has}")
 
 
 def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
@@ -194,16 +182,13 @@ def _check_training(config: DictConfig) -> None:
     frames = config.budget.num_envs * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)
     if 2 * minibatches > frames:
-        raise UserError(
-            f"learner.minibatches={minibatches} leaves less than 2 frames to each minibatch, too few to standardise "
-            f"advantages; a batch has budget.num_envs x budget.steps = {frames} frames"
-        )
+        problem = "leaves less than 2 frames to each minibatch, too few to standardise advantages"
+        size = f"a batch has budget.num_envs x budget.steps = {frames} frames"
+        raise UserError(f"learner.minibatches={minibatches} {problem}; {size}")
     grouped = config.track and getattr(learner, "validate", False) and learner.group_key is not None
     if grouped and len(build.build(config.track.train, "track.train")) == 1:
-        raise UserError(
-            "track.train gives one track, which cannot be left out to validate; set learner.group_key=null, "
-            "or learner.validate=false"
-        )
+        remedy = "set learner.group_key=null, or learner.validate=false"
+        raise UserError(f"track.train gives one track, which cannot be left out to validate; {remedy}")
     if cases := list(config.evaluation.curve.cases):
         if set(cases) != {EVALUATION, SELECTION}:
             given = ", ".join(cases)
@@ -212,7 +197,14 @@ def _check_training(config: DictConfig) -> None:
             build.build_env(config, build.cases_node(config, name))
     if config.logger:
         build.check_node(config.logger, "logger")
-    _check_watch(config, env)
+    groups = ("episode", "step")
+    for group, keys in config.watch.items():
+        if group not in groups:
+            raise UserError(f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}")
+        for name, key in keys.items():
+            if not isinstance(key, ListConfig):
+                raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
+            _check_entry(env, key, f"watch.{group}.{name}")
 
 
 def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
@@ -222,17 +214,6 @@ def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
             check_parts(proxy_config(config, name))
         except UserError as error:
             raise UserError(f"proxy of guide.{name}: {error}") from error
-
-
-def _check_watch(config: DictConfig, env: EnvBase) -> None:
-    groups = ("episode", "step")
-    for group, keys in config.watch.items():
-        if group not in groups:
-            raise UserError(f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}")
-        for name, key in keys.items():
-            if not isinstance(key, ListConfig):
-                raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
-            _check_entry(env, key, f"watch.{group}.{name}")
 
 
 def _dotted(key: str | Iterable[Any]) -> str:
@@ -246,6 +227,5 @@ def make_folder(folder: Path) -> None:
         if not os.access(folder, os.W_OK):
             raise PermissionError(None, "Permission denied")
     except OSError as error:
-        raise UserError(
-            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with hydra.run.dir=FOLDER"
-        ) from error
+        problem = f"the run's folder {folder} cannot be used ({error.strerror})"
+        raise UserError(f"{problem}; choose another with hydra.run.dir=FOLDER") from error

@@ -286,13 +286,10 @@ OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, t
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
 
-SCHEMAS = {
-    "schema": TrainConfig,
-    "evaluate_schema": EvaluateConfig,
-    "report_schema": ReportConfig,
-    "listen_schema": ListenConfig,
-    "replay_schema": ReplayConfig,
-    "reproduce_schema": ReproduceConfig,
-}
-for _name, _schema in SCHEMAS.items():
-    ConfigStore.instance().store(name=_name, node=_schema)
+_store = ConfigStore.instance().store
+_store(name="schema", node=TrainConfig)
+_store(name="evaluate_schema", node=EvaluateConfig)
+_store(name="report_schema", node=ReportConfig)
+_store(name="listen_schema", node=ListenConfig)
+_store(name="replay_schema", node=ReplayConfig)
+_store(name="reproduce_schema", node=ReproduceConfig)

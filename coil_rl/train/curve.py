@@ -6,6 +6,7 @@ happen to end. The kept policies act deterministically, all of them in one batch
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,34 +23,25 @@ from coil_rl.train.load import memory_keys
 from coil_rl.train.measures import Measure
 
 POLICIES = "policies"  # subfolder with the kept policies
+Watch = Mapping[str, Mapping[str, Sequence[str]]]  # name to key, of "episode" and of "step"
 
 
+@dataclass(eq=False)
 class EvaluationCurve:
-    """Measures of the kept policies of a run from sets of cases.
+    """Measures of the kept policies of a run from sets of cases; their names in the log are `names`."""
 
-    Args:
-        folder: of the run; `keep` writes `policies/FRAMES.pt`.
-        policy: of the learner; a copy of it drives.
-        envs: for each set of cases a function that makes an env with a copy of all cases for a number of drivers.
-        watch: name to key of further measures, "episode" at the end of an episode, "step" as the mean over its steps.
-        points: number of policies that are kept, besides the first one.
-        batches: number of times that the policies kept since the last time are driven; each takes as long as one drive.
-    """
+    folder: Path  # of the run; `keep` writes `policies/FRAMES.pt`
+    policy: TensorDictModuleBase  # of the learner; a copy of it drives
+    envs: Mapping[str, Callable[[int], EnvBase]]  # makes an env with all cases of a set for a number of drivers
+    _: KW_ONLY
+    # Further measures, "episode" at the end of an episode, "step" as the mean over its steps.
+    watch: Watch = field(default_factory=dict)
+    points: int = 16  # number of policies that are kept, besides the first one
+    batches: int = 1  # number of times that the policies kept since are driven; each takes as long as one drive
 
-    def __init__(
-        self,
-        folder: Path,
-        policy: TensorDictModuleBase,
-        envs: Mapping[str, Callable[[int], EnvBase]],
-        *,
-        watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
-        points: int = 16,
-        batches: int = 1,
-    ) -> None:
-        self.folder, self.policy, self.envs, self.watch = folder / POLICIES, policy, envs, watch or {}
-        self.points, self.batches = points, batches
+    def __post_init__(self) -> None:
         measured = ["return", *(name for group in self.watch.values() for name in group)]
-        self.names = [f"{cases}/{name}" for cases in envs for name in measured]
+        self.names = [f"{cases}/{name}" for cases in self.envs for name in measured]
 
     def kept(self, updates: int) -> list[int]:
         """Return the updates of a run after which the policy is kept."""
@@ -69,14 +61,10 @@ class EvaluationCurve:
 
     def file(self, frames: int) -> Path:
         """Return the file of the policy after some frames."""
-        return self.folder / f"{frames:012d}.pt"
+        return self.folder / POLICIES / f"{frames:012d}.pt"
 
     def drive(self, frames: Sequence[int]) -> list[dict[str, float]]:
-        """Return the mean measures of the policies after some frames, by their names in the log.
-
-        Raises:
-            UserError: if a file is missing or damaged.
-        """
+        """Return the mean measures of the policies after some frames, by name; a damaged file is a `UserError`."""
         policies = policy_batch(self.policy, [checkpoint.load(self.file(each)) for each in frames])
         rows: list[dict[str, float]] = [{} for _ in frames]
         # The training's random numbers are left alone.
@@ -90,22 +78,17 @@ class EvaluationCurve:
 
 @torch.no_grad()
 def measures(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
-    tick: Callable[[], Any] | None = None,
+    env: EnvBase, policy: TensorDictModuleBase, watch: Watch | None = None, tick: Callable[[], Any] | None = None
 ) -> dict[str, Tensor]:
     """Run one episode on every row of an env [B] with deterministic actions, and return its measures, [B] each.
 
     These are the `return`, the sum of the rewards of the task, and those of `watch`; `tick` is called after every step.
     """
-    watch = watch or {}
-    at_end, over_steps = watch.get("episode", {}), watch.get("step", {})
-    totals = Totals(
-        {"return": Measure("episode_reward", "last")}
-        | {name: Measure.of(key, reduction="last") for name, key in at_end.items()}
-        | {name: Measure.of(key, reduction="mean") for name, key in over_steps.items()}
-    )
+    measured = {"return": Measure("episode_reward", "last")}
+    for group, reduction in (("episode", "last"), ("step", "mean")):
+        keys = (watch or {}).get(group, {})
+        measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
+    totals = Totals(measured)
     for after, running in episodes(env, policy, tick=tick):
         totals.add(after, running)
     return totals.results()

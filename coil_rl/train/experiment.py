@@ -9,10 +9,12 @@ import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import KW_ONLY, dataclass, field
 from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
+import pandas as pd
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -23,21 +25,18 @@ from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import whole_file
 from coil_rl.report.runs import CHOICE, RETURN, read_curve
 from coil_rl.train import checkpoint
-from coil_rl.train.curve import EvaluationCurve
+from coil_rl.train.curve import EvaluationCurve, Watch
 from coil_rl.train.rollout import Rollout
 from coil_rl.train.run_folder import check_same
 
+REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
+
 
 class Learner(Protocol):
-    """Update of a policy from batches.
+    """Update of a policy from batches."""
 
-    Attributes:
-        kind: "agent" (learns from rewards), "imitation" (from a guide's actions) or "guides" (trains guides too).
-        policy: the policy that collects the batches.
-    """
-
-    kind: ClassVar[str]
-    policy: TensorDictModuleBase
+    kind: ClassVar[str]  # "agent", "imitation" or "guides", as for `PPO`
+    policy: TensorDictModuleBase  # collects the batches
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Learn from a batch [B, T] and return metrics."""
@@ -61,6 +60,7 @@ class Probe(Protocol):
         """Return the numbers by name."""
 
 
+@dataclass(eq=False)
 class Experiment:
     """One training run in one folder.
 
@@ -68,44 +68,28 @@ class Experiment:
     complete state), `checkpoint_previous.pt`, `policy_last.pt`, `policy_best.pt` (best evaluation; the last one without
     evaluations) and `policies/` (the kept ones). A run that was killed at any moment and resumed in a new process ends
     with the same files, to the bit on a CPU.
-
-    Args:
-        learner: see `Learner`.
-        rollout: its env must write `episode_reward` (TorchRL's RewardSum), and `task_reward` if a transform adds to
-            the reward of the task.
-        frames: length of the run; the last batch may exceed it.
-        folder: exists.
-        logger: any TorchRL logger, in addition to the CSV file.
-        watch: name to key of further entries to log, as means over finished episodes ("episode") or over all steps
-            ("step").
-        checkpoint_every: updates between two checkpoints.
-        probe: see `Probe`.
-        curve: drives the kept policies.
-        identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
     """
 
-    EPISODES = 100  # the return is the mean over this many finished episodes
+    EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
 
-    def __init__(
-        self,
-        learner: Learner,
-        rollout: Rollout,
-        frames: int,
-        folder: Path,
-        *,
-        logger: Any | None = None,
-        watch: Mapping[str, Mapping[str, Sequence[str]]] | None = None,
-        checkpoint_every: int = 10,
-        probe: Probe | None = None,
-        curve: EvaluationCurve | None = None,
-        identity: Mapping[str, Any] | None = None,
-    ) -> None:
-        self.learner, self.rollout, self.frames, self.folder = learner, rollout, frames, folder
-        self.metrics, self.checkpoint_every = Metrics(folder / "metrics.csv", logger), checkpoint_every
-        self.probe, self.curve, self.identity = probe, curve, dict(identity or {})
-        watch = watch or {}
-        self.watch_episode = {name: ("next", *key) for name, key in watch.get("episode", {}).items()}
-        self.watch_step = {name: ("next", *key) for name, key in watch.get("step", {}).items()}
+    learner: Learner
+    # Its env must write `episode_reward` (TorchRL's RewardSum), and `task_reward` if a transform adds to the reward of
+    # the task.
+    rollout: Rollout
+    frames: int  # length of the run; the last batch may exceed it
+    folder: Path  # exists
+    _: KW_ONLY
+    logger: Any | None = None  # any TorchRL logger, in addition to the CSV file
+    # Further entries to log, as means over finished episodes ("episode") or over all steps ("step").
+    watch: Watch = field(default_factory=dict)
+    checkpoint_every: int = 10  # updates between two checkpoints
+    probe: Probe | None = None
+    curve: EvaluationCurve | None = None  # drives the kept policies
+    # Values of the configuration, which a checkpoint keeps and a resumed run must have.
+    identity: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
         self.updates = 0
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
         self.rows: list[dict[str, float]] = []
@@ -122,8 +106,7 @@ class Experiment:
         self.rows = self.metrics.truncate(self.updates + 1 if self.updates else 0)
         lacking = [name for name in (self.curve.names if self.curve else []) if self.rows and name not in self.rows[0]]
         if lacking:
-            remedy = "put the whole file back, or train again in another folder"
-            raise UserError(f"{self.metrics.path} has no column {lacking[0]}; {remedy}")
+            raise UserError(f"{self.metrics.path} has no column {lacking[0]}; {REMEDY}")
         where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
         print(f"{self.folder} continues {where}", file=sys.stderr)
 
@@ -196,7 +179,9 @@ class Experiment:
         learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
         self.updates += 1
         with self._resume_hint():
-            check_losses(learned, self.updates)
+            for name, value in learned.items():
+                if not math.isfinite(value):
+                    raise UserError(f"{name} is {value} in update {self.updates}")
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
     def _probe(self, updates: int, row: Mapping[str, float]) -> dict[str, float]:
@@ -211,10 +196,9 @@ class Experiment:
         try:
             yield
         except UserError as error:
-            raise UserError(
-                f"{error}; the last good checkpoint is kept: correct the cause and continue with "
-                f"coil-train resume={self.folder}, or train again with other values"
-            ) from error
+            remedy = f"correct the cause and continue with coil-train resume={self.folder}"
+            kept = "the last good checkpoint is kept"
+            raise UserError(f"{error}; {kept}: {remedy}, or train again with other values") from error
 
     def _save(self) -> None:
         state = self.state_dict()
@@ -232,10 +216,10 @@ class Experiment:
             "train/episodes": float(done.sum()),
             "train/reward": float(after["task_reward" if "task_reward" in after else "reward"].mean()),
         }
-        for name, key in self.watch_episode.items():
-            row[f"train/{name}"] = float(batch[key][done].float().mean()) if row["train/episodes"] else math.nan
-        for name, key in self.watch_step.items():
-            row[f"train/{name}"] = float(batch[key].float().mean())
+        for name, key in self.watch.get("episode", {}).items():
+            row[f"train/{name}"] = float(after[tuple(key)][done].float().mean()) if done.any() else math.nan
+        for name, key in self.watch.get("step", {}).items():
+            row[f"train/{name}"] = float(after[tuple(key)].float().mean())
         return row
 
     def state_dict(self) -> dict[str, Any]:
@@ -261,18 +245,11 @@ class Experiment:
             torch.cuda.set_rng_state_all(state["cuda_rng"])
 
 
-def watched_keys(env: EnvBase, watch: Mapping[str, Mapping[str, Sequence[str]]]) -> list[NestedKey]:
+def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     """Return the entries that `Experiment` needs in a rollout, besides those of the learner."""
     watched = (tuple(key) for group in watch.values() for key in group.values())
     task = [("task_reward",)] if "task_reward" in env.observation_spec else []
     return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)]
-
-
-def check_losses(values: Mapping[str, float], update: int) -> None:
-    """Raise a `UserError` if a metric of an update is NaN or infinite."""
-    for name, value in values.items():
-        if not math.isfinite(value):
-            raise UserError(f"{name} is {value} in update {update}")
 
 
 def check_parameters(state: Any, update: int, name: str = "learner") -> None:
@@ -314,14 +291,11 @@ class Metrics:
 
     def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Put values into rows, by their numbers, of the CSV file; the other cells keep their text."""
-        with self.path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = pd.read_csv(self.path, dtype=str, keep_default_na=False)
         for number, values in results.items():
-            rows[number] |= {name: str(value) for name, value in values.items()}
-        with whole_file(self.path) as unfinished, unfinished.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]))
-            writer.writeheader()
-            writer.writerows(rows)
+            rows.loc[number, list(values)] = list(map(str, values.values()))
+        with whole_file(self.path) as unfinished:
+            rows.to_csv(unfinished, index=False, lineterminator="\r\n")
 
     def flush(self) -> None:
         """Wait until all rows are on the disk."""
@@ -335,14 +309,12 @@ class Metrics:
         """Remove all rows except the first ones and return these; raise a `UserError` if there are fewer."""
         lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
         if len(lines) <= count and count:
-            raise UserError(
-                f"{self.path} has {max(len(lines) - 1, 0)} of the {count} rows that belong to the checkpoint; "
-                "put the whole file back, or train again in another folder"
-            )
+            found = f"{max(len(lines) - 1, 0)} of the {count} rows that belong to the checkpoint"
+            raise UserError(f"{self.path} has {found}; {REMEDY}")
         rows: list[dict[str, float]] = []
         if count:
             kept = b"".join(lines[: count + 1])
-            with file_of_a_run(self.path, "put the whole file back, or train again in another folder"):
+            with file_of_a_run(self.path, REMEDY):
                 rows = read_curve(io.BytesIO(kept))
             with whole_file(self.path) as unfinished:
                 unfinished.write_bytes(kept)

@@ -24,14 +24,8 @@ class Fallback(TensorDictModuleBase):
     """Policy that leaves steps to the first guide by the values of a critic, with hysteresis (after CALF, 2025).
 
     The guide acts from a state on that is worth less than `leave`, until one is worth at least `back`. It serves for
-    one episode of each row.
-
-    Args:
-        policy: of the agent.
-        critic: writes `state_value`.
-        guide: writes the guide's action.
-        leave: limit of the value.
-        back: the same, higher.
+    one episode of each row. The policy is that of the agent, the critic writes `state_value`, and `guide` the guide's
+    action.
     """
 
     def __init__(

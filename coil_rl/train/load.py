@@ -28,9 +28,8 @@ def load_policy(folder: Path, config: DictConfig, env: EnvBase, which: str = "la
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
     except (RuntimeError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{path} does not fit the networks in {folder / 'config.yaml'}; one of them was changed after the run"
-        ) from error
+        networks = f"the networks in {folder / 'config.yaml'}"
+        raise UserError(f"{path} does not fit {networks}; one of them was changed after the run") from error
     policy: TensorDictModuleBase = learner.policy
     if not all(parameter.isfinite().all() for parameter in policy.parameters()):
         raise UserError(f"{path} holds weights that are NaN or infinite; train again or use another")

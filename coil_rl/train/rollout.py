@@ -36,6 +36,7 @@ class Rollout:
         self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
     ) -> None:
         self.env, self.policy, self.steps = env.train(), policy, steps
+        self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
@@ -47,13 +48,9 @@ class Rollout:
 
     @torch.no_grad()
     def collect(self, progress: float = 0.0) -> TensorDictBase:
-        """Return the next batch, [B, T].
+        """Return the next batch, [B, T]; `progress` is the finished share of the run, for the schedules of transforms.
 
-        Args:
-            progress: finished share of the run in [0, 1], for the schedules of transforms.
-
-        Raises:
-            UserError: if a number is NaN or infinite, with its entry, step and row.
+        A number that is NaN or infinite is a `UserError` with its entry, step and row.
         """
         set_progress(self.env, progress)
         carrier = acting = self.env.reset() if self.carrier is None else self.carrier
@@ -86,38 +83,34 @@ class Rollout:
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the env and of the collection."""
-        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         return {
-            "env": env.state_dict(),
-            "transforms": self.env.state_dict() if env is not self.env else {},
+            "env": self.base_env.state_dict(),
+            "transforms": self.env.state_dict() if self.base_env is not self.env else {},
             "carrier": None if self.carrier is None else self.carrier.to_dict(),
             "taken": self.taken,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state of `state_dict`; new episodes begin where the env or a guide cannot go on with its own."""
-        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
-        env.load_state_dict(state["env"])
-        if env is not self.env:
+        self.base_env.load_state_dict(state["env"])
+        if self.base_env is not self.env:
             self.env.load_state_dict(state["transforms"])
         carrier = state["carrier"]
         # A part that cannot go on has said so.
         continues = all(getattr(module, "continues", True) for module in self.env.modules())
-        if carrier is not None and not env.state_dict() and not env.state_spec.keys():
-            continues = False
-            warnings.warn(f"{type(env).__name__} does not save its state, so new episodes begin", stacklevel=2)
+        if carrier is not None and not self.base_env.state_dict() and not self.base_env.state_spec.keys():
+            continues, name = False, type(self.base_env).__name__
+            warnings.warn(f"{name} does not save its state, so new episodes begin", stacklevel=2)
         if carrier is not None and continues:
             self.carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
         self.taken = state["taken"]
 
 
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
-    """Raise an error if a number of a batch [*B, T] is NaN or infinite; `steps` is the number of earlier steps.
+    """Raise a `UserError` for the earliest number of a batch [*B, T] that is NaN or infinite.
 
-    The check waits for the device once.
-
-    Raises:
-        UserError: for the earliest such number, with its entry, step (from 1) and row (from 0).
+    It has the entry, the step (from 1, after `steps` earlier ones) and the row (from 0). The check waits for the device
+    once.
     """
     floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
     if not floats or torch.stack([value.isfinite().all() for value in floats.values()]).all():

@@ -58,10 +58,8 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
     except OSError as error:
         if error.errno not in NO_SPACE:
             raise
-        raise UserError(
-            f"{error.filename or folder} cannot be written ({error.strerror}); make room, and continue with "
-            f"coil-train resume={folder}"
-        ) from error
+        problem = f"{error.filename or folder} cannot be written ({error.strerror})"
+        raise UserError(f"{problem}; make room, and continue with coil-train resume={folder}") from error
     return report_outcome(folder)
 
 
@@ -162,28 +160,22 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     if getattr(learner, "anchor", None) is None:
         return None
     if SELECTION not in config.evaluation.curve.cases:
-        raise UserError(
-            f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases in which the brake drives; give it"
-        )
-
+        needed = f"evaluation.curve.cases.{SELECTION}, cases in which the brake drives"
+        raise UserError(f"learner.anchor needs {needed}; give it")
     look = config.copy()
     look.evaluation.curve.num_envs = learner.anchor.cases
-
-    def build_cases(policies: int) -> EnvBase:
-        return build.build_env(look, build.cases_node(look, SELECTION, policies))
-
     failure = measures_of(config.evaluation.measures).get("crashed")
-    return Brake(learner.anchor, learner.policy, build_cases, failure)
+    return Brake(learner.anchor, learner.policy, partial(_build_cases, look, SELECTION), failure)
+
+
+def _build_cases(config: DictConfig, cases: str, drivers: int) -> EnvBase:
+    return build.build_env(config, build.cases_node(config, cases, drivers))
 
 
 def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> EvaluationCurve | None:
     """Return the evaluation curve of a run; None without cases."""
-
-    def build_cases(cases: str, drivers: int) -> EnvBase:
-        return build.build_env(config, build.cases_node(config, cases, drivers))
-
     curve = config.evaluation.curve
-    envs = {cases: partial(build_cases, cases) for cases in curve.cases}
+    envs = {cases: partial(_build_cases, config, cases) for cases in curve.cases}
     options = {"watch": config.watch, "points": curve.points, "batches": curve.batches}
     return EvaluationCurve(folder, policy, envs, **options) if envs else None
 

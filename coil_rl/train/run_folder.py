@@ -49,10 +49,8 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
 def begin(config: DictConfig, folder: Path) -> None:
     """Write the versions and the configuration of a new run; raise a `UserError` if there is a run already."""
     if (folder / "config.yaml").exists():
-        raise UserError(
-            f"{folder} already holds a run; resume it with coil-train resume={folder}, "
-            "or choose another folder with hydra.run.dir=FOLDER"
-        )
+        remedy = f"resume it with coil-train resume={folder}, or choose another folder with hydra.run.dir=FOLDER"
+        raise UserError(f"{folder} already holds a run; {remedy}")
     write_text(folder / "versions.json", json.dumps(versions(), indent=2))
     saved: Any = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     saved.pop("trust", None)  # it holds for one command

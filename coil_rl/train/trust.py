@@ -146,18 +146,15 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
     elif target in allowed:
         plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
         if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
-            raise UserError(
-                f"{refusal}, which may only be the logger, with log_dir: ${{run_dir}} and a plain exp_name, "
-                "because a run writes only into its own folder; trust=[torchrl] on the command line allows it"
-            )
+            allowed_as = "which may only be the logger, with log_dir: ${run_dir} and a plain exp_name"
+            reason = "because a run writes only into its own folder"
+            raise UserError(f"{refusal}, {allowed_as}, {reason}; trust=[torchrl] on the command line allows it")
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
         raise UserError(f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}")
     else:
-        raise UserError(
-            f"{refusal}, which could run code; if you know the folder and the package, "
-            f"allow it with trust=[{package:.100}] on the command line"
-        )
+        remedy = f"allow it with trust=[{package:.100}] on the command line"
+        raise UserError(f"{refusal}, which could run code; if you know the folder and the package, {remedy}")
 
 
 @cache

@@ -21,14 +21,13 @@ MAGIC = b"\x89MCAP0\r\n"
 # If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
 CHUNK = 128 * 1024  # bytes
 
+CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
+
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
     b"version https://git-lfs": ("a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
     b"#ROSBAG V": ("a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
-    b"SQLite format 3\0": (
-        "the SQLite storage of a ROS 2 bag",
-        "convert its folder: rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap",
-    ),
+    b"SQLite format 3\0": ("the SQLite storage of a ROS 2 bag", f"convert its folder: {CONVERT}"),
     b"\x28\xb5\x2f\xfd": ("compressed as a whole with zstd", "unpack it: zstd -d FILE -o OTHER.mcap"),
     b"\x1f\x8b": ("compressed as a whole with gzip", "unpack it first"),
     b"\x04\x22\x4d\x18": ("compressed as a whole with lz4", "unpack it first"),
@@ -188,7 +187,9 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
             elif type(record) is records.Schema:
                 schemas[record.id] = record
             elif type(record) is records.Channel:
-                channel = _channel(record, schemas)
+                kind = schemas.get(record.schema_id) or records.Schema(id=0, name="", encoding="", data=b"")
+                about = record.message_encoding, kind.encoding, kind.data, tuple(record.metadata.items())
+                channel = Channel(record.topic, kind.name, *about)
                 contents.channels.append(channel)
                 if topics is None or channel.topic in topics:
                     selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
@@ -230,10 +231,9 @@ def _records(file: Path, stream: BinaryIO, size: int, complete: bool, contents: 
             whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
             if whole or not (places or following):
                 reason = " ".join(str(error).split()) or type(error).__name__
-                raise RecordingError(
-                    f"{file} is damaged before byte {end} ({reason}); copy it again from where it was "
-                    "recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
-                ) from None
+                save = "save what is left with: mcap recover FILE -o OTHER.mcap"
+                remedy = f"copy it again from where it was recorded, or {save}"
+                raise RecordingError(f"{file} is damaged before byte {end} ({reason}); {remedy}.") from None
             contents.damage.append(f"byte {start}")
             if not following:
                 return
@@ -251,13 +251,6 @@ def _summary(stream: BinaryIO) -> Summary:
         return SeekingReader(stream).get_summary() or Summary()
     except Exception:  # its bytes may be anything
         return Summary()
-
-
-def _channel(record: records.Channel, schemas: dict[int, records.Schema]) -> Channel:
-    metadata, schema = tuple(record.metadata.items()), schemas.get(record.schema_id)
-    if schema is None:
-        return Channel(record.topic, "", record.message_encoding, "", b"", metadata)
-    return Channel(record.topic, schema.name, record.message_encoding, schema.encoding, schema.data, metadata)
 
 
 def _check_format(file: Path) -> tuple[int, bool]:
@@ -294,8 +287,7 @@ def _files(path: Path) -> Iterator[Path]:
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
     listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
     if storage and storage[1] != "mcap":
-        convert = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
-        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {convert}.")
+        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}.")
     if not listed:
         raise RecordingError(f"{metadata} lists no files; {reindex}")
     for line in listed[1].splitlines():

@@ -28,11 +28,9 @@ def definition(message_type: str) -> bytes:
 
 
 def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
-    """Return a message as little-endian CDR; an unknown type or field is a `ValueError`.
+    """Return a message of a type such as "geometry_msgs/msg/Twist" as little-endian CDR.
 
-    Args:
-        message_type: such as "geometry_msgs/msg/Twist".
-        fields: number, text, sequence or nested mapping by field; a missing one is zero or empty.
+    A field is a number, text, sequence or nested mapping, zero or empty if missing. An unknown one is a `ValueError`.
     """
     return bytes(ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True))
 

@@ -90,14 +90,11 @@ class Recording:
         last = np.searchsorted(times, np.append(self.log_time[1:], np.iinfo(np.int64).max)) - 1
         rows = np.where(last[:, None] < 0, np.nan, commands[last])
         if not commands[:, 0].any():
-            rows[:, 0] = nominal_speed if self.odometry is None else self._measured_speeds()
+            rows[:, 0] = nominal_speed
+            if self.odometry is not None:  # from each scan to the next one
+                path, time = np.hypot(*np.diff(self.poses()[:, :2], axis=0).T), np.diff(self.seconds)
+                rows[:, 0] = np.append(np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0)
         return rows
-
-    def _measured_speeds(self) -> Floats:
-        """Return the speed from each scan to the next one by odometry, [N] m/s."""
-        poses, seconds = self.poses(), self.seconds
-        path, time = np.hypot(*np.diff(poses[:, :2], axis=0).T), np.diff(seconds)
-        return np.append(np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0)
 
 
 def read_recording(
@@ -138,7 +135,10 @@ def read_recording(
     if len(types) < 1 + bool(odometry) + bool(command):
         raise RecordingError(f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics.")
     contents = read_messages(path, types)
-    remarks = _remarks_on_loss(contents, scan)
+    scans, lost = len(contents.messages[scan]), contents.lost.get(scan, "an unknown number")
+    remarks = [f"is cut off: {scans} scans can be read"] if contents.cut_off else []
+    if contents.damage:
+        remarks.append(f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost")
     remarks += [remark for topic in types if (remark := _ignore_other_types(path, topic, types[topic], contents, scan))]
     if not contents.messages[scan]:
         raise _no_scans(path, scan, contents)
@@ -247,15 +247,6 @@ def _decoded(
             problem = f"it is not a valid {channel.message_type} ({' '.join(str(error).split())})"
             raise _message_error(path, topic, index, log_time, problem) from None
     return np.array([message.log_time for message in contents.messages[topic]]), rows
-
-
-def _remarks_on_loss(contents: Contents, topic: str) -> list[str]:
-    """Return remarks on an early end and on damage, with the number of scans."""
-    scans, lost = len(contents.messages[topic]), contents.lost.get(topic, "an unknown number")
-    remarks = [f"is cut off: {scans} scans can be read"] if contents.cut_off else []
-    if contents.damage:
-        remarks.append(f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost")
-    return remarks
 
 
 def _ignore_other_types(path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str) -> str | None:

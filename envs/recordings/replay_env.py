@@ -3,6 +3,7 @@
 import math
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -33,7 +34,8 @@ class McapReplayEnv(EnvBase):
     `reward`. The only term of the reward is `smooth`, as a replay cannot show the effect of other actions.
 
     A step takes the action for the current scan and moves on to the next scan, so a recording of N scans takes N
-    actions; then the episode is truncated, and the last scan is repeated.
+    actions; then the episode is truncated, and the last scan is repeated. A recording that cannot be used is a
+    `RecordingError`, a value outside its range a `ValueError`.
 
     Args:
         recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
@@ -46,10 +48,6 @@ class McapReplayEnv(EnvBase):
         sight: m, range of view in the scale of the cone world.
         speed, car_length: of the robot, m/s and m.
         device: of all tensors.
-
-    Raises:
-        RecordingError: for a recording that cannot be used.
-        ValueError: for a value outside its range.
     """
 
     def __init__(
@@ -78,26 +76,15 @@ class McapReplayEnv(EnvBase):
         sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
-        self.recordings = [
-            source
-            if isinstance(source, Recording)
-            else read_recording(source, scan, odometry, command, frame=frame, strict=strict)
-            for source in sources
-        ]
+        read = partial(read_recording, scan=scan, odometry=odometry, command=command, frame=frame, strict=strict)
+        self.recordings = [source if isinstance(source, Recording) else read(source) for source in sources]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
-        self.kept_cones, self.smooth, self.max_steering = kept_cones, smooth, math.radians(max_steering)
+        self.smooth, self.max_steering = smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
-        self._load(perception)
-        self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
-        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, len(sources)))
-        self.to(self.device)
-        declare_specs(self, self._reset())
-
-    def _load(self, perception: Perceive) -> None:
-        """Perceive all scans; store them end to end, [T] scans per buffer."""
+        # All scans are perceived here and stored end to end, [T] scans per buffer.
         self.perception = perception
-        cones, count = zip(*(_perceive(each, perception, self.kept_cones) for each in self.recordings), strict=True)
+        cones, count = zip(*(_perceive(each, perception, kept_cones) for each in self.recordings), strict=True)
         self.cones, self.count = _joined(cones), _joined(count)
         self.pose = _joined([_from_start(each.poses()).astype(np.float32) for each in self.recordings])
         self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
@@ -108,6 +95,10 @@ class McapReplayEnv(EnvBase):
         samples, valid = self.memory.estimate(self.cones, self.count)
         self.samples: Tensor = nn.Buffer(samples, persistent=False)
         self.valid: Tensor = nn.Buffer(valid, persistent=False)
+        self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
+        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, len(sources)))
+        self.to(self.device)
+        declare_specs(self, self._reset())
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: the env is deterministic."""
@@ -187,10 +178,9 @@ def _perceive(
         cones, count = map(np.asarray, perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]))
         expected = (len(rows), 2, 2)
         if cones.ndim != 4 or cones.shape[:2] + cones.shape[3:] != expected or count.shape != expected[:2]:
-            raise ValueError(
-                f"perception returned cones {cones.shape} and counts {count.shape} for {len(rows)} scans; it must "
-                f"return [{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
-            )
+            given = f"cones {cones.shape} and counts {count.shape} for {len(rows)} scans"
+            needed = f"[{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
+            raise ValueError(f"perception returned {given}; it must return {needed}")
         nearest = min(kept_cones, cones.shape[2])
         all_cones[rows, :, :nearest], all_counts[rows] = cones[:, :, :nearest], np.minimum(count, nearest)
     return all_cones, all_counts

@@ -33,7 +33,12 @@ LINE_OFFSET = 1e-3  # m, so that a robot that stands on the line has not crossed
 def robot_track() -> Track:
     """Return the track in the robot's own metres: a closed line of 6 m with left bends, a right bend and a straight."""
     centre, normal = _centre_line()
-    left, right = (_cones(centre + sign * HALF_WIDTH * normal) for sign in (1, -1))
+    sides = []
+    for sign in (1, -1):
+        ring = centre + sign * HALF_WIDTH * normal
+        length = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum()
+        sides.append(resample(ring, length / round(length / CONE_GAP)))
+    left, right = sides
     return Track("robot (simulated)", left, right)
 
 
@@ -143,11 +148,6 @@ def _centre_line() -> tuple[Array, Array]:
     # Spread the rounding error that keeps the lap open.
     position -= np.outer(np.linspace(0, 1, steps), position[-1])
     return position, np.stack([-np.sin(heading), np.cos(heading)], axis=1)
-
-
-def _cones(ring: Array) -> Array:
-    length = np.linalg.norm(np.diff(ring, axis=0, append=ring[:1]), axis=1).sum()
-    return resample(ring, length / round(length / CONE_GAP))
 
 
 def _stack_padded(tables: Sequence[Tensor], padding: float) -> Tensor:

@@ -88,10 +88,9 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
     """
     path, scans = recording.path, recording.ranges
     if "track" not in recording.notes or recording.odometry is None or len(scans) < 2:
-        raise RecordingError(
-            f"{path} lacks the positions of its cones: it needs a metadata record named track (left and right, each "
-            "[[x, y], ...] m in the frame of the odometry), odometry, and at least two scans."
-        )
+        record = "a metadata record named track (left and right, each [[x, y], ...] m in the frame of the odometry)"
+        needed = f"{record}, odometry, and at least two scans"
+        raise RecordingError(f"{path} lacks the positions of its cones: it needs {needed}.")
     track = track_of(recording)
     starts = torch.from_numpy(recording.poses()).float().t().unsqueeze(-1)
     angles = torch.from_numpy(recording.angles(slice(-1))).float()
@@ -125,8 +124,7 @@ def record_labelling_drives(
 ) -> dict[Sides, list[str]]:
     """Record drives to train a cone classifier, `pairs` past each side, and `both` drives past both sides to test it.
 
-    Returns:
-        The paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap` and so on. `tick` is called after each drive.
+    The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is called after each drive.
     """
     training, test = range(pairs), range(TEST_SEED, TEST_SEED + both)
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}

@@ -43,7 +43,7 @@ class SimulatedRobotEnv(SeededEnv):
     `valid` [B, 2], whether each side is valid in this scan. The reward is that of the cone world without the term for
     new cones, as the robot cannot distinguish new cones from known ones. A robot crashes if its outline touches a cone
     or its centre reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a
-    return.
+    return. A value outside its range is a `ValueError`.
 
     Args:
         tracks: in the robot's own metres; None for `robot_track()`.
@@ -54,9 +54,6 @@ class SimulatedRobotEnv(SeededEnv):
         speed: m/s.
         car_length: L in m; by default a seventh of the cone world's car.
         seed: of the LiDAR's noise and the draw of tracks.
-
-    Raises:
-        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import SimulatedRobotEnv

@@ -58,14 +58,13 @@ class SimulatedLidar:
 def cast_beams(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
     """Return the true distance along each beam to the first surface [B, P] m, and the index of the cone it hits [B, P].
 
+    Without a cone the distance is infinite and the index -1.
+
     Args:
         poses: [3, B, P] (m, m, radians), sensor pose at the time of each beam.
         angles: [P] radians, bearings of the beams, or [B, P] if each sensor has its own.
         cones: centres, [2, M] m, or [2, B, M] if each sensor has its own.
         radius: [M] or [B, M] m.
-
-    Returns:
-        Without a cone the distance is infinite and the index -1.
     """
     direction = poses[2] + angles
     cos, sin = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)

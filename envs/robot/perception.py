@@ -36,10 +36,8 @@ class ConeClassifier:
     in NumPy is many times faster for a few clusters. F features are standardised by `mean` and `scale` [F] and compared
     with the support vectors [S, F] by the kernel exp(-gamma |a - b|^2). The `weights` [2, S] and the `intercept` [2] of
     the two machines turn the kernel into decision values: the first is positive for thick cones and negative for thin
-    ones; the second is negative for clusters unlike those of the training.
-
-    Raises:
-        ValueError: if shapes do not match, a value is not finite, or `scale` or `gamma` is not positive.
+    ones; the second is negative for clusters unlike those of the training. Shapes that do not match, a value that is
+    not finite, and a `scale` or `gamma` that is not positive are a `ValueError`.
 
     Example:
         >>> from coil_rl.envs import simulated_cone_classifier
@@ -93,9 +91,8 @@ def simulated_cone_classifier() -> ConeClassifier:
 class Perception:
     """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep the cones in range.
 
-    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points.
-
-    Raises a `ValueError` for a value outside its range.
+    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points. A value
+    outside its range is a `ValueError`.
 
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
@@ -179,20 +176,12 @@ class BoundaryMemory(nn.Module):
 
     A side is valid if it has at least two cones and each of the five boundary samples is at a plausible distance.
     Errors of perception last several scans, as a cone stays in the shadow of another one; an invalid side keeps its
-    last valid numbers. The state is in buffers.
-
-    Args:
-        batch: B.
-        spline, smoothing: of the boundary estimate, as in `ConeTrackEnv`.
-        sight: m, range of view in the scale of the cone world.
+    last valid numbers. The state is in buffers of B rows, the `batch`. `spline` and `smoothing` are those of the
+    boundary estimate, as in `ConeTrackEnv`; `sight` is the range of view in m in the scale of the cone world.
     """
 
     def __init__(
-        self,
-        batch: int,
-        spline: Literal["cubic", "quadratic"] = "cubic",
-        smoothing: float = 0.1,
-        sight: float = SIGHT,
+        self, batch: int, spline: Literal["cubic", "quadratic"] = "cubic", smoothing: float = 0.1, sight: float = SIGHT
     ) -> None:
         super().__init__()
         self.fit = spline_fit(spline, smoothing)
@@ -203,8 +192,7 @@ class BoundaryMemory(nn.Module):
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Update the memory with the cones in view and their number, as `Perception` returns them.
 
-        Returns:
-            The observation [B, 20], zeros for a side that was never valid; and which sides are valid now [B, 2].
+        Returns the observation [B, 20], zeros for a side that was never valid, and which sides are valid now [B, 2].
         """
         return self.remember(*self.estimate(cones, count))
 

@@ -70,10 +70,10 @@ def test_auto_compiles_a_run_of_many_steps_and_remembers_it(monkeypatch):
     for updates, expected in ((2, False), (10, True)):  # of 20 steps each
         ppo, rollout = make(PPO, "auto", minibatches=4)
         for waiting in (0.0, 0.2):  # nothing is learned yet, as before there are enough steps for replay
-            ppo.gradient.decide(waiting)
+            ppo.gradient.begin(waiting)
         ppo.update(rollout.collect(), 0.4)
         assert ppo.gradient.compile == "auto"
-        ppo.gradient.decide(0.4 + 0.6 / updates)
+        ppo.gradient.begin(0.4 + 0.6 / updates)
         assert ppo.gradient.compile is expected
         assert ppo.state_dict()["gradient"]["compile"] is expected
 

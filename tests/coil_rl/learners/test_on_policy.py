@@ -142,7 +142,7 @@ def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
     rows, found = ppo.prepare(batch, 0.0), []
     for loss in (reference, ppo.loss):
         torch.manual_seed(1)
-        ppo.optimiser.zero_grad()
+        ppo.gradient.adam.zero_grad()
         losses = loss(rows)
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
         found.append((losses.detach(), [parameter.grad.clone() for parameter in ppo.gradient.parameters]))

@@ -1,0 +1,38 @@
+"""The state of a learner, which consists of the states of its parts."""
+
+import copy
+from typing import Any, ClassVar
+
+import torch
+
+
+class Stateful:
+    """Base of what has a state to save: the attributes named by `parts`.
+
+    Each is a generator, an object with a state of its own, a plain value, or None, which has an empty state.
+    """
+
+    parts: ClassVar[tuple[str, ...]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, besides its batch."""
+        return {name: _state_of(getattr(self, name)) for name in self.parts}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state of `state_dict`."""
+        for name in self.parts:
+            part = getattr(self, name)
+            if isinstance(part, torch.Generator):
+                part.set_state(state[name].cpu())
+            elif hasattr(part, "load_state_dict"):
+                part.load_state_dict(state[name])
+            elif part is not None:
+                setattr(self, name, copy.copy(state[name]))
+
+
+def _state_of(part: Any) -> Any:
+    if isinstance(part, torch.Generator):
+        return part.get_state()
+    if part is None:
+        return {}
+    return part.state_dict() if hasattr(part, "state_dict") else copy.copy(part)
