@@ -17,6 +17,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
+from coil_rl.compiled import record
 from coil_rl.train import checkpoint
 from coil_rl.train.evaluation import Totals, episodes
 from coil_rl.train.load import memory_keys
@@ -121,10 +122,15 @@ class PoliciesInTurn(TensorDictModuleBase):
 
 
 class StackedPolicies(TensorDictModuleBase):
-    """Several states of a policy whose state is its tensors, each for its own part of the rows, computed at once."""
+    """Several states of a policy whose state is its tensors, each for its own part of the rows, computed at once.
+
+    The operations are recorded at the first call, for its number of rows, and repeated afterwards, which takes a tenth
+    of the time.
+    """
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__()
+        self.recorded: Callable[..., Sequence[Tensor]] | None = None
         self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
         policies = PoliciesInTurn(policy, states).policies
         self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
@@ -132,8 +138,14 @@ class StackedPolicies(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the `action` of the policy of each row."""
-        rows = tensordict.select(*self.in_keys).view(len(self.states), -1)
-        return tensordict.set("action", torch.vmap(self._act)(self.states, rows).flatten(0, 1))
+        entries = [tensordict[key] for key in self.in_keys]
+        if self.recorded is None:
+            self.recorded = record(self._actions, entries)
+        return tensordict.set("action", self.recorded(*entries)[0])
+
+    def _actions(self, *entries: Tensor) -> list[Tensor]:
+        rows = TensorDict(dict(zip(self.in_keys, entries, strict=True)), [len(entries[0])])
+        return [torch.vmap(self._act)(self.states, rows.view(len(self.states), -1)).flatten(0, 1)]
 
     def _act(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
         (policy,) = self._policy
