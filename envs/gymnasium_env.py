@@ -103,11 +103,8 @@ class GymnasiumEnv(SeededRows):
         self.floats = torch.empty(0, dtype=dtype).numpy().dtype
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
-        self._declare_specs(id, env.observation_space, tuple(makers), dtype)
-
-    def _declare_specs(self, id: str, space: spaces.Space[Any], controllers: Sequence[str], dtype: torch.dtype) -> None:
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
-        self.entries = [Entry(id, path, leaf, self.floats) for path, leaf in leaves(space)]
+        self.entries = [Entry(id, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)]
         observation = Composite()
         for entry in self.entries:
             if entry.key[0] in RESERVED:
@@ -115,7 +112,7 @@ class GymnasiumEnv(SeededRows):
             observation[entry.key] = entry.spec
         for name in self.info:
             observation["info", name] = number.clone()
-        for name in controllers:
+        for name in makers:
             # Advice is written as given, and may be out of bounds.
             advice = Unbounded(action.shape, dtype=dtype) if isinstance(action, Bounded) else action.clone()
             observation["controller", name] = advice
@@ -147,7 +144,6 @@ class GymnasiumEnv(SeededRows):
 
     def _output(self, *, stepped: bool) -> TensorDict:
         rows = self.rows
-        observations = [row.observation for row in rows]
         terminated = np.array([[row.terminated] for row in rows], dtype=bool)
         truncated = np.array([[row.truncated] for row in rows], dtype=bool)
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
@@ -155,7 +151,7 @@ class GymnasiumEnv(SeededRows):
         if stepped:
             data["reward"] = self._numbers([row.reward for row in rows])
         for entry in self.entries:
-            data[entry.key] = torch.from_numpy(entry(observations))
+            data[entry.key] = torch.from_numpy(entry([row.observation for row in rows]))
         for name in self.info:
             try:
                 data["info", name] = self._numbers([row.info.get(name, 0) for row in rows])

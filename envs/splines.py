@@ -35,23 +35,14 @@ class Spline:
     bends: Tensor  # [D, K, *batch], 1/m, second derivatives at the knots, linear between two of them
 
     @property
-    def length(self) -> Tensor:
-        """Return the parameter of the last point: [*batch], m."""
-        return self.knots[-1]
-
-    @property
     def polyline_length(self) -> Tensor:
         """Return the length of the polyline through the spline's values: [*batch], m."""
         step = self.values[:, 1:] - self.values[:, :-1]
         return _total(_total(step * step, 0).sqrt(), 0)
 
-    def sample(self, u: Tensor) -> Tensor:
-        """Evaluate at parameters u: [S, *batch], m, clamped to [0, length]; returns [D, S, *batch], m."""
-        return self._at(torch.minimum(u.clamp(min=0), self.length))
-
     def along(self, fraction: Tensor) -> Tensor:
-        """Evaluate at fractions of the length: [S, *batch], from 0 to 1; returns [D, S, *batch], m."""
-        return self._at(self.length * fraction)
+        """Evaluate at fractions of the last knot: [S, *batch], from 0 to 1; returns [D, S, *batch], m."""
+        return self._at(self.knots[-1] * fraction)
 
     def equidistant(self, samples: int) -> Tensor:
         """Evaluate from first to last point in equal steps of the parameter: [D, samples, *batch], m."""

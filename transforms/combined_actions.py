@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.utils import expand_as_right
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
@@ -29,11 +29,10 @@ class CombinedAction(GuideTransform):
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
-    taken: Tensor  # number of steps in training, over all rows
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.register_buffer("taken", torch.zeros((), dtype=torch.int64))
+        self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # steps in training, over all rows
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         executed = self._executed(tensordict)

@@ -77,9 +77,7 @@ class DegradedAdvice(Transform):
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Add the memory, which is an input of resets."""
         if self.slots:
-            state = input_spec["full_state_spec"]
-            if state is None:
-                state = Composite(shape=input_spec.shape, device=input_spec.device)
+            state = input_spec["full_state_spec"] or Composite(shape=input_spec.shape, device=input_spec.device)
             memory = self._memory_spec(self.parent.full_observation_spec[self.key])
             input_spec["full_state_spec"] = state.update(memory)
         return input_spec

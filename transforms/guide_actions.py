@@ -318,16 +318,13 @@ class GuideActions(ActionTransform):
 
         Two guides of one name with a memory, or one in an env that resets its agents one by one, are a `ValueError`.
         """
-        spec = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
-        observation_spec[self.out_keys[0]] = spec
+        observation_spec[self.out_keys[0]] = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
         return self._add_memory(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Add the memory, which is an input of steps."""
         if self.guides.memories:
-            state = input_spec["full_state_spec"]
-            if state is None:
-                state = Composite(shape=input_spec.shape, device=input_spec.device)
+            state = input_spec["full_state_spec"] or Composite(shape=input_spec.shape, device=input_spec.device)
             input_spec["full_state_spec"] = self._add_memory(state)
         return input_spec
 

@@ -35,10 +35,9 @@ class GuideMemory:
 
     def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
         """Return the spec of the memory of all rows of an env, given their batch size and device."""
-        spec = Composite(shape=batch, device=device)
-        for key, row in self.specs.items():
-            spec[key] = row.to(device).expand(*batch, *row.shape) if device else row.expand(*batch, *row.shape)
-        return spec
+        rows = {key: row.to(device) if device else row for key, row in self.specs.items()}
+        specs = {key: row.expand(*batch, *row.shape) for key, row in rows.items()}
+        return Composite(specs, shape=batch, device=device)
 
     def start(self, batch: torch.Size, device: torch.device | None) -> TensorDictBase:
         """Return the memory at the start of episodes."""

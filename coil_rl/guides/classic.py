@@ -134,8 +134,7 @@ class Walker:
 
     def load_state_dict(self, state: Mapping[str, float]) -> None:
         """Restore the state of the machine."""
-        for name in self.memory:
-            value = state[name]
+        for name, value in state.items():
             setattr(self.machine, name, value if name == "supporting_knee_angle" else int(value))
 
 

@@ -86,9 +86,8 @@ class NetworkRegressor(Regressor):
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             fresh.layers = Mlp(self.hidden).layers(inputs, outputs, gain=1.0)
-        buffers = {"x_mean": torch.zeros(inputs), "x_scale": torch.ones(inputs)}
-        for name, value in (buffers | {"y_mean": torch.zeros(outputs), "y_scale": torch.zeros(outputs)}).items():
-            fresh.register_buffer(name, value)
+        fresh.x_mean, fresh.x_scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
+        fresh.y_mean, fresh.y_scale = nn.Buffer(torch.zeros(outputs)), nn.Buffer(torch.zeros(outputs))
         return fresh
 
     @torch.enable_grad()

@@ -41,14 +41,12 @@ class AnchoredHead(nn.Module):
     means or logits [*batch, n_guides, *event].
     """
 
-    weight: Tensor
-
     def __init__(
         self, head: nn.Module, pull: Callable[[Tensor], Tensor], guides: int, device: torch.device | None = None
     ) -> None:
         super().__init__()
         self.head, self.pull = head, pull
-        self.register_buffer("weight", torch.eye(guides, device=device)[0])
+        self.weight: Tensor = nn.Buffer(torch.eye(guides, device=device)[0])
 
     def forward(self, advice: Tensor, *inputs: Tensor) -> Any:
         """Return what `head` returns for the inputs, with the pull added."""

@@ -30,6 +30,7 @@ from torchrl.modules import (
 from coil_rl.learners.anchor import Anchor, AnchoredHead, pull_to_choice, pull_to_number
 from coil_rl.learners.encoders import STATE, ConcatObservations, Gru, Mlp, ObservationNetwork, Shapes, entry_specs
 from coil_rl.learners.normaliser import Normaliser
+from coil_rl.transforms.action_space import choices_of
 
 UNCLIPPED, REMEMBERED = "unclipped_action", "remembered"
 DEFAULT = Mlp()
@@ -73,13 +74,11 @@ class ChoicesHead(nn.Module):
     one index for each choice; so have the `options`, their numbers.
     """
 
-    valid: Tensor
-
     def __init__(self, network: ObservationNetwork, event: torch.Size, options: Tensor) -> None:
         super().__init__()
         self.network, self.event = network, event
         longest = torch.arange(int(options.max()), device=options.device)
-        self.register_buffer("valid", longest < options.unsqueeze(-1), persistent=False)
+        self.valid: Tensor = nn.Buffer(longest < options.unsqueeze(-1), persistent=False)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the logits, [*batch, *event, n]."""
@@ -220,7 +219,7 @@ def actor(
         valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
         return policy(anchored(network_of(spec.space.n), pull_to_choice(valid)), ["logits"], distribution)
     if not spec.dtype.is_floating_point:
-        options = option_counts(spec, event)
+        options = torch.tensor(choices_of(spec), device=spec.device).expand(event)
         choices = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
         return policy(anchored(choices, pull_to_choice(choices.valid)), ["logits"], Choices, event_dims=len(event))
     size = event.numel()
@@ -273,13 +272,6 @@ def split_memory(
 def action_shape(env: EnvBase) -> torch.Size:
     """Return the shape of an action of an env without the batch dimensions."""
     return env.full_action_spec[env.action_key].shape[len(env.batch_size) :]
-
-
-def option_counts(spec: Categorical | MultiCategorical, event: torch.Size) -> Tensor:
-    """Return the number of options of each choice of an action, [*event]."""
-    if isinstance(spec, MultiCategorical):
-        return spec.nvec.reshape(-1, event[-1])[0].expand(event).to(spec.device)
-    return torch.full(event, spec.space.n, device=spec.device)
 
 
 def critic(

@@ -29,9 +29,7 @@ def evaluate(config: DictConfig) -> float:
     from coil_rl.train.fallback import build_fallback
 
     torch.set_num_threads(config.threads)
-    folder = Path(config.run_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    seed, agent, run = config.seed, None, config.run
+    folder, seed, agent, run = Path(config.run_dir), config.seed, None, config.run
     if run is not None:
         config, agent = restore(Path(run), config)
     evaluate_run(config, agent, folder, seed, build_fallback(config, Path(run or ""), agent))

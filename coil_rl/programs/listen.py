@@ -40,7 +40,6 @@ def listen(config: DictConfig) -> None:
     sections: WholeEpisode = build(node, "evaluation.sections") if node else WholeEpisode()
     evaluation = build_evaluation(run, sections.record)
     rows = len(evaluation.cases) * run.evaluation.repeats
-    folder.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)  # for guides with random actions
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
@@ -82,8 +81,7 @@ def _summary(label: str, table: list[dict[str, Any]]) -> str:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    used = ("run", "track", "evaluation", "donors")
-    app.check_used(used, f"run={config.run} has its own configuration")
+    app.check_used(("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration")
     app.check_run(config)
 
 

@@ -32,7 +32,8 @@ def replay(config: DictConfig) -> None:
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
     from coil_rl.replay.open_loop import open_loop
-    from coil_rl.replay.report import caution, describe, notes, outcome
+    from coil_rl.replay.report import caution, describe, outcome
+    from coil_rl.report.table import TABLES
     from coil_rl.train.build import build
 
     torch.set_num_threads(config.threads)
@@ -55,8 +56,8 @@ def replay(config: DictConfig) -> None:
         _write(config, result, runs, destination)
     sources = [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
     cautions = [text for result in results if (text := caution(result, env.perception))]
-    warned = [f"Warning: {text}." for text in cautions]
-    text = "\n\n".join([*map(describe, results), *warned, *sources, notes(env.max_steering)])
+    notes = TABLES["replay"]["notes"].format(max_steering=math.degrees(env.max_steering))
+    text = "\n\n".join([*map(describe, results), *(f"Warning: {each}." for each in cautions), *sources, notes])
     write_text(folder / "replay.md", text)
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
 from coil_rl.envs.recordings.messages import TWIST, header, twist
@@ -29,8 +28,6 @@ FADED = 0.3  # opacity of a boundary from the memory
 ROSBAG2 = "rosbag2"  # metadata record with the numbers of messages in the original, which the copy does not have
 TRANSFORMS = ("/tf", "/tf_static")
 POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
-
-Floats = NDArray[np.floating]
 
 
 def annotate(
@@ -81,13 +78,16 @@ def annotate(
 def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale: float) -> None:
     cos, sin = math.cos(laser_yaw), math.sin(laser_yaw)
     to_laser = np.array([[cos, -sin], [sin, cos]]) / scale
-    lines, cones = _boundaries(result.observation) @ to_laser, result.cones @ to_laser
+    # The inverse of `sight.encode_samples`.
+    distance, angle = np.moveaxis(result.observation.reshape(-1, 2, SAMPLES, 2), -1, 0)
+    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
+    lines = np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1) @ to_laser
+    cones = result.cones @ to_laser
     ever_valid = np.logical_or.accumulate(result.valid, axis=0)
     recording = result.recording
     for row, (time, stamp) in enumerate(zip(recording.log_time.tolist(), recording.stamp.tolist(), strict=True)):
         top = header(stamp, recording.frame)
-        cone_markers = [{"header": top, "action": DELETE_ALL}]
-        line_markers = [{"header": top, "action": DELETE_ALL}]
+        cone_markers, line_markers = ([{"header": top, "action": DELETE_ALL}] for _ in range(2))
         for side, name in enumerate(SIDES):
             size = {"x": DIAMETERS[name], "y": DIAMETERS[name], "z": CONE_HEIGHT}
             for number, (x, y) in enumerate(cones[row, side, : result.count[row, side]].tolist()):
@@ -105,13 +105,6 @@ def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale
 
 def _marker(top: dict[str, Any], side: str, kind: int, opacity: float, **fields: Any) -> dict[str, Any]:
     return {"header": top, "ns": side, "type": kind, "color": COLOURS[side] | {"a": opacity}, **fields}
-
-
-def _boundaries(observation: Floats) -> Floats:
-    """Return the boundary samples of observations, [N, 2, 5, 2] m: the inverse of `sight.encode_samples`."""
-    distance, angle = np.moveaxis(observation.reshape(len(observation), 2, SAMPLES, 2), -1, 0)
-    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
-    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
 
 
 def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:

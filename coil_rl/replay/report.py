@@ -12,7 +12,6 @@ from matplotlib.patches import Patch
 from coil_rl.envs import Perception
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import markdown_table, style
-from coil_rl.report.table import TABLES
 
 CHECKED_SCANS = 512  # of a recording at most, evenly spread
 MOST = 0.5  # share of the clusters
@@ -56,11 +55,6 @@ def caution(result: OpenLoop, perception: object) -> str:
         return ""
     remedy = "check env.perception, or train the classifier on your own cones with coil-reproduce figure=25"
     return f"{recording.path}: {' and '.join(problems)}, so the actions mean little; {remedy}"
-
-
-def notes(max_steering: float) -> str:
-    """Return the explanation of the table; `max_steering` in radians."""
-    return str(TABLES["replay"]["notes"].format(max_steering=np.degrees(max_steering)))
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:

@@ -81,8 +81,7 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
         for curve in curves:
             frames, weight = curve.T
             weights.step(frames, abs(weight), where="pre", color=strokes[label].colour, lw=0.7, alpha=0.6)
-    weights.set_ylim(0, 4)  # at the foot of the plot
-    weights.set_yticks([0, 1])
+    weights.set(ylim=(0, 4), yticks=[0, 1])  # at the foot of the plot
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
     weights.spines[:].set_visible(False)
     weights.text(0.01, 0.01, "weight of the guide", transform=weights.transAxes, size=7, color=style.QUIET)
@@ -158,10 +157,8 @@ def draw_phases(
         bottom.set_yscale("log")
         bottom.yaxis.set_major_formatter("{x:g}")
         for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
-            axes.set_ylabel(label)
             style.lighten(axes)
-            axes.margins(x=0)
-            axes.set_xlim(left=0)
+            axes.set(ylabel=label, xmargin=0, xlim=(0, None))
             for start, end, index in zip(edges, frames, learner.astype(int), strict=False):
                 if 0 <= index < len(colours):
                     axes.axvspan(start, end, color=list(colours.values())[index], alpha=0.12, lw=0)

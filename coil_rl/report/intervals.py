@@ -71,8 +71,7 @@ def draw_intervals(
             if len(panels) > 1:
                 axes.set_title(heading, size=9, loc="left")
             draw_panel(axes, {labels.index(row.label): row for row in panel})
-        axes_row[0].set_yticks(range(len(labels)), labels)
-        axes_row[0].set_ylim(len(labels) - 0.5, -0.5)
+        axes_row[0].set(yticks=range(len(labels)), yticklabels=labels, ylim=(len(labels) - 0.5, -0.5))
 
 
 def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:

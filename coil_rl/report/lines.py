@@ -134,18 +134,16 @@ def draw_listening_map(
         label: of the colour bar, measure and unit.
         title: above the map.
     """
-    driven = [np.asarray(line, dtype=np.float64) for line in lines]
-    measured = {guide: [np.asarray(row, dtype=np.float64) for row in rows] for guide, rows in values.items()}
-    highest = float(np.nanmax([0.0, *np.concatenate([row for rows in measured.values() for row in rows])])) or 1.0
+    highest = float(np.nanmax([0.0, *np.concatenate([row for rows in values.values() for row in rows])])) or 1.0
     colours = ScalarMappable(Normalize(0, highest), MEASURE_COLOURS)
-    panels = [(guide, index) for guide in measured for index in range(len(tracks))]
+    panels = [(guide, index) for guide in values for index in range(len(tracks))]
     titled = [replace(tracks[index], name=f"{guide}: {tracks[index].name}") for guide, index in panels]
-    plot = TrackPlot(titled, title=title, groups=len(measured))
+    plot = TrackPlot(titled, title=title, groups=len(values))
     rim = [StrokeEffect(linewidth=5.2, foreground=style.BACKGROUND), Normal()]
     for panel, (guide, index) in enumerate(panels):
-        xy = driven[index] + plot.offsets[panel]
+        xy = np.asarray(lines[index], dtype=np.float64) + plot.offsets[panel]
         segments = np.stack([xy[:-1], xy[1:]], axis=1)
-        segment_values = measured[guide][index][:-1]
+        segment_values = np.asarray(values[guide][index], dtype=np.float64)[:-1]
         finite = np.isfinite(segment_values)
         plot.axes.add_collection(
             LineCollection(

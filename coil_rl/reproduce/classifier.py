@@ -11,7 +11,7 @@ from sklearn.decomposition import PCA
 from sklearn.preprocessing import StandardScaler
 from tqdm import tqdm
 
-from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.envs.recordings.reading import read_recording
 from coil_rl.envs.robot.clusters import FEATURES, Array
 from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
 from coil_rl.report import markdown_table, style, write_csv
@@ -63,7 +63,7 @@ class Figure25(Result):
             self._read([made["left"], made["right"], made["both"]])
         simulated = any(recording.simulated for side in self.recordings for recording in side)
         suffix = " (simulated)" if simulated else ""
-        left, right = map(_scans, self.recordings[:2])
+        left, right = ([(each.ranges, each.angles(slice(None))) for each in side] for side in self.recordings[:2])
         training = cones.train_on_drives(left, right)
         cones.save_classifier(training.classifier, stem.with_name("cones.json"))
         classifier = training.classifier
@@ -89,10 +89,6 @@ class Figure25(Result):
         folds = ", ".join(f"{share:.4f}" for share in training.accuracy)
         notes = PAGE["notes"].format(folds=folds, kind=kind)
         return f"## Figure 25: thin cones and thick ones{suffix}\n\n{markdown_table(rows, PAGE['columns'])}\n\n{notes}"
-
-
-def _scans(recordings: Sequence[Recording]) -> list[cones.Scans]:
-    return [(recording.ranges, recording.angles(slice(None))) for recording in recordings]
 
 
 def principal_components(features: ArrayLike) -> tuple[Array, Array, Array]:

@@ -55,12 +55,11 @@ class Table1(Result):
         gain = Q[:, 1] - Q[:, 0]
         gains = "by " + " and ".join(f"{of_state:.4f}" for of_state in gain)
         details = f"{equal} of {len(difference)} values, off by {largest:.4f} at most"
-        claims = {
-            "Advertising is worth more in both states": pages.certain_verdict(bool((gain > 0).all()), gains),
-            "Q to two decimals": pages.certain_verdict(equal == len(difference), details),
-        }
-        rows_of_claims = [{"claim": claim, "ours": ours} for claim, ours in claims.items()]
-        section = pages.claims_section(rows_of_claims, {"ours": "ours"})
+        advertising = pages.certain_verdict(bool((gain > 0).all()), gains)
+        rounded = pages.certain_verdict(equal == len(difference), details)
+        claims = [{"claim": "Advertising is worth more in both states", "ours": advertising}]
+        claims += [{"claim": "Q to two decimals", "ours": rounded}]
+        section = pages.claims_section(claims, {"ours": "ours"})
         return f"## Table 1: the toymaker's Q\n\n{table}\n\n{notes}\n\n{section}"
 
 
@@ -112,9 +111,8 @@ def _draw_differences(labels: list[str], differences: Array, path: Path) -> None
         axes.axvline(0, color=style.KERB, lw=1)
         axes.plot(differences, range(len(differences)), color=style.AGENTS[0], ls="", marker="o", ms=6)
         axes.set_yticks(range(len(differences)), labels)
-        axes.set_ylim(len(differences) - 0.5, -0.5)
         reach = 1.15 * max(3 * ROUNDING, float(np.abs(differences).max()))
-        axes.set_xlim(-reach, reach)
+        axes.set(xlim=(-reach, reach), ylim=(len(differences) - 0.5, -0.5))
 
 
 def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, path: Path) -> None:

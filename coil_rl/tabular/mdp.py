@@ -125,8 +125,7 @@ def garnet(states: int, actions: int, rng: Generator, *, branches: int = 3, gamm
     if not 1 <= branches <= states:
         raise ValueError(f"branches={branches} must be between 1 and states={states}")
     P = np.zeros((states, actions, states))
-    for s in range(states):
-        for a in range(actions):
-            P[s, a, rng.choice(states, branches, replace=False)] = rng.dirichlet(np.ones(branches))
+    for s, a in np.ndindex(states, actions):
+        P[s, a, rng.choice(states, branches, replace=False)] = rng.dirichlet(np.ones(branches))
     R = np.broadcast_to(rng.normal(size=(states, actions, 1)), P.shape)
     return MDP(P, R, gamma)

@@ -24,9 +24,7 @@ class Brake:
     policy: TensorDictModuleBase  # of the learner; copies of it act
     build: Callable[[int], EnvBase]  # makes an env with all cases for a number of policies
     failure: Measure | None = None  # measure that is true for an episode that failed, if there is one
-
-    def __post_init__(self) -> None:
-        self.names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")
+    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")  # in the log
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether there is a look after an update."""

@@ -76,15 +76,14 @@ def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
 
 def _target(path: Any, name: str) -> Callable[..., Any]:
     try:
-        target = hydra.utils.get_object(path)
+        target: Callable[..., Any] = hydra.utils.get_object(path)
     except Exception as error:
         raise UserError(
             f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
         ) from error
     if not callable(target):
         raise UserError(f"{name}: {path} is {target!r}, which cannot be called; give a class or a function")
-    function: Callable[..., Any] = target
-    return function
+    return target
 
 
 def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
@@ -194,8 +193,7 @@ def observed_keys(config: DictConfig) -> list[NestedKey]:
 
 def learner_kind(config: DictConfig) -> str:
     """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`."""
-    kind: str = getattr(_target(config.learner.get("_target_"), "learner"), "kind", "agent")
-    return kind
+    return str(getattr(_target(config.learner.get("_target_"), "learner"), "kind", "agent"))
 
 
 def trains_guides(config: DictConfig) -> bool:

@@ -73,37 +73,23 @@ def evaluate_policy(
         tick: called after every step.
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
-    totals, history = Totals(measures), []
+    totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
     for after, running in episodes(env, policy, sampled=sampled, tick=tick):
         totals.add(after, running)
-        if record:
-            history.append([after[key] for key in record.values()])
+        for name, key in (record or {}).items():
+            recorded[name].append(after[key])
     steps = totals.steps.tolist()
-    columns = {name: values.tolist() for name, values in totals.results().items()}
-    rows = range(len(steps))
-    return EvaluationResult(
-        [
-            {
-                "case": cases[row % len(cases)] if cases else str(row), "reward": columns["reward"][row],
-                "steps": steps[row], **{name: columns[name][row] for name in measures if name != "reward"},
-            }
-            for row in rows
-        ],
-        _histories(record or {}, history, steps, env.batch_dims),
-        getattr(env, "rate", float("nan")),
-    )  # fmt: skip
-
-
-def _histories(
-    record: Mapping[str, NestedKey], history: Sequence[Sequence[Tensor]], steps: Sequence[int], batch_dims: int
-) -> dict[str, list[NDArray[np.float64]]]:
-    """Return the recorded entries by name and row, each as long as its episode."""
+    results = totals.results()
+    names = [cases[row % len(cases)] if cases else str(row) for row in range(len(steps))]
+    columns = {"case": names, "reward": results["reward"].tolist(), "steps": steps}
+    columns |= {name: results[name].tolist() for name in measures if name != "reward"}
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     histories = {}
-    for name, entries in zip(record, zip(*history, strict=True), strict=bool(history)):
-        flat = torch.stack([entry.reshape(len(steps), *entry.shape[batch_dims:]) for entry in entries])
+    for name, entries in recorded.items():
+        flat = torch.stack(entries).reshape(len(entries), len(steps), *entries[0].shape[env.batch_dims :])
         values = (flat.squeeze(-1) if flat.ndim > 2 else flat).cpu().double().numpy()
         histories[name] = [values[:count, row] for row, count in enumerate(steps)]
-    return histories
+    return EvaluationResult(rows, histories, getattr(env, "rate", float("nan")))
 
 
 class Totals:
@@ -118,12 +104,10 @@ class Totals:
 
     def __init__(self, measures: Mapping[str, Measure]) -> None:
         self.measures, self.steps = dict(measures), torch.zeros((), dtype=torch.int64)
-        names = itertools.groupby(sorted(measures, key=lambda name: measures[name].reduction), self._reduction)
-        self.groups = {reduction: list(group) for reduction, group in names}
+        self.groups: dict[str, list[str]] = {}  # names by reduction
+        for name, measure in measures.items():
+            self.groups.setdefault(measure.reduction, []).append(name)
         self.state: dict[str, tuple[Tensor, Tensor]] = {}
-
-    def _reduction(self, name: str) -> str:
-        return self.measures[name].reduction
 
     def add(self, after: TensorDictBase, running: Tensor) -> None:
         """Add the entries after a step of the rows that are `running`, one flag a row; several agents' are summed."""

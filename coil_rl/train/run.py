@@ -91,7 +91,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     start = time.monotonic()
     rows = experiment.run(max(guide_returns.values(), default=None))
     if not resumed:  # the time before the interruption is unknown
-        _write_json({"seconds": time.monotonic() - start}, folder / "training_time.json")
+        write_text(folder / "training_time.json", json.dumps({"seconds": time.monotonic() - start}, indent=2))
     if improves_guides:
         draw_phases(rows, list(learner.guides), folder / "learning_curve.png", title=config.label)
     else:
@@ -138,7 +138,7 @@ def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
             numbers = json.loads(file.read_text())
             return {name: float(numbers[name]) for name in driver_names(config.guide)}
     returns = _guide_returns(config)
-    _write_json(returns, file)
+    write_text(file, json.dumps(returns, indent=2))
     return returns
 
 
@@ -178,7 +178,3 @@ def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> Ev
     envs = {cases: partial(_build_cases, config, cases) for cases in curve.cases}
     options = {"watch": config.watch, "points": curve.points, "batches": curve.batches}
     return EvaluationCurve(folder, policy, envs, **options) if envs else None
-
-
-def _write_json(numbers: Mapping[str, float], file: Path) -> None:
-    write_text(file, json.dumps(numbers, indent=2))

@@ -107,13 +107,9 @@ class McapReplayEnv(EnvBase):
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
         self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
-        before = {name: getattr(self.memory, name) for name in ("samples", "ever_valid")}
         self.memory.reset(mask)
-        view = self._perceive()
-        # Rows that are not reset have this scan in their memory already.
-        for name, kept in before.items():
-            setattr(self.memory, name, torch.where(mask, getattr(self.memory, name), kept))
-        return self._tensordict(view, torch.zeros_like(self.history[0]))
+        # Rows that are not reset perceive their scan again, which does not change their memory.
+        return self._tensordict(self._perceive(), torch.zeros_like(self.history[0]))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)

@@ -68,8 +68,18 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(middle_line(track, SPEED / lidar.rate))
     waves, phase = torch.rand(2, generator=generator, dtype=torch.float64)
-    path = _swaying(line, waves=3 + 5 * float(waves), phase=float(phase))
-    poses = _poses(path, lidar.phase)
+    # The closed line, displaced sideways by a sine.
+    along = line.roll(-1, 0) - line.roll(1, 0)
+    across = torch.stack([-along[:, 1], along[:, 0]], 1) / along.norm(dim=1, keepdim=True)
+    periods = torch.linspace(0, 3 + 5 * float(waves), len(line), dtype=line.dtype) + float(phase)
+    path = line + SWAY * (2 * torch.pi * periods).sin().unsqueeze(1) * across
+    # One scan for each step of the path: poses at the time of each beam.
+    way = path[1:] - path[:-1]
+    heading = torch.atan2(way[:, 1], way[:, 0])
+    turn = torch.remainder(heading[1:] - heading[:-1] + torch.pi, 2 * torch.pi) - torch.pi
+    position = path[:-2, :, None] + way[:-1, :, None] * lidar.phase
+    bearing = (heading[:-1, None] + turn[:, None] * lidar.phase).unsqueeze(1)
+    poses = torch.cat([position, bearing], 1).transpose(0, 1).float()
     cones, radius = cones_of(track, left=sides != "right", right=sides != "left")
     true, hit = cast_beams(poses, lidar.angles, cones, radius)
     ranges, outlier = lidar.measure(true, generator)
@@ -94,7 +104,11 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
     track = track_of(recording)
     starts = torch.from_numpy(recording.poses()).float().t().unsqueeze(-1)
     angles = torch.from_numpy(recording.angles(slice(-1))).float()
-    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * _phase(recording)
+    # The time of each range as a share of its scan, NaN for padding; the scanner turns clockwise.
+    beam, points = np.arange(scans.shape[1]), recording.points[:-1, None]
+    order = np.where(recording.angle_increment[:-1, None] > 0, points - 1 - beam, beam)
+    phase = torch.from_numpy(np.where(beam < points, order / np.maximum(points, 1), np.nan)).float()
+    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * phase
     cones, radius = cones_of(track)
     true, hit = cast_beams(poses, angles, cones, radius)
     ranges = torch.from_numpy(scans[:-1])
@@ -126,12 +140,11 @@ def record_labelling_drives(
 
     The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is called after each drive.
     """
-    training, test = range(pairs), range(TEST_SEED, TEST_SEED + both)
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}
-    for sides in paths:
-        for seed in test if sides == "both" else training:
-            paths[sides].append(os.path.join(folder, f"{sides}_{seed}.mcap"))
-            save_drive(simulated_drive(sides, seed), paths[sides][-1])
+    for sides, files in paths.items():
+        for seed in range(TEST_SEED, TEST_SEED + both) if sides == "both" else range(pairs):
+            files.append(os.path.join(folder, f"{sides}_{seed}.mcap"))
+            save_drive(simulated_drive(sides, seed), files[-1])
             if tick is not None:
                 tick()
     return paths
@@ -213,33 +226,8 @@ def _write(
             writer.add("/odom", ODOMETRY, time, fields)
 
 
-def _phase(recording: Recording) -> Tensor:
-    """Return the time of each range but those of the last scan as a share of its scan [N - 1, P], NaN for padding."""
-    beam, points = np.arange(recording.ranges.shape[1]), recording.points[:-1, None]
-    # The scanner turns clockwise.
-    order = np.where(recording.angle_increment[:-1, None] > 0, points - 1 - beam, beam)
-    return torch.from_numpy(np.where(beam < points, order / np.maximum(points, 1), np.nan)).float()
-
-
 def _visibility(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor) -> Tensor:
     """Return the share of the beams towards each cone that hit it [T, M]; `hit` [T, P] is the cone of each beam."""
     alone = [cast_beams(poses, angles, cones[:, [m]], radius[[m]])[0].isfinite().sum(-1) for m in range(len(radius))]
     hits = torch.stack([(hit == m).sum(-1) for m in range(len(radius))], -1)
     return hits / torch.stack(alone, -1).clamp(min=1)
-
-
-def _swaying(line: Tensor, waves: float, phase: float) -> Tensor:
-    """Displace a closed line [T, 2] sideways by a sine of `waves` periods."""
-    along = line.roll(-1, 0) - line.roll(1, 0)
-    across = torch.stack([-along[:, 1], along[:, 0]], 1) / along.norm(dim=1, keepdim=True)
-    periods = torch.linspace(0, waves, len(line), dtype=line.dtype) + phase
-    return line + SWAY * (2 * torch.pi * periods).sin().unsqueeze(1) * across
-
-
-def _poses(path: Tensor, phase: Tensor) -> Tensor:
-    """Return the poses [3, T - 2, P] at the time of each beam, for one scan per step of a path [T, 2]."""
-    way = path[1:] - path[:-1]
-    heading = torch.atan2(way[:, 1], way[:, 0])
-    turn = torch.remainder(heading[1:] - heading[:-1] + torch.pi, 2 * torch.pi) - torch.pi
-    position = path[:-2, :, None] + way[:-1, :, None] * phase
-    return torch.cat([position, (heading[:-1, None] + turn[:, None] * phase).unsqueeze(1)], 1).transpose(0, 1).float()

@@ -131,13 +131,11 @@ class SimulatedRobotEnv(SeededEnv):
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
         place = self.place
         start = {"track": self.start_track[place], "pose": self.start_pose[:, place], "steps": steps}
-        start["lap_start"] = steps + self.start_lap[place]
+        start |= {"lap_start": steps + self.start_lap[place], "history": torch.zeros(()), "lap": torch.tensor(0)}
         for name, value in start.items():
             setattr(self, name, torch.where(mask, value, getattr(self, name)))
         begun = self.lap_start > NEVER
         self.in_finish = torch.where(mask, self._inside() & begun, self.in_finish)
-        for name in ("history", "lap"):
-            setattr(self, name, getattr(self, name).masked_fill(mask, 0))
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
         self.memory.reset(mask)
@@ -153,7 +151,11 @@ class SimulatedRobotEnv(SeededEnv):
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.steps = self.steps + 1
-        self._drive(action)
+        # Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way.
+        turn, phase = (action * self.max_steering).sin() * (self.step_length / self.car_length), self.lidar.phase
+        poses = move_along_arc(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
+        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
+        self.scan = self._measure(poses)
         view = self._perceive()
 
         lap_time, finished = self._count_laps()
@@ -171,14 +173,6 @@ class SimulatedRobotEnv(SeededEnv):
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
         return out
-
-    def _drive(self, action: Tensor) -> None:
-        """Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way."""
-        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
-        phase = self.lidar.phase
-        poses = move_along_arc(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
-        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
-        self.scan = self._measure(poses)
 
     def _measure(self, poses: Tensor) -> Tensor:
         true, _ = cast_beams(poses, self.lidar.angles, self.course.cones[:, self.track], self.course.radius[self.track])

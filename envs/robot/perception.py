@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import KW_ONLY, dataclass, fields
-from functools import cached_property
 from importlib import resources
 from typing import Literal
 
@@ -16,7 +15,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase, make_composite_from_td
 
 from coil_rl.envs.limits import check_range
-from coil_rl.envs.robot.clusters import GAP, Clusters, Points, measure, points_of, single_linkage
+from coil_rl.envs.robot.clusters import GAP, Clusters, measure, points_of, single_linkage
 from coil_rl.envs.sight import SAMPLES, SIGHT, encode_samples
 from coil_rl.envs.splines import spline_fit
 
@@ -65,14 +64,10 @@ class ConeClassifier:
         if not (self.scale > 0).all() or not self.gamma > 0:
             raise ValueError("scale and gamma of a cone classifier must be more than 0")
 
-    @cached_property
-    def _squared_norms(self) -> Array:
-        return np.asarray((self.support * self.support).sum(1))
-
     def decision(self, features: NDArray[np.floating]) -> Array:
         """Return the decision values of both machines [C, 2] for features [C, F]."""
         x = (np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean) / self.scale
-        squared_distance = (x * x).sum(1)[:, None] + self._squared_norms - 2 * (x @ self.support.T)
+        squared_distance = (x * x).sum(1)[:, None] + (self.support * self.support).sum(1) - 2 * (x @ self.support.T)
         return np.asarray(np.exp(-self.gamma * squared_distance) @ self.weights.T + self.intercept, dtype=np.float64)
 
     def classify(self, features: NDArray[np.floating]) -> Integers:
@@ -136,13 +131,9 @@ class Perception:
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
         """Return all clusters of at least two points, in the car's frame, unscaled; arguments as in `points_of`."""
-        points = self.points(ranges, angles)
-        return measure(points, single_linkage(points, self.gap))
-
-    def points(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Points:
-        """Return all points up to `range_max + margin`, in the car's frame, unscaled."""
         bearings = np.asarray(angles, dtype=np.float64) + math.radians(self.laser_yaw)
-        return points_of(ranges, bearings, self.range_min, self.range_max + self.margin)
+        points = points_of(ranges, bearings, self.range_min, self.range_max + self.margin)
+        return measure(points, single_linkage(points, self.gap))
 
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
         """Return whether the centroid of each cluster is in range and bearing, [C]."""
@@ -225,5 +216,4 @@ def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
     env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=torch.float32)
     env.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
     flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-    done = {key: flag.clone() for key in ("done", "terminated", "truncated")}
-    env.done_spec = Composite(done, shape=batch, device=device)
+    env.done_spec = Composite(dict.fromkeys(("done", "terminated", "truncated"), flag), shape=batch, device=device)
