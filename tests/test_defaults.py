@@ -24,7 +24,7 @@ VARIATIONS = {
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],
     "proxy/network.yaml": ["method.transforms"],
-    "reproduce/figure_22.yaml": ["labels"],
+    "reproduce/figure_22.yaml": ["labels", "worlds"],
     "reproduce/table_4.yaml": ["worlds"],
     "reproduce/table_5.yaml": ["worlds"],
     "reproduce/table_6.yaml": ["experiments", "car_length"],

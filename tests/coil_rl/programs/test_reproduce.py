@@ -88,7 +88,7 @@ def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
 def two_runs(monkeypatch):
     """Finished runs of COIL and PPO, and the list of commands that a sweep starts."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        sweep = sweeps.planned("paper", [], [0])
+        sweep = sweeps.planned("paper", ["compile=true"], [0])
     for folder, label in zip(sweep.all_folders, ("coil", "ppo"), strict=True):
         make_run(folder, label, 0, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
     started = []
@@ -104,7 +104,8 @@ def two_runs(monkeypatch):
 def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs):
     sweep, started = two_runs
     choices = ["experiments=[paper]", "labels=[coil,ppo]"]
-    arguments = ["figure=22", "budgets.paper.seeds=1", *(f"results.figure_22.{choice}" for choice in choices)]
+    arguments = ["figure=22", "budgets.paper.seeds_of.paper=1", "~results.figure_22.worlds"]
+    arguments += [f"results.figure_22.{choice}" for choice in choices]
     code, out, _ = outcome(*arguments)
     assert (code, started) == (0, [])
     assert "2 runs with the seeds 0, made at commit `unknown`. Training frames: 20,000 (coil, ppo)." in out
@@ -114,7 +115,7 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     assert code == 2
     assert "the sweep of paper ended with exit code 3" in error
     (command,) = started
-    assert command == ["-m", "+experiment=paper", "seed=0", "hydra/launcher=basic"]
+    assert command == ["-m", "+experiment=paper", "compile=true", "seed=0", "hydra/launcher=basic"]
 
 
 @pytest.mark.parametrize(
