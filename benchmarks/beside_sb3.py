@@ -24,6 +24,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from tqdm import tqdm
 
+from benchmarks.timing import Stopwatch
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
 from coil_rl.schedules import Linear
@@ -50,25 +51,6 @@ CAPACITY = 50_000
 EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
 
 
-class Timed:
-    """A function whose calls are counted in CPU seconds, `seconds`."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function, self.seconds = function, 0.0
-
-    def __call__(self, *args: Any, **options: Any) -> Any:
-        """Call the function."""
-        start = time.process_time()
-        try:
-            return self.function(*args, **options)
-        finally:
-            self.seconds += time.process_time() - start
-
-    def rate(self, count: float) -> float:
-        """Return a count per CPU second of the calls; NaN for none."""
-        return count / self.seconds if count else math.nan
-
-
 def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
     """Train our learner and return its deterministic policy, and the gradient steps per CPU second of its updates."""
     torch.manual_seed(seed)
@@ -93,9 +75,10 @@ def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, se
         else:
             epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
             learner = DQN(env, network=network, epsilon=epsilon, double=False, **replay)
-    rollout, update, steps = Rollout(env, learner.policy, values["steps"], learner.keys), Timed(learner.update), 0.0
+    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
+    stopwatch, steps = updates_of(learner, "update"), 0.0
     for count in range(frames // rollout.frames):
-        metrics = update(rollout.collect(), count * rollout.frames / frames)
+        metrics = learner.update(rollout.collect(), count * rollout.frames / frames)
         steps += metrics.get("minibatches", values.get("epochs", 0) * rollout.frames / values["minibatch"])
 
     def act(observation: Tensor) -> Tensor:
@@ -103,11 +86,11 @@ def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, se
             action: Tensor = learner.policy(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
         return action
 
-    return act, update.rate(steps)
+    return act, per_second(steps, stopwatch)
 
 
 def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
-    """Train the learner of Stable-Baselines3; the results are those of `ours`."""
+    """Train the learner of Stable-Baselines3, and return its policy and its gradient steps per CPU second as `ours`."""
     import stable_baselines3
     from stable_baselines3.common.env_util import make_vec_env
 
@@ -132,12 +115,27 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
                 "MlpPolicy", envs, target_update_interval=values["every"], exploration_fraction=values["explore"],
                 exploration_final_eps=values["epsilon"], **common,
             )  # fmt: skip
-    update = model.train = Timed(model.train)
+    stopwatch = updates_of(model, "train")
     model.learn(frames)
     # Its PPO counts epochs.
     steps = model._n_updates * (values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1)
-    act = lambda observation: torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])  # noqa: E731
-    return act, update.rate(steps)
+
+    def act(observation: Tensor) -> Tensor:
+        return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
+
+    return act, per_second(steps, stopwatch)
+
+
+def updates_of(learner: object, method: str) -> Stopwatch:
+    """Return a stopwatch of the CPU time of a method of a learner."""
+    stopwatch = Stopwatch(time.process_time)
+    stopwatch.wrap(learner, method, "updates")
+    return stopwatch
+
+
+def per_second(steps: float, stopwatch: Stopwatch) -> float:
+    """Return gradient steps per second of the updates; NaN without any."""
+    return steps / stopwatch.seconds["updates"] if steps else math.nan
 
 
 def mean_return(env_id: str, act: Act) -> float:

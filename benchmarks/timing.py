@@ -52,9 +52,10 @@ def synchronise() -> None:
 
 
 class Stopwatch:
-    """Total time of methods by name. A timed method inside another counts for the outer one."""
+    """Total time of methods by name, by a clock. A timed method inside another counts for the outer one."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = time.perf_counter) -> None:
+        self.clock = clock
         self.seconds: dict[str, float] = {}
         self.running = False
 
@@ -66,11 +67,11 @@ class Stopwatch:
             if self.running:
                 return inner(*args, **kwargs)
             synchronise()
-            self.running, start = True, time.perf_counter()
+            self.running, start = True, self.clock()
             result = inner(*args, **kwargs)
             synchronise()
             self.running = False
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            self.seconds[name] = self.seconds.get(name, 0.0) + self.clock() - start
             return result
 
         owner.__dict__[method] = timed  # modules and envs override setattr

@@ -122,7 +122,7 @@ class PartialAdvice(DegradedAdvice):
 
 
 class _DrawnAdvice(DegradedAdvice):
-    """Base of advice with random numbers, independent at every step; the seed is that of the draws."""
+    """Base class of advice with random numbers, which are independent at every step; `seed` is that of the numbers."""
 
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)

@@ -152,7 +152,7 @@ class GradientStep(Stateful):
                 parameter.grad = None
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
+        """Restore a state that `state_dict` returned."""
         super().load_state_dict(state)
         self.state = []
 

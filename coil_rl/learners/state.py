@@ -7,7 +7,7 @@ import torch
 
 
 class Stateful:
-    """Base of what has a state to save: the attributes named by `parts`.
+    """Base class of objects with a state to save: that of the attributes named by `parts`.
 
     Each is a generator, an object with a state of its own, a plain value, or None, which has an empty state.
     """
@@ -19,7 +19,7 @@ class Stateful:
         return {name: _state_of(getattr(self, name)) for name in self.parts}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
+        """Restore a state that `state_dict` returned."""
         for name in self.parts:
             part = getattr(self, name)
             if isinstance(part, torch.Generator):

@@ -67,13 +67,13 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
 
 
 class WholeEpisode:
-    """No sections, the base class of what divides an episode; the pictures show each measure along the steps."""
+    """Base class of what divides an episode into sections: it makes none, and draws each measure along the steps."""
 
     names: ClassVar[tuple[str, ...]] = ()  # of the sections
     record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that `draw` needs, by name
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
-        """Return where the rows of a state [B] are, [B, ...] each, besides the step."""
+        """Return entries with the places of the rows of a state [B], [B, ...] each, in addition to the step."""
         return {}
 
     def section(self, place: TensorDictBase) -> Tensor:

@@ -89,7 +89,7 @@ def check_used(used: Iterable[str], reason: str) -> None:
 
 
 def check_run(config: DictConfig) -> None:
-    """Check everything that a run needs, if it is not finished; see `coil_rl.train.check.check`."""
+    """Check everything that a run needs, unless it is finished; see `coil_rl.train.check.check`."""
     from coil_rl.train.run_folder import holds, is_evaluated
 
     folder = Path(config.run_dir)

@@ -115,9 +115,8 @@ class Figure22(WorldsResult):
             reached = {label: _frames_to(guide, of_label) for label, of_label in by_label.items()}
             picture = stem.with_name(f"{stem.name}_{number}.png" if world else f"{stem.name}.png")
             title = ", ".join(filter(None, ("Figure 22: the return of the trained policies", world)))
-            draw_learning_curves(
-                curves, picture, guides={} if math.isnan(guide) else {GUIDE: guide}, title=title
-            )  # fmt: skip
+            guides = {} if math.isnan(guide) else {GUIDE: guide}
+            draw_learning_curves(curves, picture, guides=guides, title=title)
             parts += [*pages.world_heading(world), *([f"![{title}]({picture.name})"] if world else [])]
             parts += [_curve_table(means, by_label, reached)]
             parts += [] if math.isnan(guide) else [f"The guide alone earns {guide:.1f} in these cases."]
@@ -150,7 +149,7 @@ class Figure22(WorldsResult):
 
 
 def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:
-    """Return by seed the frames after which the curve of a run first reaches a level; all of them if it never does."""
+    """Return by seed after how many frames a curve first reaches a level; all frames of the run if it never does."""
     reached = {}
     for run in runs:
         at, values = points(run.curve, RETURN).T

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from hydra.utils import get_object
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -151,9 +152,8 @@ def evaluate_run(
 
 def _advises_only(config: DictConfig) -> bool:
     """Return whether the env of the agent is that of its guides: all that a method adds is their advice."""
-    nodes = config.method.transforms.values()
-    advice = all(str(node.get("_target_")).endswith(f".{GuideActions.__name__}") for node in nodes)
-    return bool(nodes) and advice and not config.degrade and not config.action
+    added = {get_object(node["_target_"]) for node in config.method.transforms.values()}
+    return added == {GuideActions} and not config.degrade and not config.action
 
 
 class AgentAndGuides(TensorDictModuleBase):
@@ -169,8 +169,9 @@ class AgentAndGuides(TensorDictModuleBase):
     def __init__(self, env: EnvBase, agent: TensorDictModuleBase, count: int, guides: int) -> None:
         self.in_keys, self.out_keys = list(agent.in_keys), ["action"]
         super().__init__()
-        rows = torch.arange(env.batch_size[0]) - count
-        self.guides = FollowAdvice(env, (rows.clamp(min=0) // ((len(rows) - count) // guides)).tolist())
+        cases = (env.batch_size[0] - count) // guides
+        # Of the guides' action on the rows of the agent nothing is used.
+        self.guides = FollowAdvice(env, [0] * count + [guide for guide in range(guides) for _ in range(cases)])
         self.agent, self.count = agent, count
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -35,7 +35,7 @@ REMEDY = "put the whole file back, or train again in another folder"  # for a da
 class Learner(Protocol):
     """Update of a policy from batches."""
 
-    kind: ClassVar[str]  # "agent", "imitation" or "guides", as for `PPO`
+    kind: ClassVar[str]  # "agent" learns from rewards, "imitation" from a guide's actions, "guides" trains guides too
     policy: TensorDictModuleBase  # collects the batches
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -45,7 +45,7 @@ class Learner(Protocol):
         """Return everything that the next update depends on, except its batch."""
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
+        """Restore a state that `state_dict` returned."""
 
 
 class Probe(Protocol):
@@ -235,7 +235,7 @@ class Experiment:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`."""
+        """Restore a state that `state_dict` returned."""
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
         self.updates = state["updates"]

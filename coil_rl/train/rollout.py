@@ -91,7 +91,7 @@ class Rollout:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`; new episodes begin where the env or a guide cannot go on with its own."""
+        """Restore what `state_dict` returned; new episodes begin where the env or a guide cannot go on with its own."""
         self.base_env.load_state_dict(state["env"])
         if self.base_env is not self.env:
             self.env.load_state_dict(state["transforms"])
