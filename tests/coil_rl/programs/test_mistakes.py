@@ -108,7 +108,7 @@ def refusal(name, *arguments):
         # groups
         ("guide=splin", "no guide=splin; guide can be authors, bot, centre_fast, constant, controller"),
         ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
-        ("+experiment=nope", "no experiment=nope; experiment can be anchored, coil_vs_ppo"),
+        ("+experiment=nope", "no experiment=nope; experiment can be advice, advice_better_guide"),
         ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
         ("+degrade=${pid:}", "the command line cannot be composed; give each group a name, GROUP=CHOICE"),
         (f"method={'x' * 300}", "... cannot be used (File name too long); choose a shorter name"),
