@@ -123,7 +123,7 @@ class Track:
             raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
 
 
-@lru_cache(maxsize=64)
+@lru_cache(maxsize=1024)  # tables of tracks are shared by identity
 def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
     """Return a track whose sides begin with the first cones that are visible from its start, as does its finish line.
 

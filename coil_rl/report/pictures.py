@@ -44,15 +44,17 @@ class DrivenLines(Picture):
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
     tracks: Sequence[Track]  # one for each case
     gif: bool = True  # whether to make the animation, for an env that has a `rate`
+    most: int = 12  # tracks that are drawn, the first ones
 
     def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the lines."""
-        lines = {driver: [pose[:, :2] for pose in result.histories["pose"]] for driver, result in drives.items()}
-        crashed = {driver: [bool(row.get("crashed")) for row in result.episodes] for driver, result in drives.items()}
-        draw_lines(self.tracks, lines, folder / "lines.png", crashed=crashed)
+        tracks, first = self.tracks[: self.most], {driver: result[: self.most] for driver, result in drives.items()}
+        lines = {driver: [pose[:, :2] for pose in result.histories["pose"]] for driver, result in first.items()}
+        crashed = {driver: [bool(row.get("crashed")) for row in result.episodes] for driver, result in first.items()}
+        draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
         rate = next(iter(drives.values())).rate
         if self.gif and not math.isnan(rate):
-            animate_lines(self.tracks, lines, folder / "lines.gif", rate=rate, crashed=crashed)
+            animate_lines(tracks, lines, folder / "lines.gif", rate=rate, crashed=crashed)
 
 
 class Returns(Picture):

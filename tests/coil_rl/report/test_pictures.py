@@ -42,6 +42,14 @@ def test_driven_lines_are_drawn_with_an_animation(measures, tmp_path):
         assert np.asarray(image.convert("L")).std() > 0
 
 
+def test_only_the_first_tracks_are_drawn(tmp_path):
+    pictures = []
+    for tracks, most in ((TRACKS, 1), (TRACKS[:1], 12)):
+        DrivenLines(tracks, gif=False, most=most).draw({"agent": drive()[: len(tracks)]}, tmp_path)
+        pictures.append((tmp_path / "lines.png").read_bytes())
+    assert pictures[0] == pictures[1]
+
+
 @pytest.mark.parametrize(("gif", "rate"), [(False, 2.0), (True, math.nan)])
 def test_animation_is_left_out_on_request_or_without_the_rate_of_the_env(gif, rate, tmp_path):
     DrivenLines(TRACKS, gif=gif).draw({"agent": drive(rate)}, tmp_path)
