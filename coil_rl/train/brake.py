@@ -11,9 +11,9 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.learners.anchor import Anchor, Look
-from coil_rl.train.curve import policy_batch
 from coil_rl.train.evaluation import Totals, episodes
 from coil_rl.train.measures import Measure
+from coil_rl.train.policy_batch import policy_batch
 
 
 @dataclass(eq=False)

@@ -4,24 +4,21 @@ The return in training says little about a policy: its actions are sampled, and 
 happen to end. The kept policies act deterministically, all of them in one batch, each from the same starts (cases).
 """
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
-from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coil_rl.compiled import record
 from coil_rl.train import checkpoint
 from coil_rl.train.evaluation import Totals, episodes
-from coil_rl.train.load import memory_keys
 from coil_rl.train.measures import Measure
+from coil_rl.train.policy_batch import policy_batch
 
 POLICIES = "policies"  # subfolder with the kept policies
 Watch = Mapping[str, Mapping[str, Sequence[str]]]  # name to key, of "episode" and of "step"
@@ -93,62 +90,3 @@ def measures(
     for after, running in episodes(env, policy, tick=tick):
         totals.add(after, running)
     return totals.results()
-
-
-def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> TensorDictModuleBase:
-    """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
-    tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
-    stacked = tensors == set(policy.state_dict()) and not memory_keys(policy)
-    return StackedPolicies(policy, states) if stacked else PoliciesInTurn(policy, states)
-
-
-class PoliciesInTurn(TensorDictModuleBase):
-    """Several states of any policy, each for its own part of the rows."""
-
-    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
-        super().__init__()
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
-        self.policies = torch.nn.ModuleList(copy.deepcopy(policy) for _ in states)
-        for each, state in zip(self.policies, states, strict=True):
-            each.load_state_dict(state)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of the policy of each row, and what that policy remembers."""
-        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
-        parts = [policy(part) for policy, part in zip(self.policies, parts, strict=True)]
-        for key in self.out_keys:
-            tensordict.set(key, torch.cat([part[key] for part in parts]))
-        return tensordict
-
-
-class StackedPolicies(TensorDictModuleBase):
-    """Several states of a policy whose state is its tensors, each for its own part of the rows, computed at once.
-
-    The operations are recorded at the first call, for its number of rows, and repeated afterwards, which takes a
-    seventh of the time.
-    """
-
-    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
-        super().__init__()
-        self.recorded: Callable[..., Sequence[Tensor]] | None = None
-        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
-        policies = PoliciesInTurn(policy, states).policies
-        self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
-        self._policy = (copy.deepcopy(policy),)  # a tuple, so that it is no submodule
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the `action` of the policy of each row."""
-        entries = [tensordict[key] for key in self.in_keys]
-        if self.recorded is None:
-            self.recorded = record(self._actions, entries)
-        return tensordict.set("action", self.recorded(*entries)[0])
-
-    def _actions(self, *entries: Tensor) -> list[Tensor]:
-        rows = TensorDict(dict(zip(self.in_keys, entries, strict=True)), [len(entries[0])])
-        return [torch.vmap(self._act)(self.states, rows.view(len(self.states), -1)).flatten(0, 1)]
-
-    def _act(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
-        (policy,) = self._policy
-        with state.to_module(policy):
-            action: Tensor = policy(rows)["action"]
-        return action

@@ -34,6 +34,7 @@ from coil_rl.train.build import (
 from coil_rl.train.evaluation import EvaluationResult, evaluate_policy
 from coil_rl.train.fallback import Fallback
 from coil_rl.train.measures import Measure, measures_of, summarise
+from coil_rl.train.policy_batch import RecordedPolicy, is_tensors
 from coil_rl.transforms import GuideActions
 
 COLUMNS = {"driver": ("driver", ""), "advice": ("advice", ""), "actions": ("actions", ""), "case": ("case", "")}
@@ -122,7 +123,8 @@ def evaluate_run(
             compile_steps(config, env)
             watching = pictures if not advice else []
             tick = partial(_tick, env, watching, bar.update)
-            policy = AgentAndGuides(env, agent, own, len(names)) if names else agent
+            policy = RecordedPolicy(agent) if is_tensors(agent) else agent
+            policy = AgentAndGuides(env, policy, own, len(names)) if names else policy
             sampled = repeats > 0 and (rows >= count) & (rows < own)
             result = evaluation.drive(env, policy, sampled=sampled, tick=tick)
             for name, of_guide in zip(names, result[own:].split(len(names)) if names else [], strict=True):

@@ -26,8 +26,8 @@ from coil_rl.schedules import Linear
 from coil_rl.testing import check_env
 from coil_rl.train.build import build_env, build_guided_env, build_guides
 from coil_rl.train.check import check
-from coil_rl.train.curve import PoliciesInTurn, policy_batch
 from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.train.policy_batch import PoliciesInTurn, policy_batch
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import DiscreteActions, Takeover
 

@@ -8,7 +8,7 @@ from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import IBRL
-from coil_rl.train.curve import policy_batch
+from coil_rl.train.policy_batch import policy_batch
 from coil_rl.train.rollout import Rollout
 
 RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC

@@ -2,20 +2,16 @@ import copy
 
 import pytest
 import torch
-from sklearn.linear_model import LinearRegression
-from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, TransformedEnv
-from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
-from coil_rl.imitation import Imitation, SklearnRegressor
-from coil_rl.learners import DQN, PPO, SAC
-from coil_rl.train.curve import EvaluationCurve, PoliciesInTurn, StackedPolicies, measures, policy_batch
+from coil_rl.learners import PPO
+from coil_rl.train.curve import EvaluationCurve, measures
 from coil_rl.train.evaluation import evaluate_policy
-from coil_rl.transforms import DiscreteActions, GuideActions
+from coil_rl.transforms import GuideActions
 
 CASES = 5
 WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"smoothness": ["info", "smoothness"]}}
@@ -70,38 +66,6 @@ def test_driving_leaves_the_random_numbers_alone(tmp_path, rings):
     before = torch.get_rng_state()
     line.drive([0])
     assert torch.equal(torch.get_rng_state(), before)
-
-
-@pytest.mark.parametrize("learner", ["ppo", "sac", "dqn", "forest"])
-def test_batch_of_policies_acts_like_each_of_them(learner, rings):
-    env = world(rings, 1, *([DiscreteActions()] if learner == "dqn" else []))
-    keys = ["observation", "guide_action"]
-    states = []
-    if learner == "forest":
-        imitation = Imitation(env, regressor=SklearnRegressor(LinearRegression()), validate=False)
-        policy = imitation.policy
-        for seed in range(3):
-            torch.manual_seed(seed)
-            imitation.regressor.fit(torch.rand(30, 20), torch.rand(30, 1))
-            states.append(copy.deepcopy(policy.state_dict()))
-    else:
-        policy = {"ppo": PPO, "sac": SAC, "dqn": DQN}[learner](env, keys).policy
-        states = [perturbed(policy, seed) for seed in range(3)]
-    rows = TensorDict(
-        {
-            "observation": torch.rand(15, 20),
-            "guide_action": torch.rand(15, *env.observation_spec["guide_action"].shape[1:]),
-        },
-        [15],
-    )
-    batch = policy_batch(policy, states)
-    assert isinstance(batch, PoliciesInTurn if learner == "forest" else StackedPolicies)
-    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-        together = batch(rows.clone())["action"]
-        for index, state in enumerate(states):
-            policy.load_state_dict(state)
-            part = slice(5 * index, 5 * index + 5)
-            torch.testing.assert_close(together[part], policy(rows[part].clone())["action"])
 
 
 def test_kept_policies_are_spread_over_the_run_and_each_is_driven_once(tmp_path, rings):
