@@ -15,7 +15,7 @@ from coil_rl.envs.limits import check_choice
 from coil_rl.errors import UserError
 from coil_rl.learners.state import Stateful
 
-ENOUGH = 2_000  # steps of a run, for which compilation pays in the second run of the same sizes
+ENOUGH = 4_000  # steps of a run, for which compilation pays in the second run of the same sizes
 
 
 @dataclass(eq=False)

@@ -35,7 +35,7 @@ def choices(group):
 def test_env_of_every_method_passes_check_env(preset, method):
     env = build_env(composed(f"preset={preset}", f"method={method}"))
     check_env(env, steps=3)
-    assert env.rate == {"paper": 24, "authors": 60}[preset]
+    assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
 
 
 NOT_ALONE = {"controller", "entry", "learned", "recorded"}  # need a class, an entry, a run or a file
