@@ -20,7 +20,7 @@ from coil_rl.report.statistics import Array, mean_interval
 
 Rows = Sequence[Mapping[str, object]]
 
-RETURNS = "return from the cases of the evaluation"
+RETURNS = "return in evaluation"
 ANCHOR = "learner/anchor"  # column of metrics.csv
 GRID_COLUMNS = 3
 GRID_ROW_HEIGHT = 1.55  # inches
