@@ -1,5 +1,6 @@
 """Small envs with a guide, and the measures of the cone world."""
 
+import copy
 import io
 from functools import cache
 
@@ -48,6 +49,15 @@ def carts(*transforms, categorical=True) -> TransformedEnv:
 
     guide = TensorDictModule(lean, in_keys=["observation"], out_keys=["action"])
     return TransformedEnv(SerialEnv(2, make), Compose(GuideActions({"lean": guide}), *transforms))
+
+
+def perturbed(policy, seed):
+    """Return the state of a policy with noise on its parameters."""
+    torch.manual_seed(seed)
+    changed = copy.deepcopy(policy)
+    for parameter in changed.parameters():
+        parameter.data += 0.3 * torch.randn_like(parameter)
+    return changed.state_dict()
 
 
 def drive(env, steps, carrier=None, seed=0):

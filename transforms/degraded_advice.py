@@ -122,7 +122,7 @@ class PartialAdvice(DegradedAdvice):
 
 
 class _DrawnAdvice(DegradedAdvice):
-    """Base class of advice with random numbers, which are independent at every step; `seed` is that of the numbers."""
+    """Base class of advice changed by random numbers, drawn anew at every step by a generator with the given seed."""
 
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)

@@ -7,7 +7,7 @@ import torch
 
 
 class Stateful:
-    """Base class of objects with a state to save: that of the attributes named by `parts`.
+    """Base class of objects whose saved state is that of the attributes named in `parts`.
 
     Each is a generator, an object with a state of its own, a plain value, or None, which has an empty state.
     """

@@ -67,13 +67,13 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
 
 
 class WholeEpisode:
-    """Base class of what divides an episode into sections: it makes none, and draws each measure along the steps."""
+    """Base class of divisions of an episode into sections. It has a single one, and draws each measure by step."""
 
     names: ClassVar[tuple[str, ...]] = ()  # of the sections
     record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that `draw` needs, by name
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
-        """Return entries with the places of the rows of a state [B], [B, ...] each, in addition to the step."""
+        """Return where each row of a state [B] is, besides the number of the step: entries [B, ...] by name."""
         return {}
 
     def section(self, place: TensorDictBase) -> Tensor:

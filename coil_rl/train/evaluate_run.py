@@ -111,6 +111,7 @@ def evaluate_run(
     # The kinds of advice, each with the number of sampled episodes a case.
     plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)] if agent is not None else []
     plan += [(advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms]
+    acting = RecordedPolicy(agent) if agent is not None and is_tensors(agent) else agent
     torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         for advice, repeats in plan:
@@ -123,8 +124,7 @@ def evaluate_run(
             compile_steps(config, env)
             watching = pictures if not advice else []
             tick = partial(_tick, env, watching, bar.update)
-            policy = RecordedPolicy(agent) if is_tensors(agent) else agent
-            policy = AgentAndGuides(env, policy, own, len(names)) if names else policy
+            policy = AgentAndGuides(env, acting, own, len(names)) if names else acting
             sampled = repeats > 0 and (rows >= count) & (rows < own)
             result = evaluation.drive(env, policy, sampled=sampled, tick=tick)
             for name, of_guide in zip(names, result[own:].split(len(names)) if names else [], strict=True):

@@ -1,4 +1,4 @@
-"""Policies that drive faster: several in one batch, and recorded operations that are repeated."""
+"""Faster evaluation of policies: several in one batch, and operations that are recorded once and repeated."""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -20,13 +20,13 @@ def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]])
 
 
 def is_tensors(policy: TensorDictModuleBase) -> bool:
-    """Return whether the state of a policy is its parameters and buffers, and it remembers nothing of an episode."""
+    """Return whether a policy has no state but its parameters and buffers, and no memory within an episode."""
     tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
     return tensors == set(policy.state_dict()) and not memory_keys(policy)
 
 
 class RecordedPolicy(TensorDictModuleBase):
-    """A policy that does not change, of tensors only, see `is_tensors`.
+    """A policy with fixed weights and no other state, see `is_tensors`.
 
     Its operations are recorded at the first call for a number of rows, once for each type of exploration, and repeated
     afterwards, which takes half of the time or less.
@@ -57,7 +57,7 @@ class RecordedPolicy(TensorDictModuleBase):
 
 
 class StackedPolicies(RecordedPolicy):
-    """Several states of a policy of tensors, each for its own part of the rows, computed at once."""
+    """Copies of a policy with different weights, computed in one batch, each for its own part of the rows."""
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__(copy.deepcopy(policy))
@@ -74,7 +74,7 @@ class StackedPolicies(RecordedPolicy):
 
 
 class PoliciesInTurn(TensorDictModuleBase):
-    """Several states of any policy, each for its own part of the rows."""
+    """Copies of any policy with different states, called in turn, each for its own part of the rows."""
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__()

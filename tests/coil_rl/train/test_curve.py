@@ -1,9 +1,7 @@
-import copy
-
 import pytest
 import torch
 from torchrl.envs import Compose, RewardSum, TransformedEnv
-from worlds import driving_measures
+from worlds import driving_measures, perturbed
 
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.errors import UserError
@@ -25,14 +23,6 @@ def world(tracks, drivers=1, *transforms):
 def curve(folder, tracks, policy, **options):
     envs = dict.fromkeys(("evaluation", "selection"), lambda drivers: world(tracks, drivers))
     return EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
-
-
-def perturbed(policy, seed):
-    torch.manual_seed(seed)
-    changed = copy.deepcopy(policy)
-    for parameter in changed.parameters():
-        parameter.data += 0.3 * torch.randn_like(parameter)
-    return changed.state_dict()
 
 
 def test_driver_that_never_changes_gives_a_flat_line(tmp_path, rings):

@@ -1,38 +1,18 @@
-"""Policies that drive faster."""
-
 import copy
 
 import pytest
 import torch
 from sklearn.linear_model import LinearRegression
 from tensordict import TensorDict
-from torchrl.envs import TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
+from worlds import cones, perturbed
 
-from coil_rl.envs import ConeTrackEnv
-from coil_rl.guides import SplineGuide
 from coil_rl.imitation import Imitation, SklearnRegressor
 from coil_rl.learners import DQN, PPO, SAC
 from coil_rl.train.policy_batch import PoliciesInTurn, RecordedPolicy, StackedPolicies, is_tensors, policy_batch
-from coil_rl.transforms import DiscreteActions, GuideActions
+from coil_rl.transforms import DiscreteActions
 
 KEYS = ["observation", "guide_action"]
-
-
-def world(tracks, *transforms):
-    env = ConeTrackEnv(tracks, 5, starts=5, assignment="cyclic", rate=6, time_limit=4)
-    env = TransformedEnv(env, GuideActions({"spline": SplineGuide()}))
-    for transform in transforms:
-        env.append_transform(transform)
-    return env
-
-
-def perturbed(policy, seed):
-    torch.manual_seed(seed)
-    changed = copy.deepcopy(policy)
-    for parameter in changed.parameters():
-        parameter.data += 0.3 * torch.randn_like(parameter)
-    return changed.state_dict()
 
 
 def observations(env):
@@ -41,8 +21,8 @@ def observations(env):
 
 
 @pytest.mark.parametrize("learner", ["ppo", "sac", "dqn", "forest"])
-def test_batch_of_policies_acts_like_each_of_them(learner, rings):
-    env = world(rings, *([DiscreteActions()] if learner == "dqn" else []))
+def test_batch_of_policies_acts_like_each_of_them(learner):
+    env = cones(*([DiscreteActions()] if learner == "dqn" else []))
     states = []
     if learner == "forest":
         imitation = Imitation(env, regressor=SklearnRegressor(LinearRegression()), validate=False)
@@ -67,8 +47,8 @@ def test_batch_of_policies_acts_like_each_of_them(learner, rings):
 
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 @pytest.mark.parametrize("learner", [PPO, SAC, DQN])
-def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind, rings):
-    env = world(rings, *([DiscreteActions()] if learner is DQN else []))
+def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
+    env = cones(*([DiscreteActions()] if learner is DQN else []))
     policy = learner(env, KEYS).policy
     assert is_tensors(policy)
     recorded, actions = RecordedPolicy(policy), []
@@ -81,8 +61,8 @@ def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind, rings):
     assert len(recorded.recorded) == 1
 
 
-def test_recorded_policy_takes_any_number_of_rows_and_mode(rings):
-    env = world(rings)
+def test_recorded_policy_takes_any_number_of_rows_and_mode():
+    env = cones()
     policy = PPO(env, KEYS).policy
     recorded = RecordedPolicy(policy)
     rows = observations(env)
