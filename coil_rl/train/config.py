@@ -52,11 +52,12 @@ class NodeConfig:
 
 @dataclass
 class BudgetConfig(NodeConfig):
-    """Amount of experience: frames in total, and envs in parallel and steps of each per batch."""
+    """Amount of experience: frames in total, envs in parallel, steps of each per batch, and minibatches per pass."""
 
     frames: Positive = 1
     num_envs: Envs = MISSING
     steps: Steps = 1
+    minibatches: Positive = 16
 
 
 @dataclass
