@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
     from coil_rl.envs import EnvBatch as EnvBatch
-    from coil_rl.envs import GymnasiumEnv as GymnasiumEnv
     from coil_rl.envs import McapReplayEnv as McapReplayEnv
     from coil_rl.envs import SimulatedRobotEnv as SimulatedRobotEnv
     from coil_rl.envs import Track as Track
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from coil_rl.envs import load_tracks as load_tracks
     from coil_rl.envs import random_tracks as random_tracks
     from coil_rl.envs import shipped_tracks as shipped_tracks
+    from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
     from coil_rl.errors import UserError as UserError
     from coil_rl.guides import ConstantGuide as ConstantGuide
     from coil_rl.guides import ControllerGuide as ControllerGuide
@@ -57,8 +57,9 @@ if TYPE_CHECKING:
     from coil_rl.transforms import set_progress as set_progress
 
 _NAMES = {
-    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch GymnasiumEnv McapReplayEnv SimulatedRobotEnv Track "
+    "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch McapReplayEnv SimulatedRobotEnv Track "
     "load_track load_tracks random_tracks shipped_tracks",
+    "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
     "coil_rl.errors": "UserError",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide SplineGuide ZeroGuide",
     "coil_rl.guides.learned": "LearnedGuide",

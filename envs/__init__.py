@@ -1,10 +1,5 @@
 """Batched TorchRL environments, tracks, recordings and the parts they share."""
 
-from __future__ import annotations
-
-import importlib
-from typing import TYPE_CHECKING, Any
-
 from coil_rl.envs.cone_track import ConeTrackEnv as ConeTrackEnv
 from coil_rl.envs.driving_tasks import DrivingTasksEnv as DrivingTasksEnv
 from coil_rl.envs.env_batch import EnvBatch as EnvBatch
@@ -21,7 +16,6 @@ from coil_rl.envs.recordings.reading import read_recording as read_recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv as McapReplayEnv
 from coil_rl.envs.robot.course import robot_track as robot_track
 from coil_rl.envs.robot.course import robot_tracks as robot_tracks
-from coil_rl.envs.robot.drives import SimulatedDrive as SimulatedDrive
 from coil_rl.envs.robot.drives import record_drives as record_drives
 from coil_rl.envs.robot.drives import save_drive as save_drive
 from coil_rl.envs.robot.drives import simulated_drive as simulated_drive
@@ -34,13 +28,3 @@ from coil_rl.envs.track import Track as Track
 from coil_rl.envs.track import TrackError as TrackError
 from coil_rl.envs.track_generator import random_track as random_track
 from coil_rl.envs.track_generator import random_tracks as random_tracks
-
-if TYPE_CHECKING:
-    from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
-
-
-def __getattr__(name: str) -> Any:
-    # On first use, because importing Gymnasium takes time.
-    if name != "GymnasiumEnv":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return importlib.import_module("coil_rl.envs.gymnasium_env").GymnasiumEnv

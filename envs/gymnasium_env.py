@@ -63,7 +63,7 @@ class GymnasiumEnv(SeededRows):
         dtype: of all floating-point tensors.
 
     Example:
-        >>> from coil_rl.envs import GymnasiumEnv
+        >>> from coil_rl import GymnasiumEnv
         >>> env = GymnasiumEnv("CartPole-v1", num_envs=4)
         >>> env.rollout(3, break_when_any_done=False)["next", "observation"].shape
         torch.Size([4, 3, 4])

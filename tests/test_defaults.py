@@ -27,7 +27,7 @@ VARIATIONS = {
     "reproduce/figure_22.yaml": ["labels", "worlds"],
     "reproduce/table_4.yaml": ["worlds"],
     "reproduce/table_5.yaml": ["worlds"],
-    "reproduce/table_6.yaml": ["experiments", "car_length"],
+    "reproduce/table_6.yaml": ["experiments", "worlds", "car_length"],
 }
 FILES = [path.relative_to(CONF).as_posix() for path in sorted(CONF.rglob("*.yaml"))]
 

@@ -6,8 +6,6 @@ from coil_rl.report.curves import draw_phases as draw_phases
 from coil_rl.report.intervals import Interval as Interval
 from coil_rl.report.intervals import draw_intervals as draw_intervals
 from coil_rl.report.intervals import driver_intervals as driver_intervals
-from coil_rl.report.lines import animate_lines as animate_lines
-from coil_rl.report.lines import draw_lines as draw_lines
 from coil_rl.report.lines import draw_listening_map as draw_listening_map
 from coil_rl.report.pictures import DrivenLines as DrivenLines
 from coil_rl.report.pictures import Film as Film

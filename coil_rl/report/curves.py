@@ -118,8 +118,6 @@ def draw_curve_grid(
             axes.tick_params(labelbottom=True)
         for axes in figure.axes[len(runs) :]:
             axes.remove()
-        for axes in figure.axes[:-columns]:
-            axes.tick_params(labelbottom=False)
         figure.supxlabel("frames", size=9)
         figure.supylabel(RETURNS, size=9)
 

@@ -74,7 +74,7 @@ def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     completed = laps(poses, seconds)
     row: dict[str, Any] = {
         "method": method or notes.get("policy", recording.path.stem), "seed": notes.get("seed"),
-        "recording": recording.path.name, "laps": len(completed.seconds),
+        "world": notes.get("world", ""), "recording": recording.path.name, "laps": len(completed.seconds),
         "lap_time": float(completed.seconds.mean()) if len(completed.seconds) else np.nan,
         "crashed": None, "off_centre": np.nan, "clearance": np.nan, "corner_cut": np.nan,
     }  # fmt: skip
@@ -116,25 +116,27 @@ def means(rows: Sequence[Row]) -> dict[str, Any]:
 
 def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None:
     """Draw the lines of each driver in a panel, with the cones of known tracks."""
-    methods = list(dict.fromkeys(drive.method for drive in drives))
-    strokes = style.strokes(methods)
+    names = [(drive.row["world"], drive.method) for drive in drives]
+    panels = {name: [drive for drive, of in zip(drives, names, strict=True) if of == name] for name in names}
+    strokes = style.strokes(dict.fromkeys(method for _, method in panels))
     handles: list[Line2D] = []
     if any(drive.track is not None for drive in drives):
         handles += [_dot("o", style.LEFT_CONE, "thin cones"), _dot("o", style.RIGHT_CONE, "thick cones")]
     if any(drive.row["crashed"] for drive in drives):
         handles.append(_dot("X", style.INK, "crash"))
-    rows = -(-len(methods) // 2)
+    rows = -(-len(panels) // 2)
     with style.picture(path, title, handles, 0.7 + 2.5 * rows) as figure:
-        panels = list(figure.subplots(rows, 2, squeeze=False).flat)
-        for axes, method in zip(panels, methods, strict=False):
-            _draw_panel(axes, [drive for drive in drives if drive.method == method], strokes[method].colour)
-        for axes in panels[len(methods) :]:
-            axes.axis("off")
+        axes = list(figure.subplots(rows, 2, squeeze=False).flat)
+        for panel, ((world, method), shown) in zip(axes, panels.items(), strict=False):
+            count = f"{len(shown)} drives" if len(shown) > 1 else "one drive"
+            name = "\n".join([f"{method}, {count} (m)", *filter(None, [world])])
+            _draw_panel(panel, shown, name, strokes[method].colour)
+        for panel in axes[len(panels) :]:
+            panel.axis("off")
 
 
-def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], colour: str) -> None:
-    count = f"{len(drives)} drives" if len(drives) > 1 else "one drive"
-    axes.set_title(f"{drives[0].method}, {count} (m)", size=9, color=style.QUIET)
+def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], name: str, colour: str) -> None:
+    axes.set_title(name, size=9, color=style.QUIET)
     axes.set_aspect("equal")
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0, labelsize=7)

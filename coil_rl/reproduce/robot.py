@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,8 @@ from tqdm import tqdm
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.envs.robot.course import robot_tracks, track_notes
+from coil_rl.envs.track import Track
 from coil_rl.errors import UserError
 from coil_rl.report import markdown_table, write_csv
 from coil_rl.report.runs import Run, read_runs
@@ -46,6 +48,7 @@ class Table6(Result):
     recordings: Sequence[str] | Mapping[str, Sequence[str]] = ()
     _: KW_ONLY
     runs: Sequence[str] = ()  # folders of runs whose agents drive if there are no recordings
+    worlds: Mapping[str, Sequence[Track]] = field(default_factory=dict)  # further tracks to drive on, by what differs
     labels: Sequence[str] = ("oil", "ppo", "coil")  # of the runs of the experiments that drive
     repeats: int = 3  # drives of each driver, which differ by the LiDAR noise
     laps: int = 3  # laps of a drive
@@ -93,17 +96,20 @@ class Table6(Result):
         robots = f"{self.repeats} of {robot}, {self.laps} laps, seed {self.seed}"
         recordings: list[Recording] = []
         with tqdm(desc="drive", unit="step", leave=False, mininterval=0.5) as bar:
-            for name, notes, make_env_and_policy in self._drivers(runs):
-                bar.set_postfix_str(name)
-                paths = [folder / f"{name}_{robot}.mcap" for robot in range(self.repeats)]
-                recordings += record(make_env_and_policy, paths, {**notes, "robots": robots}, bar.update)
+            for world, tracks in {"": robot_tracks(), **self.worlds}.items():
+                cones = hashlib.sha256(json.dumps([track_notes(track) for track in tracks]).encode()).hexdigest()
+                where = {"robots": robots, "world": world, "cones_sha256": cones}
+                for name, notes, make_env_and_policy in self._drivers(runs, tracks):
+                    bar.set_postfix_str(name)
+                    paths = [folder / f"{'_'.join([name, str(n), *world.split()])}.mcap" for n in range(self.repeats)]
+                    recordings += record(make_env_and_policy, paths, {**notes, **where}, bar.update)
         return recordings
 
-    def _drivers(self, runs: Sequence[Run]) -> Iterator[tuple[str, dict[str, str], Any]]:
+    def _drivers(self, runs: Sequence[Run], tracks: Sequence[Track]) -> Iterator[tuple[str, dict[str, str], Any]]:
         """Yield name, notes and the maker of env and policy for the guide of the first run and for each agent."""
         make_env = partial(
-            SimulatedRobotEnv, num_envs=self.repeats, assignment="cyclic", laps=self.laps, car_length=self.car_length,
-            max_steering=self.max_steering, seed=self.seed,
+            SimulatedRobotEnv, tracks, num_envs=self.repeats, assignment="cyclic", laps=self.laps,
+            car_length=self.car_length, max_steering=self.max_steering, seed=self.seed,
         )  # fmt: skip
         configs = [read_config(run.folder, "run", {"device": "cpu"}) for run in runs]
         guides = build_guides(configs[0])
@@ -121,29 +127,38 @@ class Table6(Result):
 
 def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     """Return the page of Tables 6 and 7, given the measures of the drives and a suffix of the headings."""
-    by_method: dict[str, dict[str | None, list[Row]]] = {}
+    by_world: dict[str, dict[str, dict[str | None, list[Row]]]] = {}
     for row in rows:
-        by_method.setdefault(row["method"], {}).setdefault(row["seed"], []).append(row)
-    table = []
-    for method, by_seed in by_method.items():
-        paper = PAPER_ROBOT.get(method, dict.fromkeys(PAPER_ROBOT["guide"]))
-        line = means([row for drives in by_seed.values() for row in drives])
-        line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
-        table.append(line | {f"paper {key}": value for key, value in paper.items()})
-    parts = [f"## Table 6: the robot{suffix}", markdown_table(table, PAGE["columns"])]
-    parts += [f"### Table 7, measured{suffix}", markdown_table(table, PAGE["columns_of_table_7"])]
+        by_world.setdefault(row["world"], {}).setdefault(row["method"], {}).setdefault(row["seed"], []).append(row)
+    parts = [f"## Table 6: the robot{suffix}"]
+    claims: list[Row] = []
+    for world, by_method in by_world.items():
+        table = []
+        for method, by_seed in by_method.items():
+            paper = PAPER_ROBOT.get(method, dict.fromkeys(PAPER_ROBOT["guide"]))
+            line = means([row for drives in by_seed.values() for row in drives])
+            line |= {"method": method, "seeds": None if None in by_seed else len(by_seed)}
+            table.append(line | {f"paper {key}": value for key, value in paper.items()})
+        parts += [*pages.world_heading(world), markdown_table(table, PAGE["columns"])]
+        parts += [f"### Table 7, measured{suffix}", markdown_table(table, PAGE["columns_of_table_7"])]
+        claims += _claims(table, by_method, f", {world}" if world else "")
     notes = PAGE["notes"].format(max_steering=max_steering)
-    of_seeds = {method: {s: means(drives) for s, drives in of.items()} for method, of in by_method.items()}
-    verdicts = [_claim(of_seeds, *claim) for claim in PAGE["claims"]]
-    claims = [claim for claim in verdicts if claim is not None]
     if not claims:
         return "\n\n".join([*parts, notes])
-    crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
-    details = ", ".join(f"{line['method']} {_crashes(line, of_seeds[line['method']])}" for line in crashes)
-    ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details) if crashes else None
-    claims.append({"claim": "Nobody crashes", "paper": "0", "ours": ours})
     section = pages.claims_section(claims, {"paper": "paper", "seeds": "seeds", "ours": "ours (95 %)"})
     return "\n\n".join([*parts, f"{notes}\n{PAGE['claim_notes']}", section])
+
+
+def _claims(table: Sequence[Row], drives: Mapping[str, Mapping[str | None, Sequence[Row]]], end: str) -> Sequence[Row]:
+    """Return the verdicts on the claims of the paper in one world, which their text ends with."""
+    of_seeds = {method: {s: means(rows) for s, rows in of.items()} for method, of in drives.items()}
+    claims = [row for claim, *about in PAGE["claims"] if (row := _claim(of_seeds, claim + end, *about))]
+    crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
+    if not claims or not crashes:
+        return claims
+    details = ", ".join(f"{line['method']} {_crashes(line, of_seeds[line['method']])}" for line in crashes)
+    ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details)
+    return [*claims, {"claim": f"Nobody crashes{end}", "paper": "0", "ours": ours}]
 
 
 def _claim(

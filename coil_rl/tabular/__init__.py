@@ -7,7 +7,6 @@ In the paper's order: `mdp`, Markov decision processes as arrays; `planning`, dy
 from coil_rl.tabular.coil import observations_with_advice as observations_with_advice
 from coil_rl.tabular.coil import with_advice as with_advice
 from coil_rl.tabular.learning import ModelEstimate as ModelEstimate
-from coil_rl.tabular.learning import QLearningResult as QLearningResult
 from coil_rl.tabular.learning import Simulator as Simulator
 from coil_rl.tabular.learning import Transitions as Transitions
 from coil_rl.tabular.learning import q_learning as q_learning
@@ -15,7 +14,6 @@ from coil_rl.tabular.learning import sample_transitions as sample_transitions
 from coil_rl.tabular.mdp import MDP as MDP
 from coil_rl.tabular.mdp import garnet as garnet
 from coil_rl.tabular.mdp import toymaker as toymaker
-from coil_rl.tabular.planning import PlanningResult as PlanningResult
 from coil_rl.tabular.planning import policy_evaluation as policy_evaluation
 from coil_rl.tabular.planning import policy_iteration as policy_iteration
 from coil_rl.tabular.planning import solve as solve

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from coil_rl.envs.limits import check_range
 from coil_rl.envs.sight import Frame
 from coil_rl.envs.track import SIDES, Array, Track, TrackError, resample
 
@@ -42,10 +43,20 @@ def robot_track() -> Track:
     return Track("robot (simulated)", left, right)
 
 
-def robot_tracks(scale: float = 1.0) -> list[Track]:
-    """Return a list with the robot's track, `scale` times as large; 7 suits the cars of the cone world."""
-    track = robot_track()
-    return [track if scale == 1 else Track(track.name, track.left * scale, track.right * scale)]
+def robot_tracks(scale: float = 1, count: int = 1, missing: float = 0, moved: float = 0, seed: int = 0) -> list[Track]:
+    """Return copies of the robot's track, `scale` times as large; 7 suits the cars of the cone world.
+
+    Each cone is `missing` with this probability, or `moved` by normal noise of this standard deviation in m of the
+    unscaled track. A track with too few cones, or with sides that cross, is a `TrackError`.
+    """
+    check_range(0, missing=missing, moved=moved)
+    track, generator, tracks = robot_track(), np.random.default_rng(seed), []
+    start = (scale * track.start[0], scale * track.start[1], track.start[2])
+    for copy in range(count):
+        kept = [ring[generator.random(len(ring)) >= missing] for ring in (track.left, track.right)]
+        left, right = (scale * (ring + moved * generator.standard_normal(ring.shape)) for ring in kept)
+        tracks.append(Track(f"{track.name} {copy}".removesuffix(" 0"), left, right, start))
+    return tracks
 
 
 def track_notes(track: Track) -> dict[str, str]:

@@ -6,7 +6,7 @@ import torch
 from torchrl.envs import GymEnv, PendulumEnv
 from worlds import drive, reloaded, same
 
-from coil_rl.envs import EnvBatch, GymnasiumEnv
+from coil_rl import EnvBatch, GymnasiumEnv
 from coil_rl.testing import check_env
 
 SINGLE = {"pendulum": PendulumEnv, "cartpole": partial(GymEnv, "CartPole-v1")}

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from torchrl.data import Bounded, Categorical, MultiCategorical, Unbounded
 from worlds import drive, reloaded, same
 
-from coil_rl.envs import GymnasiumEnv
+from coil_rl import GymnasiumEnv
 from coil_rl.testing import check_env
 
 LIMIT = 7  # steps of an episode of `Echo`

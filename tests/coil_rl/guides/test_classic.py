@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs import TransformedEnv
 
-from coil_rl.envs import GymnasiumEnv
+from coil_rl import GymnasiumEnv
 from coil_rl.guides import EntryGuide, classic
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.train.evaluation import evaluate_policy

@@ -15,6 +15,7 @@ from coil_rl.envs import (
     SimulatedRobotEnv,
     read_recording,
     record_drives,
+    robot_tracks,
     simulated_cone_classifier,
 )
 from coil_rl.errors import UserError
@@ -108,6 +109,18 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert sorted(map(str, read_csv(tmp_path / "again.csv"))) == sorted(map(str, rows))
 
 
+def test_all_drive_on_further_tracks_too(runs, tmp_path):
+    worlds = {"cones missing": robot_tracks(missing=0.2, seed=1)}
+    table = Table6(["mine"], labels=["ppo"], repeats=1, worlds=worlds)
+    page = table.make(tmp_path / "table_6", runs)
+    rows = read_csv(tmp_path / "table_6.csv")
+    expected = [(name, world) for world in ("", "cones missing") for name in ("guide", "ppo")]
+    assert [(line["method"], line["world"]) for line in rows] == expected
+    assert page.count("Cones missing") == 1
+    with_cones, without = (len(drive.track.left) for drive in table.drives[::2])
+    assert without < with_cones
+
+
 def robots_of(run, folder):
     """Return the recordings of the agent of a run, one robot and a lap of the constant guide at most."""
     Table6(runs=[str(run)], repeats=1, laps=1).make(folder / "own")
@@ -147,7 +160,7 @@ LOST = {"laps": 0, "lap_time": math.nan, "corner_cut": math.nan, "crashed": True
 
 
 def drive(method, seed=None, **others):
-    return KNOWN | {"method": method, "seed": seed, "smoothness": 0.3} | others
+    return KNOWN | {"method": method, "seed": seed, "world": "", "smoothness": 0.3} | others
 
 
 def page_of(*drives):
@@ -187,6 +200,15 @@ def test_drives_without_a_complete_lap_are_compared_by_clearance_only(page):
     lost = page_of(drive("guide"), drive("ppo", "0", **LOST))
     assert row(lost, "PPO steers more smoothly")[2:] == ["0 of 1", "-"]
     assert row(lost, "PPO drives nearer")[2:] == ["1 of 1", "**undecided**: -0.050, 1 seed"]
+
+
+def test_each_world_has_its_own_rows_and_claims():
+    in_rain = [drive(name, "0", world="rain", smoothness=0.5) for name in ("coil", "ppo")]
+    page = page_of(drive("guide"), drive("ppo", "0"), *in_rain)
+    assert row(page, "ppo ")[5] == "0.300"
+    rain = page.split("### Rain")[1]
+    assert [row(rain, f"{name} ")[5] for name in ("coil", "ppo")] == ["0.500", "0.500"]
+    assert row(page, "COIL steers more smoothly than PPO, rain")[2] == "1 of 1"
 
 
 def test_an_agent_without_seed_leaves_claims_undecided_and_other_drivers_have_none():

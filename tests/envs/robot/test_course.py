@@ -27,6 +27,21 @@ def test_lap_is_six_metres_with_a_straight_a_left_turn_and_a_right_turn():
     assert large.length == pytest.approx(7 * track.length, rel=1e-3)
 
 
+def test_cones_are_missing_or_moved_in_copies_of_the_track():
+    track, copies = robot_track(), robot_tracks(count=40, missing=0.1, moved=0.01, seed=3)
+    assert len({copy.name for copy in copies}) == 40
+    left = [len(copy.left) for copy in copies]
+    assert np.mean(left) == pytest.approx(0.9 * len(track.left), rel=0.03)
+    assert min(left) < max(left)
+    offsets = [copy.right[:, None] - track.right for copy in copies]
+    nearest = [np.take_along_axis(o, (o**2).sum(-1).argmin(1)[:, None, None], 1)[:, 0] for o in offsets]
+    assert np.concatenate(nearest).std() == pytest.approx(0.01, rel=0.1)
+    assert {copy.start for copy in copies} == {track.start}
+    again, (unchanged,) = robot_tracks(count=40, missing=0.1, moved=0.01, seed=3), robot_tracks()
+    np.testing.assert_array_equal(again[7].left, copies[7].left)
+    np.testing.assert_array_equal(unchanged.left, track.left)
+
+
 def test_cones_are_evenly_spaced_and_leave_room_for_the_robot():
     track = robot_track()
     for ring in (track.left, track.right):
