@@ -44,7 +44,7 @@ def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, st
 
     Cells that are a `Claim` become verdicts; they are one family of tests.
     """
-    headings = {key: (heading, "") for key, heading in {"claim": "claim of the paper", **columns}.items()}
+    headings = {key: (heading, "") for key, heading in {"claim": "claim", **columns}.items()}
     corrected = iter(holm([cell.estimate.p for row in claims for cell in row.values() if isinstance(cell, Claim)]))
     rows = [
         {key: cell.verdict(float(next(corrected))) if isinstance(cell, Claim) else cell for key, cell in row.items()}

@@ -100,5 +100,5 @@ def test_off_policy_learners_set_their_action_and_batch(tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
     assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
-    assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 8_192]
+    assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 6_144]
     assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1
