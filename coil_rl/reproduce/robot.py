@@ -150,7 +150,7 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
 
 
 def _claims(table: Sequence[Row], drives: Mapping[str, Mapping[str | None, Sequence[Row]]], end: str) -> Sequence[Row]:
-    """Return the verdicts on the claims of the paper in one world, which their text ends with."""
+    """Return the verdicts on the claims of the paper in one world; `end` ends the text of each."""
     of_seeds = {method: {s: means(rows) for s, rows in of.items()} for method, of in drives.items()}
     claims = [row for claim, *about in PAGE["claims"] if (row := _claim(of_seeds, claim + end, *about))]
     crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
