@@ -141,7 +141,7 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
             table.append(line | {f"paper {key}": value for key, value in paper.items()})
         parts += [*pages.world_heading(world), markdown_table(table, PAGE["columns"])]
         parts += [f"### Table 7, measured{suffix}", markdown_table(table, PAGE["columns_of_table_7"])]
-        claims += _claims(table, by_method, f", {world}" if world else "")
+        claims += [{"world": world, **row} for row in _claims(table, by_method)]
     notes = PAGE["notes"].format(max_steering=max_steering)
     if not claims:
         return "\n\n".join([*parts, notes])
@@ -149,16 +149,16 @@ def robot_page(rows: Sequence[Row], suffix: str, max_steering: float) -> str:
     return "\n\n".join([*parts, f"{notes}\n{PAGE['claim_notes']}", section])
 
 
-def _claims(table: Sequence[Row], drives: Mapping[str, Mapping[str | None, Sequence[Row]]], end: str) -> Sequence[Row]:
-    """Return the verdicts on the claims of the paper in one world; `end` ends the text of each."""
+def _claims(table: Sequence[Row], drives: Mapping[str, Mapping[str | None, Sequence[Row]]]) -> Sequence[Row]:
+    """Return the verdicts on the claims of the paper in one world."""
     of_seeds = {method: {s: means(rows) for s, rows in of.items()} for method, of in drives.items()}
-    claims = [row for claim, *about in PAGE["claims"] if (row := _claim(of_seeds, claim + end, *about))]
+    claims = [row for claim, *about in PAGE["claims"] if (row := _claim(of_seeds, claim, *about))]
     crashes = [line for line in table if line["method"] in PAPER_ROBOT and line["crashes"] is not None]
     if not claims or not crashes:
         return claims
     details = ", ".join(f"{line['method']} {_crashes(line, of_seeds[line['method']])}" for line in crashes)
     ours = pages.certain_verdict(not any(line["crashes"] for line in crashes), details)
-    return [*claims, {"claim": f"Nobody crashes{end}", "paper": "0", "ours": ours}]
+    return [*claims, {"claim": "Nobody crashes", "paper": "0", "ours": ours}]
 
 
 def _claim(

@@ -50,12 +50,11 @@ class Table4(WorldsResult):
             parts += [*pages.world_heading(world), markdown_table(table, columns)]
         parts += [PAGES["table_4"]["notes"].format(against=self.against)]
         claims = []
-        for world, table in tables.items():
-            for line in table:
-                if line["label"] == "coil" and self.against == "ppo":
-                    claim = ", ".join(filter(None, ("COIL's best return is above PPO's", world)))
-                    paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
-                    claims.append({"claim": claim, "paper": paper, "ours": pages.Claim(line["difference"], "+.1f")})
+        coil = [(world, line) for world, table in tables.items() for line in table if line["label"] == "coil"]
+        for world, line in coil if self.against == "ppo" else []:
+            row = {"world": world, "claim": "COIL's best return is above PPO's"}
+            paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
+            claims.append({**row, "paper": paper, "ours": pages.Claim(line["difference"], "+.1f")})
         if claims:
             parts.append(pages.claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
         return "\n\n".join(parts)
@@ -100,7 +99,7 @@ class Figure22(WorldsResult):
         """Make the result, see `Result`."""
         learned = {name: [run for run in runs[name] if run.curve] for name in self.experiments}
         runs_by_label(self.labels, learned)  # each has runs in some world
-        parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[dict[str, Any]]()
+        parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[Row]()
         for number, (world, experiments) in enumerate(self.worlds.items(), start=1):
             of_world = [run for experiment in experiments for run in learned[experiment]]
             by_label = {label: [run for run in of_world if run.label == label] for label in self.labels}
@@ -120,32 +119,30 @@ class Figure22(WorldsResult):
             parts += [*pages.world_heading(world), *([f"![{title}]({picture.name})"] if world else [])]
             parts += [_curve_table(means, by_label, reached)]
             parts += [] if math.isnan(guide) else [f"The guide alone earns {guide:.1f} in these cases."]
-            claims += self._claims(means, reached, world)
+            claims += _claims(means, reached, world)
         write_csv(rows, stem.with_suffix(".csv"))
         parts.append(PAGES["figure_22"]["notes"])
         parts += [pages.claims_section(claims, {"ours": "ours (95 %)"})] if claims else []
         return "\n\n".join(parts)
 
-    @staticmethod
-    def _claims(
-        means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str
-    ) -> list[dict[str, Any]]:
-        """Return the verdicts on the curves of a world."""
-        claims: list[dict[str, Any]] = []
-        for claim, driver, other in PAGES["figure_22"]["claims"]:
-            if not {driver, other} <= reached.keys():
-                continue
-            if claim == "above":
-                (frames, mean, *_), (_, others, *_) = means[driver], means[other]
-                above = (mean > others)[frames > 0]  # both begin untrained
-                ours: Any = pages.certain_verdict(bool(above.all()), f"at {above.sum()} of {len(above)} points")
-            else:
-                seeds = sorted(reached[driver].keys() & reached[other].keys())
-                more = [reached[driver][seed] - reached[other][seed] for seed in seeds]
-                ours = pages.Claim(estimate(more), "+,.0f", -1)
-            text = PAGES["figure_22"]["texts"][claim].format(driver=driver, other=other)
-            claims.append({"claim": f"{text}, {world}" if world else text, "ours": ours})
-        return claims
+
+def _claims(means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str) -> list[Row]:
+    """Return the verdicts on the curves of a world."""
+    claims: list[Row] = []
+    for claim, driver, other in PAGES["figure_22"]["claims"]:
+        if not {driver, other} <= reached.keys():
+            continue
+        if claim == "above":
+            (frames, mean, *_), (_, others, *_) = means[driver], means[other]
+            above = (mean > others)[frames > 0]  # both begin untrained
+            ours: Any = pages.certain_verdict(bool(above.all()), f"at {above.sum()} of {len(above)} points")
+        else:
+            seeds = sorted(reached[driver].keys() & reached[other].keys())
+            more = [reached[driver][seed] - reached[other][seed] for seed in seeds]
+            ours = pages.Claim(estimate(more), "+,.0f", -1)
+        text = PAGES["figure_22"]["texts"][claim].format(driver=driver, other=other)
+        claims.append({"world": world, "claim": text, "ours": ours})
+    return claims
 
 
 def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:

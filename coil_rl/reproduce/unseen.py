@@ -91,7 +91,7 @@ class Table5(WorldsResult):
                         cells[actions] = pages.Claim(pairs.difference, spec, sign) if pairs else None
                 if cells:
                     paper = _paper_difference(measure, driver, other, by_actions[ACTIONS[0]].normalised)
-                    rows.append({"claim": f"{claim}, {world}" if world else claim, "paper": paper} | cells)
+                    rows.append({"world": world, "claim": claim, "paper": paper} | cells)
         crashes: dict[str, str] = {"claim": "Nobody crashes", "paper": "0%"}
         for actions, comparison in worlds[""].items():
             drivers = [group for group in comparison.groups if group.name in PAPER_UNSEEN]

@@ -61,7 +61,7 @@ def test_a_verdict_needs_a_small_p(number, sign, p, cell):
     assert Claim(Estimate(*number), "+.1f", sign).verdict(p) == cell
 
 
-def test_the_verdicts_of_a_page_are_one_family():
+def test_the_verdicts_of_a_world_are_one_family():
     alone = Claim(estimate([1.0, 1.1, 1.3]), ".1f")
     undecided = Claim(estimate([1.0, -1.0, 0.5]), ".1f")
     assert 0.005 < alone.estimate.p < 0.025
@@ -70,3 +70,7 @@ def test_the_verdicts_of_a_page_are_one_family():
             [{"claim": "first", "ours": alone}, *[{"claim": "other", "ours": undecided}] * others], {"ours": "ours"}
         )
         assert row(page, "first")[1].startswith(f"**{word}**")
+    elsewhere = [{"world": "rain", "claim": "other", "ours": undecided}] * 8
+    page = claims_section([{"world": "", "claim": "first", "ours": alone}, *elsewhere], {"ours": "ours"})
+    assert row(page, "first")[1].startswith("**held up**")
+    assert row(page, "other, rain")[1].startswith("**undecided**")
