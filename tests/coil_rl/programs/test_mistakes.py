@@ -62,7 +62,7 @@ def refusal(name, *arguments):
         ("learner.learning_rat=1", "+learner.learning_rat=VALUE adds it; did you mean learning_rate?"),
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
-        ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps, minibatches; did you mean frames?"),
+        ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps, minibatches"),
         ("+watch.epsode.a=[reward]", "no key watch.epsode; watch has episode, step; did you mean episode?"),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
