@@ -67,7 +67,7 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
 
 
 class WholeEpisode:
-    """Base class of divisions of an episode into sections. It has a single one, and draws each measure by step."""
+    """Base class of divisions of an episode into sections. The whole episode is one section, drawn by step."""
 
     names: ClassVar[tuple[str, ...]] = ()  # of the sections
     record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that `draw` needs, by name

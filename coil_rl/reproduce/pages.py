@@ -40,13 +40,13 @@ def certain_verdict(holds: bool, details: str) -> str:
 
 
 def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
-    """Return the last section of a page: rows with a `claim`, its `world`, and further columns by key with headings.
+    """Return the last section of a page, a table of claims: `claim`, `world`, and cells of the columns by key.
 
     Cells that are a `Claim` become verdicts; those of a world are a family of tests. The main world is "", or missing.
     """
     headings = {key: (heading, "") for key, heading in {"claim": "claim", **columns}.items()}
     found = [(row.get("world"), cell.estimate.p) for row in claims for cell in row.values() if isinstance(cell, Claim)]
-    corrected = {world: iter(holm([p for of, p in found if of == world])) for world, _ in found}
+    corrected = {world: iter(holm([p for of, p in found if of == world])) for world in dict(found)}
     rows = [
         {key: cell.verdict(float(next(p))) if isinstance(cell, Claim) else cell for key, cell in row.items()}
         | {"claim": ", ".join(filter(None, [row["claim"], row.get("world")]))}

@@ -127,7 +127,7 @@ class Figure22(WorldsResult):
 
 
 def _claims(means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str) -> list[Row]:
-    """Return the verdicts on the curves of a world."""
+    """Return the verdicts on the learning curves in one world, as rows of `claims_section`."""
     claims: list[Row] = []
     for claim, driver, other in PAGES["figure_22"]["claims"]:
         if not {driver, other} <= reached.keys():

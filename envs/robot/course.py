@@ -44,7 +44,7 @@ def robot_track() -> Track:
 
 
 def robot_tracks(scale: float = 1, count: int = 1, missing: float = 0, moved: float = 0, seed: int = 0) -> list[Track]:
-    """Return copies of the robot's track, `scale` times as large; 7 suits the cars of the cone world.
+    """Return copies of the robot's track, enlarged by `scale`: with 7 it fits the cars of the cone world.
 
     Each cone is `missing` with this probability, or `moved` by normal noise of this standard deviation in m of the
     unscaled track. A track with too few cones, or with sides that cross, is a `TrackError`.
