@@ -10,10 +10,10 @@ to the logit of the advised action. Residual policies start the same way (Silver
 but here f is unbounded, and w falls: a policy that keeps w = 1 never loses the guide's habits. A guide that is always
 wrong is of use too: with w = -1 the first policy does the opposite, and |w| falls.
 
-Falling too far breaks the policy, so there is a brake. At a few looks over the run the policy acts deterministically in
-fixed cases of the training, with today's weight and with one that is lower by a margin. If the lower one fails in no
-further case and loses next to nothing, the weight falls by a step, which is shorter than the margin; if today's has
-become worse, it rises.
+Falling too far breaks the policy, and any update may, so there is a brake. At a few looks over the run the policy acts
+deterministically in fixed cases of the training, with today's weight and with one that is lower by a margin. If today's
+has become worse, the policy goes back to that of the best look. Else the weight falls, if the lower one fails in no
+further case: by a step, which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
 """
 
 import math
@@ -127,34 +127,33 @@ class Anchor(Stateful):
     """
 
     parts: ClassVar[tuple[str, ...]] = (
-        "holds", "guide", "sign", "unit", "guide_return", "guide_failures", "allowed", "best",
+        "holds", "guide", "sign", "unit", "guide_failures", "allowed", "best", "kept",
     )  # fmt: skip
 
-    looks: int = 24  # number of looks over the run
+    looks: int = 32  # number of looks over the run, besides the one before training
     cases: int = 24  # C, number of cases of a look
     step: float = 0.05  # by which the weight falls at a look
     margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
-    back: float = 0.1  # by which the weight rises
     # Loss of return that is allowed for a step, as a share of the guide's return; at least half a standard error of
-    # the guide's return is. Three times as much below the best look so far, the weight rises.
+    # the guide's return is. Three times as much below the best look so far, the policy goes back to that.
     tolerance: float = 0.01
     warmup: float = 0.05  # share of the run, from its start, in which only the critic learns
-    # Standard deviation of an anchored policy that has one of its own, of PPO and the like; with DQN the probability
-    # of a random action.
+    # Standard deviation of a policy that has one of its own, as that of PPO; with DQN probability of a random action.
     noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5)
     advice_key: NestedKey = "guide_action"  # entry with the advice, [*batch, n_guides, A]
 
     def __post_init__(self) -> None:
         check_range(1, looks=self.looks)
         check_range(2, cases=self.cases)
-        check_range(0, 1, step=self.step, back=self.back, tolerance=self.tolerance, warmup=self.warmup)
+        check_range(0, 1, step=self.step, tolerance=self.tolerance, warmup=self.warmup)
         check_range(self.step, 1, margin=self.margin)
         self.noise_at = schedule(self.noise)
         check_range(0, above=True, noise=self.noise_at(0))
         self.holds = True
-        self.guide_return = self.allowed = self.best = math.nan
+        self.allowed = self.best = math.nan
         self.guide = self.guide_failures = 0
         self.sign, self.unit = 1, 1.0
+        self.kept: dict[str, Tensor] = {}  # state of the policy at the best look
 
     def attach(self, head: AnchoredHead) -> AnchoredHead:
         """Choose the head of the policy, and return it."""
@@ -168,9 +167,7 @@ class Anchor(Stateful):
 
     def weights(self, value: float) -> Tensor:
         """Return the weights of all guides, [n_guides], with a value for the one that holds, or for its opposite."""
-        weights = torch.zeros_like(self.head.weight)
-        weights[self.guide] = self.sign * value
-        return weights
+        return self.starts()[self.guide] * (self.sign * value)
 
     def starts(self) -> list[Tensor]:
         """Return the weights, [n_guides] each, of the look before training: each guide, none, each opposite."""
@@ -193,16 +190,15 @@ class Anchor(Stateful):
         return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
 
     def due(self, update: int, updates: int) -> bool:
-        """Return whether there is a look after an update of a run, apart from the first and the last one."""
-        looks = min(self.looks, updates)
-        return self.holds and 0 < update < updates and update * looks // updates > (update - 1) * looks // updates
+        """Return whether there is a look after an update of a run, apart from the one before training."""
+        return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
 
-    def lower(self) -> float:
-        """Return the lower weight to try at a look."""
-        return max(self.weight - self.margin, 0.0)
+    def tried(self) -> tuple[float, float]:
+        """Return the weights of a look: today's and a lower one."""
+        return self.weight, max(self.weight - self.margin, 0.0)
 
-    def begin(self, look: Look, random: Tensor) -> None:
-        """Hold the best guide or opposite, or let go, after a look with the weights of `starts`.
+    def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
+        """Hold the best guide or opposite, or let go, after a look at the policy with the weights of `starts`.
 
         `random` are returns of random actions, [C].
         """
@@ -214,21 +210,31 @@ class Anchor(Stateful):
         self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
         self.head.weight.copy_(self.weights(float(self.holds)))
         self.set_noise(0.0)
-        self.guide_return = self.best = look.score(best)
+        self._keep(policy, look.score(best))
         self.guide_failures = look.failures[best]
         if self.holds:
             self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
         self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
 
-    def decide(self, look: Look) -> None:
-        """Lower, keep or raise the weight after a look with today's weight and with the lower one."""
+    def decide(self, look: Look, policy: nn.Module) -> bool:
+        """Lower or keep the weight after a look at the policy with today's weight and with the lower one.
+
+        If the policy has become worse, it goes back to that of the best look instead; return whether it did.
+        """
         now, lower = look.score(0), look.score(1)
-        steps = self.margin / self.step if self.step else 1.0
-        self.best = max(self.best, now)
         if look.failures[0] > self.guide_failures or now < self.best - 3 * self.allowed:
-            self.head.weight.copy_(self.weights(min(self.weight + self.back, 1.0)))
-        elif look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
-            self.head.weight.copy_(self.weights(max(self.weight - self.step, 0.0)))
+            policy.load_state_dict(self.kept)
+            return True
+        if now >= self.best:
+            self._keep(policy, now)
+        steps = self.margin / self.step if self.step else 1.0
+        if look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
+            fall = self.margin if lower > self.best + 3 * self.allowed else self.step
+            self.head.weight.copy_(self.weights(max(self.weight - fall, 0.0)))
+        return False
+
+    def _keep(self, policy: nn.Module, score: float) -> None:
+        self.best, self.kept = score, {name: value.clone() for name, value in policy.state_dict().items()}
 
 
 def standard_error(values: Tensor) -> Tensor:

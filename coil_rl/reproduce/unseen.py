@@ -30,7 +30,8 @@ class Table5(WorldsResult):
             for run in of_world:
                 about = {"world": world, "label": run.label, "seed": run.seed}
                 # Six digits are enough, and half the size.
-                episodes += [about | row for row in run.evaluation.map(_six_digits).to_dict("records")]
+                rounded = run.evaluation.map(lambda value: float(f"{value:.6g}") if isinstance(value, float) else value)
+                episodes += [about | row for row in rounded.to_dict("records")]
             compared = worlds[world] = {actions: self._compare(of_world, actions) for actions in ACTIONS}
             rows = {actions: self._rows(compared[actions]) for actions in ACTIONS}
             parts += pages.world_heading(world)
@@ -99,10 +100,6 @@ class Table5(WorldsResult):
             crashes[actions] = pages.certain_verdict(not any(group.means()["crashed"] for group in drivers), details)
         headings = {"paper": "paper"} | {actions: f"ours, {actions} actions (95 %)" for actions in ACTIONS}
         return pages.claims_section([*rows, crashes], headings)
-
-
-def _six_digits(value: Any) -> Any:
-    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def _paper_table(rows: Mapping[str, Sequence[Row]]) -> str:

@@ -24,7 +24,7 @@ class Brake:
     policy: TensorDictModuleBase  # of the learner; copies of it act
     build: Callable[[int], EnvBase]  # makes an env with all cases for a number of policies
     failure: Measure | None = None  # measure that is true for an episode that failed, if there is one
-    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures")  # in the log
+    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures", "look/back")
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether there is a look after an update."""
@@ -32,18 +32,19 @@ class Brake:
 
     def __call__(self, update: int) -> dict[str, float]:
         """Look, decide, and return the numbers by name."""
+        back = False
         if update == 0:
             look = self._look(self.anchor.starts())
             env = self.build(1)
             with torch.random.fork_rng():
                 torch.manual_seed(0)
                 random = self._drive(env, env.rand_action)["return"]
-            self.anchor.begin(look, random)
+            self.anchor.begin(look, random, self.policy)
         else:
-            look = self._look([self.anchor.weights(weight) for weight in (self.anchor.weight, self.anchor.lower())])
-            self.anchor.decide(look)
-        numbers = (look.score(0), look.score(1), *map(float, look.failures[:2]))
-        return dict(zip(self.names, numbers, strict=True))
+            look = self._look([self.anchor.weights(weight) for weight in self.anchor.tried()])
+            back = self.anchor.decide(look, self.policy)
+        numbers = (look.score(0), look.score(1), *look.failures[:2], back)
+        return dict(zip(self.names, map(float, numbers), strict=True))
 
     def _look(self, weights: Sequence[Tensor]) -> Look:
         """Drive all cases with each of some weights of the guides."""

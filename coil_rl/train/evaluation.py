@@ -155,11 +155,7 @@ class Totals:
 
 
 def episodes(
-    env: EnvBase,
-    policy: TensorDictModuleBase,
-    *,
-    sampled: bool | Tensor = False,
-    tick: Callable[[], Any] | None = None,
+    env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool | Tensor = False, tick: Callable[[], Any] | None = None
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Yield the entries after each step of one episode on every row, and whether the row was still in it, [*B, 1].
 

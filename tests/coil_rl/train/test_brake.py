@@ -37,7 +37,7 @@ def test_first_policy_is_within_two_percent_of_the_guide(action):
     returns = brake._drive(guide, lambda data: data.set("action", guided(data, action)))["return"]
     assert learner.anchor.weight == 1
     assert first == pytest.approx(float(returns.mean()), rel=0.02)
-    assert learner.anchor.guide_return == pytest.approx(first)
+    assert learner.anchor.best == pytest.approx(first)
 
 
 def guided(data, action):
@@ -51,7 +51,7 @@ def test_opposite_of_a_reversed_guide_is_as_good_as_the_guide():
     good, brake_of_good, _ = built()
     brake_of_good(0)
     assert learner.anchor.head.weight.tolist() == [-1]
-    assert learner.anchor.guide_return == pytest.approx(good.anchor.guide_return)
+    assert learner.anchor.best == pytest.approx(good.anchor.best)
 
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
@@ -70,15 +70,19 @@ def test_look_leaves_the_policy_and_the_random_numbers_alone_and_can_be_repeated
     assert first == second
     assert first["look/return"] == first["look/lower_return"]
     assert first["look/failures"] == 5, "every episode begins far from upright"
+    assert first["look/back"] == 0
     assert torch.equal(torch.get_rng_state(), state)
     assert all(torch.equal(value, before[name]) for name, value in learner.policy.state_dict().items())
 
 
-def test_weight_falls_where_the_network_does_what_the_guide_did():
+def test_weight_falls_where_the_network_does_what_the_guide_did_and_a_bad_policy_goes_back():
     learner, brake, _ = built()
     brake(0)
     brake(1)
     assert learner.anchor.weight in (1.0, pytest.approx(0.95))
-    learner.anchor.best = learner.anchor.guide_return + 1000
-    brake(2)
-    assert learner.anchor.weight == 1, "worse than before"
+    first = {name: value.clone() for name, value in learner.anchor.kept.items()}
+    for value in learner.policy.parameters():
+        value.data += 1
+    learner.anchor.best += 1000
+    assert brake(2)["look/back"] == 1
+    assert all(torch.equal(value, first[name]) for name, value in learner.policy.state_dict().items())
