@@ -121,9 +121,8 @@ class Anchor(Stateful):
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
-        unit: of rewards in the updates of PPO and the like, the largest mean return, without its sign, of the first
-            policy, one without a guide and random actions; 1 without an anchor. A critic starts near 0, and would
-            follow returns of hundreds for most of the run.
+        unit: of rewards in updates of PPO and the like: the largest mean return, without its sign, before training;
+            1 without an anchor. A critic starts near 0, and would follow returns of hundreds for most of the run.
     """
 
     parts: ClassVar[tuple[str, ...]] = (

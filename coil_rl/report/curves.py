@@ -72,19 +72,20 @@ def draw_learning_curves(
 
 
 def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]) -> None:
-    """Draw the weights of the guides of anchored policies, on an axis inside the plot."""
-    anchors = {label: [points(rows, ANCHOR) for rows in seeds] for label, seeds in runs.items()}
-    if not any(len(curve) for curves in anchors.values() for curve in curves):
+    """Draw the weights of the guides of anchored policies, on an axis inside the plot, and where a policy went back."""
+    if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
         return
     weights = axes.twinx()
-    for label, curves in anchors.items():
-        for curve in curves:
-            frames, weight = curve.T
-            weights.step(frames, abs(weight), where="pre", color=strokes[label].colour, lw=0.7, alpha=0.6)
+    for label, stroke in strokes.items():
+        for rows in runs[label]:
+            frames, weight = points(rows, ANCHOR).T
+            weights.step(frames, abs(weight), where="pre", color=stroke.colour, lw=0.7, alpha=0.6)
+            back = [frame for frame, went in points(rows, "look/back") if went]
+            weights.plot(back, [0.5] * len(back), "x", color=stroke.colour, ms=4, alpha=0.6)
     weights.set(ylim=(0, 4), yticks=[0, 1])  # at the foot of the plot
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
     weights.spines[:].set_visible(False)
-    weights.text(0.01, 0.01, "weight of the guide", transform=weights.transAxes, size=7, color=style.QUIET)
+    weights.text(0.01, 0.01, "guide's weight; x: went back", transform=weights.transAxes, size=7, color=style.QUIET)
 
 
 def draw_curve_grid(
