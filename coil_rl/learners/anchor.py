@@ -189,15 +189,15 @@ class Anchor(Stateful):
         return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
 
     def due(self, update: int, updates: int) -> bool:
-        """Return whether there is a look after an update of a run, apart from the one before training."""
+        """Return whether the policy is to be looked at after an update; `updates` is the number of all updates."""
         return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
 
     def tried(self) -> tuple[float, float]:
-        """Return the weights of a look: today's and a lower one."""
+        """Return the two weights to compare at a look: the current one and a lower one."""
         return self.weight, max(self.weight - self.margin, 0.0)
 
     def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
-        """Hold the best guide or opposite, or let go, after a look at the policy with the weights of `starts`.
+        """Anchor the policy to the best guide or opposite, or to none, after a look with the weights of `starts`.
 
         `random` are returns of random actions, [C].
         """
@@ -216,7 +216,7 @@ class Anchor(Stateful):
         self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look, policy: nn.Module) -> bool:
-        """Lower or keep the weight after a look at the policy with today's weight and with the lower one.
+        """Lower or keep the weight after a look at the policy with the two weights of `tried`.
 
         If the policy has become worse, it goes back to that of the best look instead; return whether it did.
         """

@@ -72,7 +72,7 @@ def draw_learning_curves(
 
 
 def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]) -> None:
-    """Draw the weights of the guides of anchored policies, on an axis inside the plot, and where a policy went back."""
+    """Draw the anchor weights of policies, on an axis inside the plot, and a cross where the brake restored one."""
     if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
         return
     weights = axes.twinx()
