@@ -97,7 +97,7 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
     add = f"; +{key}=VALUE adds it" if parent is not None and OmegaConf.get_type(parent) is dict else ""
-    return f"there is no key {key}; {node} has {', '.join(known)}{add}{did_you_mean(str(error.key), known)}"
+    return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{did_you_mean(str(error.key), known)}"
 
 
 def _first_paragraph(error: BaseException) -> str:

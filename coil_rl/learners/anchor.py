@@ -192,9 +192,9 @@ class Anchor(Stateful):
         """Return whether the policy is to be looked at after an update; `updates` is the number of all updates."""
         return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
 
-    def tried(self) -> tuple[float, float]:
-        """Return the two weights to compare at a look: the current one and a lower one."""
-        return self.weight, max(self.weight - self.margin, 0.0)
+    def tried(self) -> list[Tensor]:
+        """Return the weights, [n_guides] each, of a look during training: today's and lower ones."""
+        return [self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))]
 
     def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
         """Anchor the policy to the best guide or opposite, or to none, after a look with the weights of `starts`.
@@ -209,11 +209,11 @@ class Anchor(Stateful):
         self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
         self.head.weight.copy_(self.weights(float(self.holds)))
         self.set_noise(0.0)
-        self._keep(policy, look.score(best))
         self.guide_failures = look.failures[best]
         if self.holds:
+            self._keep(policy, look.score(best))
             self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
-        self.allowed = max(self.tolerance * abs(self.best), float(standard_error(look.returns[best])) / 2)
+        self.allowed = max(self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look, policy: nn.Module) -> bool:
         """Lower or keep the weight after a look at the policy with the two weights of `tried`.

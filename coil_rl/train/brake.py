@@ -41,7 +41,7 @@ class Brake:
                 random = self._drive(env, env.rand_action)["return"]
             self.anchor.begin(look, random, self.policy)
         else:
-            look = self._look([self.anchor.weights(weight) for weight in self.anchor.tried()])
+            look = self._look(self.anchor.tried())
             back = self.anchor.decide(look, self.policy)
         numbers = (look.score(0), look.score(1), *look.failures[:2], back)
         return dict(zip(self.names, map(float, numbers), strict=True))
