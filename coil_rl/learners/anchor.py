@@ -133,8 +133,8 @@ class Anchor(Stateful):
     cases: int = 24  # C, number of cases of a look
     step: float = 0.05  # by which the weight falls at a look
     margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
-    # Loss of return that is allowed for a step, as a share of the guide's return; at least half a standard error of
-    # the guide's return is. Three times as much below the best look so far, the policy goes back to that.
+    # Share of the guide's return that may be lost for a step; at least half a standard error of that return may be.
+    # Three times as much below the best look, and two standard errors of the difference, the policy goes back to that.
     tolerance: float = 0.01
     warmup: float = 0.05  # share of the run, from its start, in which only the critic learns
     # Standard deviation of a policy that has one of its own, as that of PPO; with DQN probability of a random action.
@@ -149,9 +149,8 @@ class Anchor(Stateful):
         self.noise_at = schedule(self.noise)
         check_range(0, above=True, noise=self.noise_at(0))
         self.holds = True
-        self.allowed = self.best = math.nan
-        self.guide = self.guide_failures = 0
-        self.sign, self.unit = 1, 1.0
+        self.allowed, self.best = math.nan, torch.empty(0)  # returns of the best look, [C]
+        self.guide, self.guide_failures, self.sign, self.unit = 0, 0, 1, 1.0
         self.kept: dict[str, Tensor] = {}  # state of the policy at the best look
 
     def attach(self, head: AnchoredHead) -> AnchoredHead:
@@ -211,7 +210,7 @@ class Anchor(Stateful):
         self.set_noise(0.0)
         self.guide_failures = look.failures[best]
         if self.holds:
-            self._keep(policy, look.score(best))
+            self._keep(policy, look.returns[best])
             self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
         self.allowed = max(self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2)
 
@@ -220,20 +219,21 @@ class Anchor(Stateful):
 
         If the policy has become worse, it goes back to that of the best look instead; return whether it did.
         """
-        now, lower = look.score(0), look.score(1)
-        if look.failures[0] > self.guide_failures or now < self.best - 3 * self.allowed:
+        now, lower, best = look.score(0), look.score(1), float(self.best.mean())
+        chance = 2 * float(standard_error(self.best - look.returns[0]))
+        if look.failures[0] > self.guide_failures or now < best - max(3 * self.allowed, chance):
             policy.load_state_dict(self.kept)
             return True
-        if now >= self.best:
-            self._keep(policy, now)
+        if now >= best:
+            self._keep(policy, look.returns[0])
         steps = self.margin / self.step if self.step else 1.0
         if look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
-            fall = self.margin if lower > self.best + 3 * self.allowed else self.step
+            fall = self.margin if lower > max(now, best) + 3 * self.allowed else self.step
             self.head.weight.copy_(self.weights(max(self.weight - fall, 0.0)))
         return False
 
-    def _keep(self, policy: nn.Module, score: float) -> None:
-        self.best, self.kept = score, {name: value.clone() for name, value in policy.state_dict().items()}
+    def _keep(self, policy: nn.Module, returns: Tensor) -> None:
+        self.best, self.kept = returns, {name: value.clone() for name, value in policy.state_dict().items()}
 
 
 def standard_error(values: Tensor) -> Tensor:

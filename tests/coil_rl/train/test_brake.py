@@ -37,7 +37,7 @@ def test_first_policy_is_within_two_percent_of_the_guide(action):
     returns = brake._drive(guide, lambda data: data.set("action", guided(data, action)))["return"]
     assert learner.anchor.weight == 1
     assert first == pytest.approx(float(returns.mean()), rel=0.02)
-    assert learner.anchor.best == pytest.approx(first)
+    assert float(learner.anchor.best.mean()) == pytest.approx(first)
 
 
 def guided(data, action):
@@ -51,7 +51,7 @@ def test_opposite_of_a_reversed_guide_is_as_good_as_the_guide():
     good, brake_of_good, _ = built()
     brake_of_good(0)
     assert learner.anchor.head.weight.tolist() == [-1]
-    assert learner.anchor.best == pytest.approx(good.anchor.best)
+    assert torch.allclose(learner.anchor.best, good.anchor.best)
 
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
