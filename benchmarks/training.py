@@ -22,7 +22,7 @@ from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, media
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
-from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner
+from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner, compile_steps
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -42,7 +42,7 @@ class Training:
 
     def __init__(self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
-        env = build_env(config, {"num_envs": cars})
+        env = compile_steps(config, build_env(config, {"num_envs": cars}))
         learner = build_learner(config, env)
         rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
