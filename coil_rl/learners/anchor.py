@@ -192,7 +192,7 @@ class Anchor(Stateful):
         return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
 
     def tried(self) -> list[Tensor]:
-        """Return the weights, [n_guides] each, of a look during training: today's and lower ones."""
+        """Return the weights, [n_guides] each, of a look during training: today's and a lower one."""
         return [self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))]
 
     def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
