@@ -188,17 +188,17 @@ class Anchor(Stateful):
         return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
 
     def due(self, update: int, updates: int) -> bool:
-        """Return whether the policy is to be looked at after an update; `updates` is the number of all updates."""
+        """Return whether the brake is to test the policy after an update; `updates` is the number of all updates."""
         return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
 
     def tried(self) -> list[Tensor]:
-        """Return the weights, [n_guides] each, of a look during training: today's and a lower one."""
+        """Return the two weights to test, [n_guides] each: the present one, and one that is lower by the margin."""
         return [self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))]
 
     def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
-        """Anchor the policy to the best guide or opposite, or to none, after a look with the weights of `starts`.
+        """Choose the best guide, or the opposite of one, as the anchor of the policy, or none.
 
-        `random` are returns of random actions, [C].
+        `look` is with the weights of `starts`; `random` are returns of random actions, [C].
         """
         guides = len(self.head.weight)
         best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)
@@ -215,7 +215,7 @@ class Anchor(Stateful):
         self.allowed = max(self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2)
 
     def decide(self, look: Look, policy: nn.Module) -> bool:
-        """Lower or keep the weight after a look at the policy with the two weights of `tried`.
+        """Lower the weight of the guide or keep it, after drives with the two weights of `tried`.
 
         If the policy has become worse, it goes back to that of the best look instead; return whether it did.
         """

@@ -72,7 +72,7 @@ def draw_learning_curves(
 
 
 def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]) -> None:
-    """Draw the anchor weights of policies, on an axis inside the plot, and a cross where the brake restored one."""
+    """Draw the weights of guides on an axis inside the plot, and a cross where the brake restored an earlier policy."""
     if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
         return
     weights = axes.twinx()

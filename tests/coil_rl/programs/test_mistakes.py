@@ -63,6 +63,7 @@ def refusal(name, *arguments):
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
         ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps, minibatches"),
+        ("training.env.laps=1", "there is no key training.env.laps; training.env has none; +training"),
         ("+watch.epsode.a=[reward]", "no key watch.epsode; watch has episode, step; did you mean episode?"),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
