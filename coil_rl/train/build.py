@@ -171,10 +171,11 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
     return dict(resolved)
 
 
-def cases_node(config: DictConfig, cases: str, drivers: int = 1) -> dict[str, Any]:
-    """Return the overrides of `env` for a set of cases of the evaluation curve, all of them for each driver."""
+def cases_node(config: DictConfig, cases: str, drivers: int = 1, count: int | None = None) -> dict[str, Any]:
+    """Return the overrides of `env` for a set of cases of the evaluation curve, or for `count` of them, per driver."""
     curve = config.evaluation.curve
-    return {**curve.env, **curve.cases[cases], "num_envs": drivers * curve.num_envs}
+    count = count or curve.num_envs
+    return {**curve.env, curve.count_key: count, **curve.cases[cases], "num_envs": drivers * count}
 
 
 def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:

@@ -162,14 +162,12 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     if SELECTION not in config.evaluation.curve.cases:
         needed = f"evaluation.curve.cases.{SELECTION}, cases in which the brake drives"
         raise UserError(f"learner.anchor needs {needed}; give it")
-    look = config.copy()
-    look.evaluation.curve.num_envs = learner.anchor.cases
-    failure = measures_of(config.evaluation.measures).get("crashed")
-    return Brake(learner.anchor, learner.policy, partial(_build_cases, look, SELECTION), failure)
+    envs = partial(_build_cases, config, SELECTION, count=learner.anchor.cases)
+    return Brake(learner.anchor, learner.policy, envs, measures_of(config.evaluation.measures).get("crashed"))
 
 
-def _build_cases(config: DictConfig, cases: str, drivers: int) -> EnvBase:
-    return build.build_env(config, build.cases_node(config, cases, drivers))
+def _build_cases(config: DictConfig, cases: str, drivers: int, count: int | None = None) -> EnvBase:
+    return build.build_env(config, build.cases_node(config, cases, drivers, count))
 
 
 def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> EvaluationCurve | None:

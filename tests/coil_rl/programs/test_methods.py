@@ -28,6 +28,7 @@ SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.b
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
 REPLAY = ["learner.batch_size=8", "learner.ratio=1", "learner.starts=16", "learner.hidden=[8]", "learner.critics=3"]
 SMALL |= {
+    "coil_anchored": [*PPO, "learner.anchor.cases=4"],
     "cheq": REPLAY,
     "policy_decorator": REPLAY,
     "q_filter": REPLAY,

@@ -3,6 +3,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.testing import check_env, check_guide
@@ -13,6 +14,7 @@ from coil_rl.train.build import (
     build_guided_env,
     build_guides,
     build_learner,
+    cases_node,
     trains_guides,
 )
 from coil_rl.train.distillation import guides_with_untrained_proxies
@@ -106,3 +108,15 @@ def test_every_track_group_has_tracks(track):
         node = compose("train", [f"track={track}", "run_dir=unused"]).track
     fewest = 1 if track == "robot" else 3
     assert min(len(build(node.train, "track.train")), len(build(node.test, "track.test"))) >= fewest
+
+
+@pytest.mark.parametrize(
+    ("env", "key"), [("cone_track", "starts"), ("simulated_robot", "starts"), ("pendulum", "cases")]
+)
+def test_cases_of_several_drivers_are_the_same_ones(env, key):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        evaluation = compose("train", [f"env={env}", "run_dir=unused"]).evaluation
+    # In the file of a run all references are resolved.
+    stored = OmegaConf.create({"evaluation": OmegaConf.to_container(evaluation, resolve=True)})
+    node = cases_node(stored, "selection", drivers=2, count=3)
+    assert (node[key], node["num_envs"]) == (3, 6)
