@@ -19,13 +19,14 @@ SMALL = [*LAP, "budget.frames=2048", "budget.num_envs=8", "budget.steps=64", "ev
 RUNS = {
     "ppo": ["method=ppo"],
     "coil": ["method=coil"],
-    "dagger": ["method=dagger", "learner.validate=false"],
+    "dagger": ["method=dagger", "learner.regressor.estimator.n_estimators=20"],
     "dynamic_coil_sequential": [
         "method=dynamic_coil_sequential",
         "guide=[spline,undertuned]",
         "learner.phases.agent_phase.frames=512",
         "learner.phases.guide_phase.frames=512",
         "proxy.budget.frames=512",
+        "proxy.learner.regressor.epochs=5",
     ],
     "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],
 }
