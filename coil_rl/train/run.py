@@ -160,10 +160,10 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     if getattr(learner, "anchor", None) is None:
         return None
     if SELECTION not in config.evaluation.curve.cases:
-        needed = f"evaluation.curve.cases.{SELECTION}, cases in which the brake drives"
-        raise UserError(f"learner.anchor needs {needed}; give it")
-    envs = partial(_build_cases, config, SELECTION, count=learner.anchor.cases)
-    return Brake(learner.anchor, learner.policy, envs, measures_of(config.evaluation.measures).get("crashed"))
+        raise UserError(f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its drives; give it")
+    failure = measures_of(config.evaluation.measures).get("crashed")
+    count = learner.anchor.cases or (24 if failure is None else 96)
+    return Brake(learner.anchor, learner.policy, partial(_build_cases, config, SELECTION, count=count), failure)
 
 
 def _build_cases(config: DictConfig, cases: str, drivers: int, count: int | None = None) -> EnvBase:

@@ -10,23 +10,35 @@ from torchrl.envs import EnvBase
 from coil_rl.train.brake import Brake
 from coil_rl.train.build import build_env, build_learner, cases_node
 from coil_rl.train.measures import Measure
+from coil_rl.train.run import _probe
 
 pytest.importorskip("gymnasium.envs.classic_control")
 FAST = Measure("reward", "min", at_most=-10.0)  # true for an episode that was ever far from upright
 
 
+def configured(*overrides):
+    """Return the configuration of a run and its learner."""
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", ["method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides])
+    torch.manual_seed(0)
+    return config, build_learner(config, build_env(config))
+
+
 def built(*overrides, failure=None):
     """Return learner, brake, and a function that makes the env of the brake."""
-    arguments = ["env=pendulum", "method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides]
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", arguments)
-    torch.manual_seed(0)
-    learner = build_learner(config, build_env(config))
+    config, learner = configured("env=pendulum", *overrides)
 
     def build(policies: int) -> EnvBase:
         return build_env(config, cases_node(config, "selection", policies))
 
     return learner, Brake(learner.anchor, learner.policy, build, failure), partial(build, 1)
+
+
+@pytest.mark.parametrize(
+    ("override", "cases"), [("env=pendulum", 24), ("env=cone_track", 96), ("learner.anchor.cases=7", 7)]
+)
+def test_look_has_four_times_as_many_cases_where_failures_are_counted(override, cases):
+    assert _probe(*configured(override)).build(2).batch_size == (2 * cases,)
 
 
 @pytest.mark.parametrize("action", ["continuous", "choices"])
