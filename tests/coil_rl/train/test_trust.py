@@ -188,22 +188,28 @@ def test_file_that_no_run_writes_is_refused(text, message, tmp_path):
     assert str(tmp_path / "config.yaml") in str(error.value)
 
 
-GROUPS = ("env", "guide", "degrade", "learner", "logger", "method", "track", "action", "preset")
-MISSING = ["+env.recordings=[a.mcap]", "+track.dir=levels", "+guide.learned.run=other"]
+GROUPS = ("guide", "degrade", "learner", "logger", "method", "track", "action", "preset")  # of the cone world
+MISSING = ["+track.dir=levels", "+guide.learned.run=other"]
 MISSING += [
     "+guide.controller.of=coil_rl.guides:SplineGuide",
     "+guide.recorded.file=a.csv",
     "+guide.entry.key=steering",
 ]
+OF_ENV = {"gym": ["env.id=CartPole-v1"], "torchrl": ["env.of._target_=coil_rl.envs.ConeTrackEnv"]}
+
+
+def files(group):
+    return sorted(file.stem for file in (importlib.resources.files("coil_rl.conf") / group).glob("*.yaml"))
 
 
 @pytest.mark.slow
 def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(run_folder, "versions", dict)
-    conf = importlib.resources.files("coil_rl.conf")
-    choices = [[f"{group}={file.stem}" for file in sorted((conf / group).glob("*.yaml"))] for group in GROUPS]
-    for number, overrides in enumerate(zip_longest(*choices)):
-        composed(tmp_path / str(number), *filter(None, overrides), *MISSING)
+    columns = [[f"{group}={name}" for name in files(group)] for group in GROUPS]
+    choices = [[*filter(None, row), *MISSING] for row in zip_longest(*columns)]
+    choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in files("env")]
+    for number, overrides in enumerate(choices):
+        composed(tmp_path / str(number), *overrides)
         assert read_config(tmp_path / str(number), "run").label
 
 
