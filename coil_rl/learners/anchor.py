@@ -130,7 +130,7 @@ class Anchor(Stateful):
     )  # fmt: skip
 
     looks: int = 32  # number of looks over the run, besides the one before training
-    cases: int | None = None  # C, of a look; None for 96 where failures, which may be rare, are counted, 24 elsewhere
+    cases: int | None = None  # C, number of cases of a look; None: 96 where failures, often rare, are counted, else 24
     step: float = 0.05  # by which the weight falls at a look
     margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
     # Share of the guide's return that may be lost for a step; at least half a standard error of that return may be.
@@ -148,7 +148,8 @@ class Anchor(Stateful):
         check_range(self.step, 1, margin=self.margin)
         self.noise_at = schedule(self.noise)
         check_range(0, above=True, noise=self.noise_at(0))
-        self.holds, self.allowed, self.best = True, math.nan, torch.empty(0)  # `best`: returns of the best look, [C]
+        self.holds = True
+        self.allowed, self.best = math.nan, torch.empty(0)  # returns of the best look, [C]
         self.guide, self.guide_failures, self.sign, self.unit = 0, 0, 1, 1.0
         self.kept: dict[str, Tensor] = {}  # state of the policy at the best look
 

@@ -172,7 +172,7 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def cases_node(config: DictConfig, cases: str, drivers: int = 1, count: int | None = None) -> dict[str, Any]:
-    """Return the overrides of `env` for a set of cases of the evaluation curve, or for `count` of them, per driver."""
+    """Return the overrides of `env` in which each driver drives a set of cases; `count` replaces their number."""
     curve = config.evaluation.curve
     count = count or curve.num_envs
     return {**curve.env, curve.count_key: count, **curve.cases[cases], "num_envs": drivers * count}

@@ -67,7 +67,7 @@ class CurveConfig(NodeConfig):
     points: Annotated[int, Field(ge=1, le=1000)] = 16
     batches: Annotated[int, Field(ge=1, le=1000)] = 1
     num_envs: Envs = 1  # number of cases in a set
-    count_key: str = "num_envs"  # argument of the env that takes this number
+    count_key: str = "num_envs"  # argument of the env that takes this number, if it is another one
     env: dict[str, Any] = field(default_factory=dict)
     cases: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the name of a set
 
