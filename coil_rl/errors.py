@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from hydra.errors import MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationKeyError, OmegaConfBaseException
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 # Another kind of file than expected, or one that may not be used.
@@ -73,8 +73,11 @@ def _message(error: BaseException) -> str:
             return _unknown_key(key_error)
     if isinstance(error, MissingMandatoryValue) and error.full_key:
         return f"{error.full_key} must be given: write {error.full_key}=VALUE"
-    if isinstance(error, OmegaConfBaseException) and error.full_key:
-        return f"{error.full_key}: {_first_paragraph(error)}"
+    if isinstance(error, OmegaConfBaseException) and (key := error.full_key):
+        if isinstance(error, InterpolationKeyError):
+            missing, group = str(error).split("'")[1], key.partition(".")[0]
+            return f"{key} refers to {missing}, which does not exist; choose another {group}, or give {key}=VALUE"
+        return f"{key}: {_first_paragraph(error)}"
     if isinstance(cause, OmegaConfBaseException):
         return f"{_first_paragraph(error)}: {_first_paragraph(cause)}"
     return _first_paragraph(error)

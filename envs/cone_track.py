@@ -248,11 +248,8 @@ class ConeTrackEnv(SeededEnv):
 
         kept = ("track", "pose", "samples", "sampled", "latest")
         copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
-        copied |= {
-            "steps": steps,
-            "in_finish": start(self.start_in_finish),
-            "lap_start": steps + start(self.start_lap_start),
-        }
+        copied |= {"steps": steps, "in_finish": start(self.start_in_finish)}
+        copied["lap_start"] = steps + start(self.start_lap_start)
         for name, value in copied.items():
             setattr(self, name, getattr(self, name).index_copy(-1, cars, value))
         for name in ("history", "lap"):

@@ -38,8 +38,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
             raise UserError(f"{name}: {textwrap.shorten(str(message), 500, placeholder=' ...')}") from error
         if isinstance(cause, ImportError):
-            extra = "python -m pip install 'coil-rl[gym]' installs Gymnasium"
-            raise UserError(f"{name}: {node['_target_']} needs a package that is missing ({cause}); {extra}") from error
+            raise UserError(f"{name}: {node['_target_']} needs a package ({cause}); install it") from error
         if cause is None:  # Hydra itself refuses to call the target
             raise UserError(f"{name}: {error}") from error
         if isinstance(cause, MemoryError) or "allocate" in str(cause):

@@ -39,6 +39,8 @@ INDEX = {re.search(r"`(\w+)`", name)[1]: cells for name, *cells in table(FOLDER 
 def composed(command):
     """Return the configuration of a command, after a comparison of its method, if it has one, with the index."""
     program, *overrides = command
+    if "-m" in overrides:  # the first run of the sweep
+        overrides = [override.partition(",")[0] for override in overrides if override != "-m"]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose(program.removeprefix("coil-"), overrides)
     if "method" in config:

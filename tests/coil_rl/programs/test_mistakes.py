@@ -154,7 +154,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
         ("=3", "'=3' has no key, write KEY=VALUE"),
         ("seed=1,2", "Ambiguous value for argument 'seed=1,2'"),
-        ("env.rate=${nope}", "env.rate: Interpolation key 'nope' not found"),
+        ("env.rate=${nope}", "env.rate refers to nope, which does not exist; choose another env, or give env.rate="),
         ("--nope", "unrecognized arguments: --nope"),
         ("--config-dir=nope", "nope' not found"),
         # folders
@@ -261,18 +261,16 @@ def test_override_without_effect_or_out_of_range_is_refused(started, name, argum
     assert message in refusal(name, arguments)
 
 
-@pytest.mark.slow
-def test_missing_extra_is_named(tmp_path):
-    (tmp_path / "conf" / "env").mkdir(parents=True)
-    (tmp_path / "conf" / "env" / "theirs.yaml").write_text("_target_: torchrl.envs.GymEnv\nenv_name: Pendulum-v1\n")
-    without = (
-        "import sys; sys.modules |= {'gym': None, 'gymnasium': None}; from coil_rl.programs.train import main; main()"
-    )
-    command = [sys.executable, "-c", without, "--config-dir=conf", "env=theirs"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment(tmp_path), capture_output=True, text=True, check=False)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
-    assert line.endswith("python -m pip install 'coil-rl[gym]' installs Gymnasium")
+def test_missing_extra_is_named(monkeypatch):
+    pytest.importorskip("Box2D")
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    monkeypatch.delitem(sys.modules, "gymnasium.envs.box2d", raising=False)
+    assert refusal("train", "env=lunar_lander").endswith("is not installed: python -m pip install 'coil-rl[gym]'")
+
+
+def test_env_with_the_guide_of_another_one_is_refused():
+    message = "guide.spline.spline refers to preset.spline, which does not exist; choose another guide, or give"
+    assert message in refusal("train", "env=mountain_car", "guide=spline")
 
 
 # The first is imported before the program begins, the second by its check of the configuration.

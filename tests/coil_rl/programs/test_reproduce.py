@@ -5,7 +5,7 @@ import pytest
 from drives import drive as circle
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
-from programs import TRACK, called, program
+from programs import ROOT, TRACK, called, program
 from run_folders import driven, make_run
 
 from coil_rl.programs import sweeps
@@ -153,17 +153,18 @@ def test_every_budget_fits_every_experiment(budget):
             sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
             for name in experiments
         ]
-    folders = [folder for plan in plans for folder in plan.all_folders]
-    assert len(experiments) == 7
+    assert experiments == {path.stem for path in (ROOT / "conf" / "experiment").glob("paper*.yaml")}
     assert set(chosen.only) <= experiments
-    assert len(folders) == len(set(folders)) == 15 * chosen.seeds
+    for plan in plans:
+        assert len(set(plan.all_folders)) == len(plan.all_folders) >= chosen.seeds
 
 
 @pytest.mark.slow
 def test_a_figure_trains_its_runs_and_a_lost_run_again():
     choices = ["experiments=[paper]", "labels=[coil,ppo]"]
     tiny = [*TRACK, "budget.frames=512", "budget.num_envs=8"]
-    arguments = ["figure=22", "budget=smoke", *(f"results.figure_22.{choice}" for choice in choices), f"train={tiny}"]
+    arguments = ["figure=22", "budget=smoke", "~results.figure_22.worlds", f"train={tiny}"]
+    arguments += [f"results.figure_22.{choice}" for choice in choices]
     program("reproduce", *arguments, cwd=Path())
     pages = [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")]
     evaluated = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
