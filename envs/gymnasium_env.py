@@ -125,7 +125,7 @@ class GymnasiumEnv(SeededRows):
         """Return a picture of row 0, [height, width, 3]; None if there are none."""
         try:
             return self.rows[0].env.render() if self.shown else None
-        except errors.DependencyNotInstalled as error:
+        except Exception as error:  # a missing package or display; each library raises its own
             self.shown = False
             warnings.warn(f"no pictures of the env: {error}", stacklevel=2)
             return None

@@ -310,6 +310,18 @@ def test_pictures_show_the_first_row():
     assert [row.env.render_mode for row in env.rows] == ["rgb_array", None, None]
 
 
+def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
+    def fail(self):
+        raise RuntimeError("no display")
+
+    monkeypatch.setattr(Echo, "render", fail)
+    env = build("Echo-v0", render=True)
+    drive(env, 1)
+    with pytest.warns(UserWarning, match="no pictures of the env: no display"):
+        assert env.render() is None
+    assert env.render() is None
+
+
 @pytest.mark.parametrize(
     ("id", "arguments", "message"),
     [
