@@ -17,7 +17,8 @@ METHODS = sorted(file.stem for file in (ROOT / "conf" / "method").glob("*.yaml")
 
 
 def commands(page):
-    lines = re.findall(r"^ *(coil-\w+ .*)$|`(coil-\w+ [^`]+)`", page.read_text(), flags=re.MULTILINE)
+    text = page.read_text().replace("\\\n", "")  # a command of several lines
+    lines = re.findall(r"^ *(coil-\w+ .*)$|`(coil-\w+ [^`]+)`", text, flags=re.MULTILINE)
     return [shlex.split(block or inline, comments=True) for block, inline in lines]
 
 
