@@ -17,15 +17,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
-from coil_rl.envs.reward import (
-    HISTORY,
-    REWARD_TERMS,
-    Outcome,
-    RewardWeights,
-    check_weights,
-    recent_mean,
-    weighted_terms,
-)
+from coil_rl.envs.reward import HISTORY, TERMS, Outcome, RewardWeights, check_weights, recent_mean, weighted_terms
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, encode_samples, view
 from coil_rl.envs.sorting import append, first_come, rows_in_use
 from coil_rl.envs.splines import spline_fit
@@ -39,6 +31,12 @@ class SeededEnv(EnvBase):
     """Env that draws all random numbers from `generator`, whose state is part of `state_dict`."""
 
     generator: torch.Generator
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name in (buffers := self.__dict__.get("_buffers", {})):  # PyTorch's checks take longer than an operation
+            buffers[name] = value
+        else:
+            super().__setattr__(name, value)
 
     def get_extra_state(self) -> Tensor:
         """Return the state of the generator."""
@@ -104,7 +102,7 @@ class ConeTrackEnv(SeededEnv):
         torch.Size([8, 3, 20])
     """
 
-    reward_terms: ClassVar[tuple[str, ...]] = REWARD_TERMS
+    reward_terms: ClassVar[tuple[str, ...]] = TERMS
 
     def __init__(
         self,

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torchrl.data import Binary, Composite, OneHot
 
 from coil_rl.envs.cone_track import ConeTrackEnv
-from coil_rl.envs.reward import REWARD_TERMS, Outcome, RewardWeights, check_weights, weighted_terms
+from coil_rl.envs.reward import TERMS, Outcome, RewardWeights, check_weights, weighted_terms
 from coil_rl.envs.track import Track
 
 
@@ -51,7 +51,7 @@ class DrivingTasksEnv(ConeTrackEnv):
         torch.Size([8, 3, 3])
     """
 
-    reward_terms: ClassVar[tuple[str, ...]] = (*REWARD_TERMS, *PositionWeights._fields)
+    reward_terms: ClassVar[tuple[str, ...]] = (*TERMS, *PositionWeights._fields)
 
     def __init__(
         self,

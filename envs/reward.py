@@ -11,7 +11,7 @@ from torch import Tensor
 from coil_rl.envs.constants import constant
 
 HISTORY = 20
-REWARD_TERMS = ("finish", "crash", "cone", "smooth", "alive")
+TERMS = ("finish", "crash", "cone", "smooth", "alive")
 
 
 class RewardWeights(NamedTuple):

@@ -125,9 +125,7 @@ class Anchor(Stateful):
             1 without an anchor. A critic starts near 0, and would follow returns of hundreds for most of the run.
     """
 
-    parts: ClassVar[tuple[str, ...]] = (
-        "holds", "guide", "sign", "unit", "guide_failures", "allowed", "best", "kept",
-    )  # fmt: skip
+    parts: ClassVar[tuple[str, ...]] = ("holds", "guide", "sign", "unit", "guide_failures", "allowed", "best", "kept")
 
     looks: int = 32  # number of looks over the run, besides the one before training
     cases: int | None = None  # C, number of cases of a look; None: 96 where failures, often rare, are counted, else 24

@@ -17,15 +17,7 @@ from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
-from coil_rl.envs.reward import (
-    HISTORY,
-    REWARD_TERMS,
-    Outcome,
-    RewardWeights,
-    check_weights,
-    recent_mean,
-    weighted_terms,
-)
+from coil_rl.envs.reward import HISTORY, TERMS, Outcome, RewardWeights, check_weights, recent_mean, weighted_terms
 from coil_rl.envs.robot.course import RobotCourse, robot_track
 from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
 from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs, simulated_cone_classifier
@@ -142,7 +134,7 @@ class SimulatedRobotEnv(SeededEnv):
         # Robots that are not reset perceive their last scan again, which does not change their memory.
         view = self._perceive()
         zero = torch.zeros(self.batch_size)
-        terms = dict.fromkeys(REWARD_TERMS, zero)
+        terms = dict.fromkeys(TERMS, zero)
         flags = {"crashed": zero.bool(), "completed": zero.bool()}
         return self._tensordict(view, terms, lap_time=zero, **flags, clearance=zero, smoothness=zero)
 

@@ -12,7 +12,7 @@ from worlds import driving_measures
 
 from coil_rl.compiled import Compiled
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
-from coil_rl.envs.reward import REWARD_TERMS
+from coil_rl.envs.reward import TERMS
 from coil_rl.guides.spline import SplineGuide
 from coil_rl.testing import check_env
 from coil_rl.train.evaluation import evaluate_policy
@@ -210,7 +210,7 @@ def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
         emitted, state = advance(env, state, guide(state)["action"] + 0.2 * action)
         terms, alive = emitted["info", "reward"], ~emitted["info", "crashed"]
         lap_time = emitted["info", "lap_time"]
-        assert torch.allclose(emitted["reward"], sum(terms[term] for term in REWARD_TERMS), rtol=0, atol=1e-6)
+        assert torch.allclose(emitted["reward"], sum(terms[term] for term in TERMS), rtol=0, atol=1e-6)
         assert torch.allclose(terms["smooth"], -7 * emitted["info", "smoothness"] * alive, rtol=0, atol=1e-6)
         assert torch.allclose(terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * alive, rtol=0, atol=1e-5)
         assert torch.equal(terms["alive"], 0.25 * alive)

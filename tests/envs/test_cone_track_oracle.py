@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from oracle import OneCar, Outcome, guide_action, midpoints
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
-from coil_rl.envs.reward import REWARD_TERMS
+from coil_rl.envs.reward import TERMS
 from coil_rl.guides.spline import SplineGuide
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ def drive(
             row = {"advice": advice, "action": state["action"]}
             row |= {key: after[key] for key in ("observation", "steering", "reward", "terminated", "truncated")}
             row |= {key: after["info", key] for key in ("lap", "lap_time", "crashed", "clearance", "smoothness")}
-            row |= {key: after["info", "reward", key] for key in REWARD_TERMS}
+            row |= {key: after["info", "reward", key] for key in TERMS}
             rows.append({key: value.numpy().copy() for key, value in row.items()})
             state = env.step_mdp(state)
     return {key: np.stack([row[key] for row in rows]) for key in rows[0]}
@@ -101,7 +101,7 @@ def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> O
     expected = {
         key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in Outcome._fields if key != "terms"
     }
-    expected |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in REWARD_TERMS}
+    expected |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in TERMS}
     expected["reward"] = np.array([outcome.reward for outcome in outcomes])
 
     # Within the error of the distance field, a car may crash in one of the two only; later steps are not compared.
@@ -117,7 +117,7 @@ def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> O
     tolerance = np.where(np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE)[:together]
     difference = np.abs(ours["advice"] - np.array(advice)[:together])
     assert (difference <= tolerance).all(), f"advice differs by {difference.max()} at step {difference.argmax()}"
-    for key in ("observation", "reward", "lap_time", "smoothness", *REWARD_TERMS):
+    for key in ("observation", "reward", "lap_time", "smoothness", *TERMS):
         np.testing.assert_allclose(ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}")
     for key in ("lap", "crashed", "terminated", "truncated"):
         np.testing.assert_array_equal(ours[key], expected[key], err_msg=f"{key}, track {track.name}")
