@@ -74,8 +74,10 @@ class CurveConfig(NodeConfig):
 
 @dataclass
 class TrainingConfig(NodeConfig):
-    """Overrides of `env` in training, and `imitation_env` for methods that imitate a guide."""
+    """Values of learners that suit an env, its overrides in training, and those for methods that imitate a guide."""
 
+    learning_rate: float = 1e-3  # of PPO, at the start of a run
+    anchored: dict[str, Any] = field(default_factory=dict)  # the same, cases and margin of the looks, of anchored COIL
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
 

@@ -35,10 +35,11 @@ def built(*overrides, failure=None):
 
 
 @pytest.mark.parametrize(
-    ("override", "cases"), [("env=pendulum", 24), ("env=cone_track", 96), ("learner.anchor.cases=7", 7)]
+    ("overrides", "cases"),
+    [("env=pendulum", 24), ("env=cone_track preset=paper", 96), ("env=cone_track", 224), ("learner.anchor.cases=7", 7)],
 )
-def test_look_has_four_times_as_many_cases_where_failures_are_counted(override, cases):
-    assert _probe(*configured(override)).build(2).batch_size == (2 * cases,)
+def test_look_has_more_cases_where_failures_are_counted(overrides, cases):
+    assert _probe(*configured(*overrides.split())).build(2).batch_size == (2 * cases,)
 
 
 @pytest.mark.parametrize("action", ["continuous", "choices"])

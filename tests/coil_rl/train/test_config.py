@@ -27,6 +27,22 @@ def test_label_is_the_method_and_an_unusual_learner(overrides, label):
     assert composed(*overrides.split(), "run_dir=unused").label == label
 
 
+@pytest.mark.parametrize(
+    ("overrides", "values"),
+    [
+        ("preset=default", (3e-3, 224, 0.15)),
+        ("preset=paper", (1e-3, None, 0.3)),
+        ("preset=authors", (1e-3, None, 0.1)),
+        ("env=lunar_lander", (1e-3, None, 0.3)),
+        ("env=lunar_lander training.learning_rate=0.1 training.anchored.margin=0.2", (0.1, None, 0.2)),
+    ],
+)
+def test_learning_rate_and_looks_of_anchored_coil_are_those_of_the_world(overrides, values):
+    learner = composed("method=coil_anchored", *overrides.split(), "run_dir=unused").learner
+    assert (learner.learning_rate.start, learner.anchor.cases, learner.anchor.margin) == values
+    assert composed("method=coil", "run_dir=unused").learner.learning_rate.start == 1e-3
+
+
 def test_fingerprint_depends_on_everything_that_changes_the_numbers():
     one = fingerprint(composed())
     assert one == fingerprint(composed("run_dir=elsewhere", "logger=none", "existing=resume"))
