@@ -53,6 +53,7 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
             report_changed_versions(folder)
         agent = None if config.method.observes is None else _train(config, folder, resumed)
         evaluate_run(config, agent, folder, config.seed, build_fallback(config, folder, agent))
+        return report_outcome(folder)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"continue with: coil-train resume={folder}") from None
     except OSError as error:
@@ -60,7 +61,6 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
             raise
         problem = f"{error.filename or folder} cannot be written ({error.strerror})"
         raise UserError(f"{problem}; make room, and continue with coil-train resume={folder}") from error
-    return report_outcome(folder)
 
 
 def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:

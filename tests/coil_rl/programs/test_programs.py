@@ -1,4 +1,5 @@
 import json
+import signal
 import subprocess
 import time
 
@@ -61,10 +62,12 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
     first = subprocess.Popen(train, cwd=tmp_path, env=environment(tmp_path), **pipes)
     while first.poll() is None and not (tmp_path / "run" / "policy_best.pt").exists():
         time.sleep(0.01)
+    first.send_signal(signal.SIGSTOP)  # its evaluation may take less time than the start of another process
     second = called("train", "resume=run", cwd=tmp_path, code=2)
     (sentence,) = second.stderr.splitlines()
     assert sentence == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
     first.terminate()
+    first.send_signal(signal.SIGCONT)
     _, stderr = first.communicate(timeout=60)
     assert first.returncode == 130
     assert stderr.splitlines()[-1] == f"train: interrupted; continue with: coil-train resume={tmp_path / 'run'}"
