@@ -74,10 +74,10 @@ class CurveConfig(NodeConfig):
 
 @dataclass
 class TrainingConfig(NodeConfig):
-    """Values of learners that suit an env, its overrides in training, and those for methods that imitate a guide."""
+    """Learner settings of an env, and its overrides in training; `imitation_env` is for methods that imitate guides."""
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
-    anchored: dict[str, Any] = field(default_factory=dict)  # the same, cases and margin of the looks, of anchored COIL
+    anchored: dict[str, Any] = field(default_factory=dict)  # `learning_rate`, `cases`, `margin` of anchored COIL
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
 

@@ -40,6 +40,9 @@ def test_label_is_the_method_and_an_unusual_learner(overrides, label):
 def test_learning_rate_and_looks_of_anchored_coil_are_those_of_the_world(overrides, values):
     learner = composed("method=coil_anchored", *overrides.split(), "run_dir=unused").learner
     assert (learner.learning_rate.start, learner.anchor.cases, learner.anchor.margin) == values
+
+
+def test_learning_rate_of_anchored_coil_is_not_that_of_coil():
     assert composed("method=coil", "run_dir=unused").learner.learning_rate.start == 1e-3
 
 
