@@ -14,7 +14,6 @@ from coil_rl.learners.encoders import Mlp as Mlp
 from coil_rl.learners.ibrl import IBRL as IBRL
 from coil_rl.learners.kickstart import FilteredKickstartLoss as FilteredKickstartLoss
 from coil_rl.learners.kickstart import KickstartLoss as KickstartLoss
-from coil_rl.learners.noise import NoiseDecay as NoiseDecay
 from coil_rl.learners.ppo import PPO as PPO
 from coil_rl.learners.reinforce import Reinforce as Reinforce
 from coil_rl.learners.sac import SAC as SAC

@@ -18,21 +18,15 @@ from torch.distributions import Categorical as CategoricalDistribution
 from torch.distributions import Independent
 from torchrl.data import Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.modules import (
-    GRUModule,
-    IndependentNormal,
-    OneHotCategorical,
-    ProbabilisticActor,
-    SafeProbabilisticModule,
-    TanhNormal,
-)
+from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl.modules import GRUModule, IndependentNormal, OneHotCategorical, SafeProbabilisticModule, TanhNormal
 
 from coil_rl.learners.anchor import Anchor, AnchoredHead, pull_to_choice, pull_to_number
 from coil_rl.learners.encoders import STATE, ConcatObservations, Gru, Mlp, ObservationNetwork, Shapes, entry_specs
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.transforms.action_space import choices_of
 
-UNCLIPPED, REMEMBERED = "unclipped_action", "remembered"
+UNCLIPPED, REMEMBERED, NOISE = "unclipped_action", "remembered", "exploration_noise"
 DEFAULT = Mlp()
 
 
@@ -121,17 +115,38 @@ class FastTensorDictModule(TensorDictModuleBase):
         return tensordict
 
 
-class ClippedNormal(SafeProbabilisticModule):
+class Sample(SafeProbabilisticModule):
+    """Sample of a distribution, with its logarithmic probability as `action_log_prob`.
+
+    If there is `exploration_noise`, standard normal numbers, and actions are explored, a normal sample is made of it.
+    """
+
+    def __init__(self, parameters: Sequence[str], key: NestedKey, distribution: type, **options: Any) -> None:
+        super().__init__(
+            list(parameters), [key], distribution_class=distribution, distribution_kwargs=options,
+            return_log_prob=True, log_prob_key="action_log_prob",
+        )  # fmt: skip
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
+        """Write the sample."""
+        noise = tensordict.get(NOISE, None)
+        if noise is None or exploration_type() is not ExplorationType.RANDOM:
+            return super().forward(tensordict, *args, **options)
+        distribution = self.get_dist(tensordict)
+        sample = tensordict["loc"] + tensordict["scale"] * noise
+        for transform in getattr(distribution, "transforms", ()):
+            sample = transform(sample)
+        return tensordict.set(self.out_keys[0], sample).set("action_log_prob", distribution.log_prob(sample))
+
+
+class ClippedNormal(Sample):
     """Sample of a normal distribution, clipped to the bounds of an action.
 
     It writes `unclipped_action`, the sample, with `action_log_prob`, and the action, which the env executes.
     """
 
     def __init__(self, low: Tensor, high: Tensor, action_key: NestedKey = "action") -> None:
-        super().__init__(
-            ["loc", "scale"], [UNCLIPPED], distribution_class=IndependentNormal,
-            distribution_kwargs={"event_dim": low.ndim}, return_log_prob=True, log_prob_key="action_log_prob",
-        )  # fmt: skip
+        super().__init__(["loc", "scale"], UNCLIPPED, IndependentNormal, event_dim=low.ndim)
         self.low, self.high, self.action_key = low, high, action_key
 
     @property
@@ -208,11 +223,8 @@ def actor(
         return head if anchor is None else anchor.attach(AnchoredHead(head, pull, advice.shape[-2], env.device))
 
     def policy(head: nn.Module, parameters: list[str], distribution: type, **options: Any) -> Any:
-        actions = ProbabilisticActor(
-            FastTensorDictModule(head, keys, parameters), parameters, [key], spec=spec, distribution_class=distribution,
-            distribution_kwargs=options, return_log_prob=True, log_prob_key="action_log_prob",
-        )  # fmt: skip
-        return ProbabilisticTensorDictSequential(*before, *actions.module) if before else actions
+        module = FastTensorDictModule(head, keys, parameters)
+        return ProbabilisticTensorDictSequential(*before, module, Sample(parameters, key, distribution, **options))
 
     if isinstance(spec, OneHot) or (isinstance(spec, Categorical) and not event):
         distribution = CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical

@@ -27,7 +27,6 @@ from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.noise import NoiseDecay
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -66,7 +65,6 @@ class PPO(Stateful):
         critic: coefficient of the critic's loss.
         max_grad_norm: gradients are scaled down to this norm.
         compile: whether to compile the update, see `GradientStep`.
-        noise: schedule of the standard deviation of the policy.
         anchor: makes the policy start as its guide.
         auxiliary: additional losses of the policy.
         seed: of the order of minibatches.
@@ -90,7 +88,7 @@ class PPO(Stateful):
     kind: ClassVar[str] = "agent"
     with_memory: ClassVar[bool] = True  # whether the learner can train a network with a memory
     compilable: ClassVar[bool] = True  # whether the update can be compiled
-    parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "generator", "noise", "anchor")
+    parts: ClassVar[tuple[str, ...]] = ("policy", "critic", "gradient", "generator", "anchor")
 
     def __init__(
         self,
@@ -113,7 +111,6 @@ class PPO(Stateful):
         critic: float = 0.5,
         max_grad_norm: float = 0.5,
         compile: bool | Literal["auto"] = "auto",
-        noise: NoiseDecay | None = None,
         anchor: Anchor | None = None,
         auxiliary: Sequence[KickstartLoss] = (),
         seed: int = 0,
@@ -124,10 +121,8 @@ class PPO(Stateful):
         check_range(0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm)
         check_range(1, epochs=epochs, minibatches=minibatches)
         check_range(0, LARGEST_SEED, seed=seed)
-        if noise and anchor:
-            raise ValueError("an anchor has its own schedule of the noise; leave out noise, or the anchor")
         self.epochs, self.minibatches = epochs, minibatches
-        self.auxiliary, self.noise, self.anchor = list(auxiliary), noise, anchor
+        self.auxiliary, self.anchor = list(auxiliary), anchor
         in_keys = [nested_key(key) for key in in_keys]
         network = network or Mlp(hidden)
         if not self.with_memory:
@@ -137,8 +132,6 @@ class PPO(Stateful):
             env, in_keys, network, scale=action_scale, gain=action_gain, squash=squash, anchor=anchor
         )
         self.memory, self.head = networks.split_memory(self.policy)
-        if noise:
-            noise.attach(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss = self.build_loss(
             clip, entropy_bonus=self.entropy(0) > 0, entropy_coeff=self.entropy(0), critic_coeff=critic,
@@ -159,7 +152,6 @@ class PPO(Stateful):
         valued = dict.fromkeys([*in_keys, *self.critic.in_keys])
         after = [unravel_key(("next", key)) for key in (*valued, "done", "terminated")]
         self.keys: list[NestedKey] = [*read, *after, self.reward_key]
-        self.keys += [noise.key] if noise else []
         self.minibatch_keys = [*read, "advantage", "value_target"]
 
     def build_networks(
@@ -217,16 +209,14 @@ class PPO(Stateful):
         return self.anchor is not None and self.anchor.waits(progress)
 
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Do what follows an update: learn the statistics of the observations, and apply the noise schedule, if any.
+        """Do what follows an update: learn the statistics of the observations, and set the noise of an anchored policy.
 
-        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones. With
-        a schedule the result is the metric `noise`, the policy's standard deviation.
+        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones. The
+        result are the metrics of the anchor, if there is one.
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)
-        if self.anchor is not None:
-            return self.anchor.set_noise(progress)
-        return {"noise": self.noise.apply(batch, progress)} if self.noise else {}
+        return {} if self.anchor is None else self.anchor.set_noise(progress)
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
         """Apply the schedules and compute advantages; returns the rows to learn from, [B * T], with a memory [B, T]."""

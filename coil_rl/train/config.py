@@ -77,7 +77,8 @@ class TrainingConfig(NodeConfig):
     """Learner settings of an env, and its overrides in training; `imitation_env` is for methods that imitate guides."""
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
-    anchored: dict[str, Any] = field(default_factory=dict)  # `learning_rate`, `cases`, `margin` of anchored COIL
+    noise_correlation: Annotated[float, Field(ge=0, le=1)] = 0.0  # of the noise of continuous actions, see `Rollout`
+    anchored: dict[str, Any] = field(default_factory=dict)  # of anchored COIL, see its file in conf/method
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
 

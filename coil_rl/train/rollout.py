@@ -12,7 +12,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
+from coil_rl.learners.networks import NOISE
 from coil_rl.transforms.guide_transform import set_progress
 
 
@@ -24,6 +26,8 @@ class Rollout:
         policy: writes the action; actions are sampled.
         steps: T, length of a batch.
         keys: entries to keep, those after a step as `("next", ...)`; all by default.
+        noise_correlation: of the noise of continuous actions in consecutive steps, at most 1. Each action alone has the
+            distribution that the policy gives. Korenkevych et al. 2019; Hollenstein et al. 2024 (for PPO).
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -33,11 +37,21 @@ class Rollout:
     """
 
     def __init__(
-        self, env: EnvBase, policy: TensorDictModuleBase, steps: int, keys: Sequence[NestedKey] | None = None
+        self,
+        env: EnvBase,
+        policy: TensorDictModuleBase,
+        steps: int,
+        keys: Sequence[NestedKey] | None = None,
+        noise_correlation: float = 0.0,
     ) -> None:
+        check_range(0, 1, noise_correlation=noise_correlation)
         self.env, self.policy, self.steps = env.train(), policy, steps
         self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
+        spec = env.full_action_spec[env.action_key] if noise_correlation else None
+        self.noise_spec = spec if spec is not None and spec.dtype.is_floating_point else None
+        self.noise_correlation = noise_correlation
+        self.noise: Tensor | None = None  # of the last actions
         self.carrier: TensorDictBase | None = None
         self.taken = 0  # steps of each row
 
@@ -58,7 +72,7 @@ class Rollout:
         try:
             with set_exploration_type(ExplorationType.RANDOM):
                 for _ in range(self.steps):
-                    acting = self.policy(carrier)
+                    acting = self.policy(self._explored(carrier))
                     step, carrier = self.env.step_and_maybe_reset(acting)
                     for key in self.keys or step.keys(True, True):
                         columns.setdefault(key, []).append(step[key])
@@ -72,6 +86,14 @@ class Rollout:
         self.carrier = carrier
         self.taken += self.steps
         return batch
+
+    def _explored(self, carrier: TensorDictBase) -> TensorDictBase:
+        """Write the noise of the next actions, drawn from that of the actions before."""
+        if (spec := self.noise_spec) is None:
+            return carrier
+        share, fresh = self.noise_correlation, torch.randn(spec.shape, dtype=spec.dtype, device=spec.device)
+        self.noise = fresh if self.noise is None else share * self.noise + (1 - share**2) ** 0.5 * fresh
+        return carrier.set(NOISE, self.noise)
 
     def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
         time = len(self.env.batch_size)
@@ -87,6 +109,7 @@ class Rollout:
             "env": self.base_env.state_dict(),
             "transforms": self.env.state_dict() if self.base_env is not self.env else {},
             "carrier": None if self.carrier is None else self.carrier.to_dict(),
+            "noise": self.noise,
             "taken": self.taken,
         }
 
@@ -103,7 +126,7 @@ class Rollout:
             warnings.warn(f"{name} does not save its state, so new episodes begin", stacklevel=2)
         if carrier is not None and continues:
             self.carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
-        self.taken = state["taken"]
+        self.noise, self.taken = state["noise"], state["taken"]
 
 
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:

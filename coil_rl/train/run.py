@@ -76,7 +76,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(
         learner,
-        Rollout(env, learner.policy, config.budget.steps, keys),
+        Rollout(env, learner.policy, config.budget.steps, keys, config.training.noise_correlation),
         config.budget.frames,
         folder,
         logger=build.build(config.logger, "logger") if config.logger else None,

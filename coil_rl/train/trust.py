@@ -160,7 +160,7 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
 @cache
 def _shipped_targets() -> frozenset[str]:
     conf = resources.files("coil_rl.conf")
-    names = [*(field.name for field in fields(TrainConfig)), "cases", "network", "noise"]
+    names = [*(field.name for field in fields(TrainConfig)), "cases", "network"]
     groups = [group for name in names if (group := conf / name).is_dir()]
     texts = [file.read_text(encoding="utf-8") for group in groups for file in group.iterdir() if ".yaml" in file.name]
     return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))

@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, Unbound
 from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, NoiseDecay, Reinforce
+from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
 from coil_rl.learners.anchor import Look
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -304,11 +304,9 @@ def test_state_brings_back_the_weight_and_the_brake():
     assert second.anchor.weight == pytest.approx(0.8), "the policy of the best look is in the state"
 
 
-def test_anchor_without_advice_with_a_second_schedule_or_out_of_range_is_refused():
+def test_anchor_without_advice_or_out_of_range_is_refused():
     with pytest.raises(KeyError, match="the env has no entry guide_action to observe"):
         PPO(AnyEnv(), anchor=Anchor())
-    with pytest.raises(ValueError, match="an anchor has its own schedule of the noise; leave out noise, or the anchor"):
-        PPO(AnyEnv(), anchor=Anchor(), noise=NoiseDecay())
     with pytest.raises(ValueError, match=r"margin=0\.01 must be at least 0\.05"):
         Anchor(margin=0.01)
     assert math.isnan(Anchor().allowed)

@@ -46,6 +46,23 @@ def test_learning_rate_of_anchored_coil_is_not_that_of_coil():
     assert composed("method=coil", "run_dir=unused").learner.learning_rate.start == 1e-3
 
 
+@pytest.mark.parametrize(
+    ("overrides", "correlation"),
+    [
+        ("method=coil", 0.7),
+        ("method=coil_anchored", 0.0),
+        ("method=coil preset=paper", 0.0),
+        ("method=coil preset=authors", 0.0),
+        ("method=coil_anchored preset=authors", 0.0),
+        ("method=coil_anchored preset=authors training.noise_correlation=0.5", 0.5),
+        ("method=ppo env=driving_tasks", 0.0),
+        ("method=ppo env=lunar_lander", 0.0),
+    ],
+)
+def test_correlation_of_the_noise_is_that_of_the_world(overrides, correlation):
+    assert composed(*overrides.split(), "run_dir=unused").training.noise_correlation == correlation
+
+
 def test_fingerprint_depends_on_everything_that_changes_the_numbers():
     one = fingerprint(composed())
     assert one == fingerprint(composed("run_dir=elsewhere", "logger=none", "existing=resume"))

@@ -1,11 +1,13 @@
 import pytest
 import torch
+import worlds
 from tensordict import TensorDict
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
+from coil_rl.learners import PPO
 from coil_rl.train.rollout import Rollout, check_batch
 from coil_rl.transforms import GuideActions
 
@@ -50,6 +52,54 @@ def test_restored_rollout_gives_the_same_batches():
     batches = [(first.collect(), second.collect()) for _ in range(10)]
     assert all((one == other).all() for one, other in batches)
     assert any(one["next", "done"].any() for one, _ in batches)
+
+
+def learning(env, correlation, squash=True, observed="observation"):
+    ppo = PPO(env, [observed], squash=squash)
+    keys = [*ppo.keys, "loc", "scale", "action"]
+    return ppo, Rollout(env, ppo.policy, 50, keys, noise_correlation=correlation)
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.8])
+@pytest.mark.parametrize("squash", [True, False])
+def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_policys_distribution(correlation, squash):
+    torch.manual_seed(0)
+    ppo, rollout = learning(worlds.cones(cars=150), correlation, squash)
+    batch = torch.cat([rollout.collect(), rollout.collect()], 1)
+    assert batch["next", "done"].any()
+    sample = batch["action"].atanh() if squash else batch["unclipped_action"]
+    noise = ((sample - batch["loc"]) / batch["scale"]).squeeze(-1)
+    assert float(noise.mean()) == pytest.approx(0.0, abs=0.05)
+    assert float(noise.std()) == pytest.approx(1.0, abs=0.04)
+    for lag in (1, 2, 5):
+        assert float((noise[:, lag:] * noise[:, :-lag]).mean()) == pytest.approx(correlation**lag, abs=0.06)
+    assert float((noise[:, 50] * noise[:, 49]).mean()) == pytest.approx(correlation, abs=0.25)
+    with torch.no_grad():
+        density = ppo.policy.get_dist(batch).log_prob(batch["action" if squash else "unclipped_action"])
+    torch.testing.assert_close(batch["action_log_prob"], density)
+
+
+def test_correlated_noise_goes_on_after_a_restored_state():
+    env, other = worlds.cones(), worlds.cones()
+    (ppo, first), (_, second) = learning(env, 0.9), learning(other, 0.9)
+    second.policy.load_state_dict(ppo.policy.state_dict())
+    first.collect()
+    second.load_state_dict(first.state_dict())
+    batches = []
+    for rollout in (first, second):
+        torch.manual_seed(1)
+        batches.append(rollout.collect())
+    assert (batches[0] == batches[1]).all()
+
+
+def test_noise_fits_envs_without_a_batch_and_does_not_concern_discrete_actions():
+    torch.manual_seed(0)
+    _, rollout = learning(worlds.pendulum(), 1.0, observed="th")
+    batch = rollout.collect()
+    noise = ((batch["action"] / 2).atanh() - batch["loc"]) / batch["scale"]
+    torch.testing.assert_close(noise, noise[:1].expand_as(noise), rtol=0, atol=1e-4)
+    env = worlds.carts()
+    assert "exploration_noise" not in Rollout(env, PPO(env).policy, 3, noise_correlation=0.9).collect()
 
 
 def zeros():
