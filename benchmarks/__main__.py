@@ -17,7 +17,14 @@ from hydra.errors import HydraException
 from tabulate import tabulate
 from tqdm import tqdm
 
-from benchmarks.driving import measure_compiled, measure_driving, measure_robot, profile_operators, train_config
+from benchmarks.driving import (
+    measure_compiled,
+    measure_cores,
+    measure_driving,
+    measure_robot,
+    profile_operators,
+    train_config,
+)
 from benchmarks.process import measure_processes
 from benchmarks.timing import Row
 from benchmarks.training import measure_command, measure_one_car, measure_sb3, measure_shares, measure_training
@@ -29,6 +36,7 @@ from coil_rl.train.run_folder import versions
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "processes": ("Start-up and memory of fresh processes", measure_processes),
     "env": ("Env steps per second, with resets, random actions unless the guide drives", measure_driving),
+    "cores": ("The guide drives, in one process on each core", measure_cores),
     "training": ("Training in frames per second", measure_training),
     "shares": ("Shares of the time of an update, collection included", measure_shares),
     "robot": ("Recordings and perception of the robot, 360 points a scan, CPU time", measure_robot),
@@ -44,6 +52,7 @@ GOALS = [
     ("training", "PPO compiled / by hand, {batch}", "ppo compiled / by hand", ">=", 1.3),
     ("training", "COIL compiled / by hand, {batch}", "coil compiled / by hand", ">=", 1.3),
     ("command", "default command, {time} time (s)", "whole command (s)", "<", 45),
+    ("cores", "{cars} cars with the guide, {processes} processes (steps/s)", "together (steps/s)", ">=", 580_000),
     ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
     ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
     ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),

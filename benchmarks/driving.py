@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import itertools
+import os
 import tempfile
 import time
 from argparse import Namespace
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -89,6 +91,34 @@ def measure_driving(args: Namespace) -> list[Row]:
             }
         )
     return rows
+
+
+def measure_cores(args: Namespace) -> list[Row]:
+    """Return the speed of the guide's drives, the cars shared by as many processes as there are cores."""
+    count, context = len(os.sched_getaffinity(0)), torch.multiprocessing.get_context("spawn")
+    barrier, queue = context.Barrier(count), context.Queue()
+    work = (args, args.compare_cars // count, barrier.wait, queue.put)
+    processes = [context.Process(target=_drive_in_turns, args=work, daemon=True) for _ in range(count)]
+    for process in processes:
+        process.start()
+    rates = {"together": [sum(turn) for turn in zip(*(queue.get() for _ in processes), strict=True)]}
+    row = {
+        "cars": args.compare_cars // count * count,
+        "processes": count,
+        "together (steps/s)": medians(rates)["together"],
+    }
+    return [{**row, "rounds": rates}]
+
+
+def _drive_in_turns(args: Namespace, cars: int, wait: Callable[[], int], put: Callable[[list[float]], None]) -> None:
+    """Drive in turns that begin at the same time in all processes, and send the steps per second of each."""
+    torch.set_num_threads(1)
+    driving = Driving(driving_env(args, cars, guide=True), follow=True)
+    rates = []
+    for _ in range(args.repeats):
+        wait()
+        rates += measure(Namespace(repeats=1, seconds=args.seconds / args.repeats), {"drive": driving})["drive"]
+    put(rates)
 
 
 def measure_compiled(args: Namespace) -> list[Row]:

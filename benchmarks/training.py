@@ -44,7 +44,8 @@ class Training:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         env = compile_steps(config, build_env(config, {"num_envs": cars}))
         learner = build_learner(config, env)
-        rollout = Rollout(env, learner.policy, steps, [*learner.keys, *watched_keys(env, {})])
+        keys = [*learner.keys, *watched_keys(env, {})]
+        rollout = Rollout(env, learner.policy, steps, keys, config.training.noise_correlation)
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
         while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
