@@ -118,7 +118,7 @@ class FastTensorDictModule(TensorDictModuleBase):
 class Sample(SafeProbabilisticModule):
     """Sample of a distribution, with its logarithmic probability as `action_log_prob`.
 
-    If there is `exploration_noise`, standard normal numbers, and actions are explored, a normal sample is made of it.
+    A normal sample is made of the `exploration_noise`, standard normal numbers, if a rollout has written it.
     """
 
     def __init__(self, parameters: Sequence[str], key: NestedKey, distribution: type, **options: Any) -> None:

@@ -211,8 +211,8 @@ class PPO(Stateful):
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Do what follows an update: learn the statistics of the observations, and set the noise of an anchored policy.
 
-        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones. The
-        result are the metrics of the anchor, if there is one.
+        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
+        Returns the metrics of the anchor, if there is one.
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)
