@@ -7,7 +7,8 @@ import os
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Callable
+from multiprocessing.queues import SimpleQueue
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 
 import torch
@@ -94,31 +95,23 @@ def measure_driving(args: Namespace) -> list[Row]:
 
 
 def measure_cores(args: Namespace) -> list[Row]:
-    """Return the speed of the guide's drives, the cars shared by as many processes as there are cores."""
-    count, context = len(os.sched_getaffinity(0)), torch.multiprocessing.get_context("spawn")
-    barrier, queue = context.Barrier(count), context.Queue()
-    work = (args, args.compare_cars // count, barrier.wait, queue.put)
-    processes = [context.Process(target=_drive_in_turns, args=work, daemon=True) for _ in range(count)]
-    for process in processes:
-        process.start()
-    rates = {"together": [sum(turn) for turn in zip(*(queue.get() for _ in processes), strict=True)]}
-    row = {
-        "cars": args.compare_cars // count * count,
-        "processes": count,
-        "together (steps/s)": medians(rates)["together"],
-    }
-    return [{**row, "rounds": rates}]
+    """Return the steps per second of cars that the guide drives, shared by one process on each core."""
+    count, context = os.cpu_count() or 1, torch.multiprocessing.get_context("spawn")
+    cars, queue = args.compare_cars // count, context.SimpleQueue()
+    torch.multiprocessing.spawn(_drive_at_once, (args, cars, context.Barrier(count), queue), nprocs=count)
+    rates = {"together (steps/s)": [sum(turn) for turn in zip(*(queue.get() for _ in range(count)), strict=True)]}
+    return [{"cars": cars * count, "processes": count, **medians(rates), "rounds": rates}]
 
 
-def _drive_in_turns(args: Namespace, cars: int, wait: Callable[[], int], put: Callable[[list[float]], None]) -> None:
-    """Drive in turns that begin at the same time in all processes, and send the steps per second of each."""
+def _drive_at_once(process: int, args: Namespace, cars: int, barrier: Barrier, queue: SimpleQueue) -> None:
+    """Put the steps per second of each turn into the queue; all processes begin a turn at the same time."""
     torch.set_num_threads(1)
     driving = Driving(driving_env(args, cars, guide=True), follow=True)
-    rates = []
+    turn, rates = Namespace(repeats=1, seconds=args.seconds / args.repeats), []
     for _ in range(args.repeats):
-        wait()
-        rates += measure(Namespace(repeats=1, seconds=args.seconds / args.repeats), {"drive": driving})["drive"]
-    put(rates)
+        barrier.wait()
+        rates += measure(turn, {"drive": driving})["drive"]
+    queue.put(rates)
 
 
 def measure_compiled(args: Namespace) -> list[Row]:

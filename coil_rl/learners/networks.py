@@ -116,9 +116,9 @@ class FastTensorDictModule(TensorDictModuleBase):
 
 
 class Sample(SafeProbabilisticModule):
-    """Sample of a distribution, with its logarithmic probability as `action_log_prob`.
+    """Module that samples from a distribution; it writes the sample, and its logarithmic probability `action_log_prob`.
 
-    A normal sample is made of the `exploration_noise`, standard normal numbers, if a rollout has written it.
+    If a rollout has written `exploration_noise`, standard normal numbers, a normal distribution takes these.
     """
 
     def __init__(self, parameters: Sequence[str], key: NestedKey, distribution: type, **options: Any) -> None:
@@ -128,7 +128,7 @@ class Sample(SafeProbabilisticModule):
         )  # fmt: skip
 
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
-        """Write the sample."""
+        """Write the sample and its logarithmic probability."""
         noise = tensordict.get(NOISE, None)
         if noise is None or exploration_type() is not ExplorationType.RANDOM:
             return super().forward(tensordict, *args, **options)

@@ -209,7 +209,7 @@ class PPO(Stateful):
         return self.anchor is not None and self.anchor.waits(progress)
 
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Do what follows an update: learn the statistics of the observations, and set the noise of an anchored policy.
+        """Learn the statistics of the observations, and set the noise of an anchored policy, after an update.
 
         The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
         Returns the metrics of the anchor, if there is one.

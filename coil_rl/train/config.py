@@ -74,7 +74,7 @@ class CurveConfig(NodeConfig):
 
 @dataclass
 class TrainingConfig(NodeConfig):
-    """Learner settings of an env, and its overrides in training; `imitation_env` is for methods that imitate guides."""
+    """Training values for an env, and overrides of `env` in training; `imitation_env` is for methods that imitate."""
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
     noise_correlation: Annotated[float, Field(ge=0, le=1)] = 0.0  # of the noise of continuous actions, see `Rollout`

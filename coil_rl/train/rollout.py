@@ -72,7 +72,7 @@ class Rollout:
         try:
             with set_exploration_type(ExplorationType.RANDOM):
                 for _ in range(self.steps):
-                    acting = self.policy(self._explored(carrier))
+                    acting = self.policy(self._with_noise(carrier))
                     step, carrier = self.env.step_and_maybe_reset(acting)
                     for key in self.keys or step.keys(True, True):
                         columns.setdefault(key, []).append(step[key])
@@ -87,8 +87,8 @@ class Rollout:
         self.taken += self.steps
         return batch
 
-    def _explored(self, carrier: TensorDictBase) -> TensorDictBase:
-        """Write the noise of the next actions, drawn from that of the actions before."""
+    def _with_noise(self, carrier: TensorDictBase) -> TensorDictBase:
+        """Write the exploration noise of the next step, which is correlated with that of the step before."""
         if (spec := self.noise_spec) is None:
             return carrier
         share, fresh = self.noise_correlation, torch.randn(spec.shape, dtype=spec.dtype, device=spec.device)
@@ -126,7 +126,8 @@ class Rollout:
             warnings.warn(f"{name} does not save its state, so new episodes begin", stacklevel=2)
         if carrier is not None and continues:
             self.carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
-        self.noise, self.taken = state["noise"], state["taken"]
+        self.noise = None if state["noise"] is None else state["noise"].to(self.env.device)
+        self.taken = state["taken"]
 
 
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
