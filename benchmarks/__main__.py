@@ -27,7 +27,13 @@ from benchmarks.driving import (
 )
 from benchmarks.process import measure_processes
 from benchmarks.timing import Row
-from benchmarks.training import measure_command, measure_one_car, measure_sb3, measure_shares, measure_training
+from benchmarks.training import (
+    measure_command,
+    measure_one_car,
+    measure_sb3,
+    measure_shares,
+    measure_training,
+)
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs.app import program
 from coil_rl.train.check import check_parts
@@ -35,7 +41,10 @@ from coil_rl.train.run_folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "processes": ("Start-up and memory of fresh processes", measure_processes),
-    "env": ("Env steps per second, with resets, random actions unless the guide drives", measure_driving),
+    "env": (
+        "Env steps per second, with resets, random actions unless the guide drives",
+        measure_driving,
+    ),
     "cores": ("The guide drives, in one process on each core", measure_cores),
     "training": ("Training in frames per second", measure_training),
     "shares": ("Shares of the time of an update, collection included", measure_shares),
@@ -52,51 +61,99 @@ GOALS = [
     ("training", "PPO compiled / by hand, {batch}", "ppo compiled / by hand", ">=", 1.3),
     ("training", "COIL compiled / by hand, {batch}", "coil compiled / by hand", ">=", 1.3),
     ("command", "default command, {time} time (s)", "whole command (s)", "<", 45),
-    ("cores", "{cars} cars with the guide, {processes} processes (steps/s)", "together (steps/s)", ">=", 580_000),
+    (
+        "cores",
+        "{cars} cars with the guide, {processes} processes (steps/s)",
+        "together (steps/s)",
+        ">=",
+        580_000,
+    ),
     ("one_car", "{cars} cars with the guide / one car in NumPy", "ratio", ">=", 500),
     ("sb3", "PPO / Stable-Baselines3 with {envs} envs", "ratio", ">=", 10),
     ("robot", "{subject} (scans/s)", "scans/s", ">=", 1000),
     ("processes", "state per car (B), {cars} cars", "state per car (B)", "<", 2000),
 ]
-SHORT = ["budget.frames=4096", "budget.num_envs=64", "evaluation.repeats=1", "evaluation.gif=false", "env.laps=1"]
+SHORT = [
+    "budget.frames=4096",
+    "budget.num_envs=64",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "env.laps=1",
+]
 FULL = {
-    "cars": [64, 256, 1024, 4096, 16384, 65536], "batches": [(256, 64), (1024, 32), (4096, 16)], "compare_cars": 4096,
-    "memory_cars": [64, 4096, 65536], "sb3_frames": 512, "seconds": 2.0, "repeats": 5,
-    "compile_updates": True, "command": [],
-}  # fmt: skip
+    "cars": [64, 256, 1024, 4096, 16384, 65536],
+    "batches": [(256, 64), (1024, 32), (4096, 16)],
+    "compare_cars": 4096,
+    "memory_cars": [64, 4096, 65536],
+    "sb3_frames": 512,
+    "seconds": 2.0,
+    "repeats": 5,
+    "compile_updates": True,
+    "command": [],
+}
 QUICK = {
-    "cars": [16, 64], "batches": [(16, 16)], "compare_cars": 64, "memory_cars": [64, 1024], "sb3_frames": 64,
-    "seconds": 0.1, "repeats": 2, "compile_updates": False, "command": SHORT,
-}  # fmt: skip
+    "cars": [16, 64],
+    "batches": [(16, 16)],
+    "compare_cars": 64,
+    "memory_cars": [64, 1024],
+    "sb3_frames": 64,
+    "seconds": 0.1,
+    "repeats": 2,
+    "compile_updates": False,
+    "command": SHORT,
+}
 
 
 def parse(argv: Sequence[str] | None = None) -> Namespace:
     """Return the options, with the sizes of `FULL` or `QUICK`."""
-    parser = argparse.ArgumentParser("python -m benchmarks", description="Measure the speed of coil-rl.")
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of coil-train, e.g. learner.compile=true")
+    parser = argparse.ArgumentParser(
+        "python -m benchmarks", description="Measure the speed of coil-rl."
+    )
+    parser.add_argument(
+        "overrides", nargs="*", metavar="KEY=VALUE", help="of coil-train, e.g. learner.compile=true"
+    )
     parser.add_argument("--device", default="cpu", help="cpu or cuda")
     parser.add_argument("--threads", type=int, default=1, help="of torch")
     parts = [name for name in PARTS if name != "compiled"]
     parser.add_argument("--parts", nargs="+", choices=parts, default=parts)
     parser.add_argument("--cars", nargs="+", type=int, help="numbers of cars for env steps")
-    parser.add_argument("--compile", nargs="+", type=int, default=[], metavar="CARS", help="also with compiled steps")
+    parser.add_argument(
+        "--compile",
+        nargs="+",
+        type=int,
+        default=[],
+        metavar="CARS",
+        help="also with compiled steps",
+    )
     parser.add_argument("--seconds", type=float, help="of each subject, all rounds together")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it works")
-    parser.add_argument("--output", type=Path, default=Path("outputs/benchmark") / time.strftime("%Y-%m-%d_%H-%M-%S"))
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("outputs/benchmark") / time.strftime("%Y-%m-%d_%H-%M-%S"),
+    )
     args = parser.parse_intermixed_args(argv)
     sizes = QUICK if args.quick else FULL
-    vars(args).update({key: value for key, value in sizes.items() if getattr(args, key, None) is None})
+    vars(args).update(
+        {key: value for key, value in sizes.items() if getattr(args, key, None) is None}
+    )
     if args.compile:
         args.parts = [*args.parts, "compiled"]
     if (args.output / "benchmark.json").exists():
-        parser.error(f"{args.output} already holds a benchmark; choose another folder with --output")
+        parser.error(
+            f"{args.output} already holds a benchmark; choose another folder with --output"
+        )
     return args
 
 
 def check_configuration(args: Namespace) -> None:
     """Raise a `UserError` for the first mistake in the overrides."""
-    if method := [override for override in args.overrides if re.match(r"[+~]*method(@\w*)?=", override)]:
-        raise UserError(f"{method[0]} has no effect: the methods ppo and coil are compared; leave it out")
+    if method := [
+        override for override in args.overrides if re.match(r"[+~]*method(@\w*)?=", override)
+    ]:
+        raise UserError(
+            f"{method[0]} has no effect: the methods ppo and coil are compared; leave it out"
+        )
     try:
         check_parts(train_config(args, "coil"))
     except HydraException as error:
@@ -111,14 +168,22 @@ def goals(results: Mapping[str, Any]) -> list[Row]:
             if key in row:
                 met = row[key] >= bound if sign == ">=" else row[key] < bound
                 rows.append(
-                    {"subject": subject.format(**row), "value": row[key], "goal": f"{sign} {bound}", "met": met}
+                    {
+                        "subject": subject.format(**row),
+                        "value": row[key],
+                        "goal": f"{sign} {bound}",
+                        "met": met,
+                    }
                 )
     return rows
 
 
 def page(results: Mapping[str, Any]) -> str:
     """Return the results as Markdown tables."""
-    sections = [("Goals", results["goals"]), *((title, results.get(part)) for part, (title, _) in PARTS.items())]
+    sections = [
+        ("Goals", results["goals"]),
+        *((title, results.get(part)) for part, (title, _) in PARTS.items()),
+    ]
     return "\n\n".join(f"## {title}\n\n{_table(rows)}" for title, rows in sections if rows)
 
 
@@ -145,7 +210,9 @@ def _run(args: Namespace) -> None:
     check_configuration(args)
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
-    os.environ.setdefault("KINETO_LOG_LEVEL", "99")  # the profiler prints its start and end otherwise
+    os.environ.setdefault(
+        "KINETO_LOG_LEVEL", "99"
+    )  # the profiler prints its start and end otherwise
     args.output.mkdir(parents=True, exist_ok=True)
     settings = {key: value for key, value in vars(args).items() if key != "output"}
     results: dict[str, Any] = {"versions": versions(), "settings": settings, "goals": []}

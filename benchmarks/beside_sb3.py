@@ -2,9 +2,9 @@
 
     python -m benchmarks.beside_sb3 ppo Pendulum-v1 --frames 40000 --seeds 3
 
-prints for both the mean return of deterministic episodes with fixed seeds after the training, with the standard
-deviation over the runs, the frames per CPU second of the training, and the gradient steps per CPU second of the updates
-alone. The extra `bench` of coil-rl installs what it needs.
+prints for both the mean return of deterministic episodes with fixed seeds after the training, with
+the standard deviation over the runs, the frames per CPU second of the training, and the gradient
+steps per CPU second of the updates alone. The extra `bench` of coil-rl installs what it needs.
 """
 
 from __future__ import annotations
@@ -31,47 +31,104 @@ from coil_rl.schedules import Linear
 from coil_rl.train.rollout import Rollout
 
 Act = Callable[[Tensor], Tensor]  # observations [B, D] to deterministic actions
-# Values of an algorithm on any env, with `every` frames to a minibatch; and what differs on some, as tuned for
-# Stable-Baselines3 by RL Zoo.
+# Values of an algorithm on any env, with `every` frames to a minibatch; and what differs on some,
+# as tuned for Stable-Baselines3 by RL Zoo.
 VALUES: Mapping[str, Mapping[str, Any]] = {
-    "ppo": {"envs": 8, "steps": 256, "minibatch": 64, "epochs": 10, "learning_rate": 3e-4, "gamma": 0.99,
-            "gae_lambda": 0.95, "entropy": 0.0},
-    "sac": {"envs": 1, "steps": 1, "every": 1, "minibatch": 256, "learning_rate": 1e-3, "gamma": 0.99, "tau": 0.005,
-            "starts": 1_000, "hidden": (64, 64)},
-    "dqn": {"envs": 1, "steps": 4, "every": 4, "minibatch": 128, "learning_rate": 6e-4, "gamma": 0.99, "tau": 0.01,
-            "starts": 1_000, "hidden": (128, 128), "explore": 0.3, "epsilon": 0.05},
-}  # fmt: skip
-LANDER = {"envs": 16, "steps": 1024, "epochs": 4, "gamma": 0.999, "gae_lambda": 0.98, "entropy": 0.01}
+    "ppo": {
+        "envs": 8,
+        "steps": 256,
+        "minibatch": 64,
+        "epochs": 10,
+        "learning_rate": 3e-4,
+        "gamma": 0.99,
+        "gae_lambda": 0.95,
+        "entropy": 0.0,
+    },
+    "sac": {
+        "envs": 1,
+        "steps": 1,
+        "every": 1,
+        "minibatch": 256,
+        "learning_rate": 1e-3,
+        "gamma": 0.99,
+        "tau": 0.005,
+        "starts": 1_000,
+        "hidden": (64, 64),
+    },
+    "dqn": {
+        "envs": 1,
+        "steps": 4,
+        "every": 4,
+        "minibatch": 128,
+        "learning_rate": 6e-4,
+        "gamma": 0.99,
+        "tau": 0.01,
+        "starts": 1_000,
+        "hidden": (128, 128),
+        "explore": 0.3,
+        "epsilon": 0.05,
+    },
+}
+LANDER = {
+    "envs": 16,
+    "steps": 1024,
+    "epochs": 4,
+    "gamma": 0.999,
+    "gae_lambda": 0.98,
+    "entropy": 0.01,
+}
 TUNED: Mapping[tuple[str, str], Mapping[str, Any]] = {
     ("ppo", "Pendulum-v1"): {"envs": 4, "steps": 1024, "learning_rate": 1e-3, "gamma": 0.9},
     ("ppo", "LunarLander-v3"): LANDER,
     ("ppo", "LunarLanderContinuous-v3"): LANDER,
-}  # fmt: skip
+}
 CAPACITY = 50_000
 EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
 
 
-def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
+def ours(
+    algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int
+) -> tuple[Act, float]:
     """Train our learner and return its deterministic policy, and the gradient steps per CPU second of its updates."""
     torch.manual_seed(seed)
     env = GymnasiumEnv(env_id, values["envs"], seed=seed)
-    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")} | {"seed": seed}
+    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")} | {
+        "seed": seed
+    }
     learner: PPO | SAC | DQN
     if algorithm == "ppo":
         learner = PPO(
-            env, hidden=(64, 64), action_scale=1.0, squash=False, gae_lambda=values["gae_lambda"],
-            epochs=values["epochs"], minibatches=values["envs"] * values["steps"] // values["minibatch"],
-            entropy=values["entropy"], **common,
-        )  # fmt: skip
+            env,
+            hidden=(64, 64),
+            action_scale=1.0,
+            squash=False,
+            gae_lambda=values["gae_lambda"],
+            epochs=values["epochs"],
+            minibatches=values["envs"] * values["steps"] // values["minibatch"],
+            entropy=values["entropy"],
+            **common,
+        )
     else:
-        replay = common | {name: values[name] for name in ("tau", "starts")} | {"capacity": CAPACITY}
-        replay |= {"batch_size": values["minibatch"], "ratio": values["minibatch"] / values["every"]}
+        replay = (
+            common | {name: values[name] for name in ("tau", "starts")} | {"capacity": CAPACITY}
+        )
+        replay |= {
+            "batch_size": values["minibatch"],
+            "ratio": values["minibatch"] / values["every"],
+        }
         network = Mlp(values["hidden"], "relu")
         if algorithm == "sac":
             # The default of Stable-Baselines3 is for actions in [-1, 1], ours for those of the env.
             high, size = env.action_spec.space.high, env.action_spec.shape[-1]
             entropy = -size + size * math.log(float(high.max()))
-            learner = SAC(env, network=network, target_entropy=entropy, temperature=1.0, max_grad_norm=1e6, **replay)
+            learner = SAC(
+                env,
+                network=network,
+                target_entropy=entropy,
+                temperature=1.0,
+                max_grad_norm=1e6,
+                **replay,
+            )
         else:
             epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
             learner = DQN(env, network=network, epsilon=epsilon, double=False, **replay)
@@ -79,32 +136,48 @@ def ours(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, se
     stopwatch, steps = updates_of(learner, "update"), 0.0
     for count in range(frames // rollout.frames):
         metrics = learner.update(rollout.collect(), count * rollout.frames / frames)
-        steps += metrics.get("minibatches", values.get("epochs", 0) * rollout.frames / values["minibatch"])
+        steps += metrics.get(
+            "minibatches", values.get("epochs", 0) * rollout.frames / values["minibatch"]
+        )
 
     def act(observation: Tensor) -> Tensor:
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            action: Tensor = learner.policy(TensorDict({"observation": observation}, observation.shape[:1]))["action"]
+            action: Tensor = learner.policy(
+                TensorDict({"observation": observation}, observation.shape[:1])
+            )["action"]
         return action
 
     return act, per_second(steps, stopwatch)
 
 
-def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int) -> tuple[Act, float]:
+def theirs(
+    algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int
+) -> tuple[Act, float]:
     """Train the learner of Stable-Baselines3, and return its policy and its gradient steps per CPU second as `ours`."""
     import stable_baselines3
     from stable_baselines3.common.env_util import make_vec_env
 
-    # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no picture removes them.
+    # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no
+    # picture removes them.
     envs = make_vec_env(env_id, values["envs"], seed=seed, env_kwargs={"render_mode": None})
     common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")}
     common |= {"batch_size": values["minibatch"], "seed": seed, "device": "cpu"}
     if algorithm == "ppo":
         model = stable_baselines3.PPO(
-            "MlpPolicy", envs, n_steps=values["steps"], n_epochs=values["epochs"], gae_lambda=values["gae_lambda"],
-            ent_coef=values["entropy"], **common,
-        )  # fmt: skip
+            "MlpPolicy",
+            envs,
+            n_steps=values["steps"],
+            n_epochs=values["epochs"],
+            gae_lambda=values["gae_lambda"],
+            ent_coef=values["entropy"],
+            **common,
+        )
     else:
-        common |= {"tau": values["tau"], "learning_starts": values["starts"], "buffer_size": CAPACITY}
+        common |= {
+            "tau": values["tau"],
+            "learning_starts": values["starts"],
+            "buffer_size": CAPACITY,
+        }
         steps = values["envs"] * values["steps"] // values["every"]
         common |= {"train_freq": values["steps"], "gradient_steps": steps}
         common["policy_kwargs"] = {"net_arch": list(values["hidden"]), "activation_fn": nn.ReLU}
@@ -112,13 +185,19 @@ def theirs(algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, 
             model = stable_baselines3.SAC("MlpPolicy", envs, **common)
         else:
             model = stable_baselines3.DQN(
-                "MlpPolicy", envs, target_update_interval=values["every"], exploration_fraction=values["explore"],
-                exploration_final_eps=values["epsilon"], **common,
-            )  # fmt: skip
+                "MlpPolicy",
+                envs,
+                target_update_interval=values["every"],
+                exploration_fraction=values["explore"],
+                exploration_final_eps=values["epsilon"],
+                **common,
+            )
     stopwatch = updates_of(model, "train")
     model.learn(frames)
     # Its PPO counts epochs.
-    steps = model._n_updates * (values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1)
+    steps = model._n_updates * (
+        values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1
+    )
 
     def act(observation: Tensor) -> Tensor:
         return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
@@ -141,7 +220,11 @@ def per_second(steps: float, stopwatch: Stopwatch) -> float:
 def mean_return(env_id: str, act: Act) -> float:
     """Return the mean return of one episode from each of the fixed seeds."""
     env = GymnasiumEnv(env_id, EPISODES, first_seed=FIRST_SEED)
-    carrier, running, total = env.reset(), torch.ones(EPISODES, 1, dtype=torch.bool), torch.zeros(EPISODES, 1)
+    carrier, running, total = (
+        env.reset(),
+        torch.ones(EPISODES, 1, dtype=torch.bool),
+        torch.zeros(EPISODES, 1),
+    )
     while running.any():
         step = env.step(carrier.set("action", act(carrier["observation"])))
         total += step["next", "reward"] * running
@@ -180,7 +263,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         speed = [statistics.median(numbers[name]) for numbers in (rates, steps)]
         rows.append([name, statistics.mean(returns[name]), spread, *speed])
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
-    print(tabulate(rows, ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"], floatfmt=".0f"))
+    print(
+        tabulate(
+            rows,
+            ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"],
+            floatfmt=".0f",
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -19,7 +19,13 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import coil_rl.train.config  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
-from coil_rl.envs import Perception, read_recording, save_drive, simulated_cone_classifier, simulated_drive
+from coil_rl.envs import (
+    Perception,
+    read_recording,
+    save_drive,
+    simulated_cone_classifier,
+    simulated_drive,
+)
 from coil_rl.train.build import build_bare_env, build_guides, compile_steps
 from coil_rl.transforms import GuideActions
 
@@ -27,7 +33,14 @@ from coil_rl.transforms import GuideActions
 def train_config(args: Namespace, method: str, *more: str) -> DictConfig:
     """Return the configuration of `coil-train` with the overrides of the command line."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        given = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused", *args.overrides, *more]
+        given = [
+            f"method={method}",
+            f"device={args.device}",
+            "logger=none",
+            "run_dir=unused",
+            *args.overrides,
+            *more,
+        ]
         return compose("train", given)
 
 
@@ -75,7 +88,9 @@ def measure_driving(args: Namespace) -> list[Row]:
     """Return a row for each number of cars."""
     rows = []
     for cars in args.cars:
-        bare, guided = (Driving(driving_env(args, cars, guide)).until_resets() for guide in (False, True))
+        bare, guided = (
+            Driving(driving_env(args, cars, guide)).until_resets() for guide in (False, True)
+        )
         following = Driving(driving_env(args, cars, True), follow=True)
         rates = measure(args, {"env": bare, "advice": guided, "follow": following})
         median = medians(rates)
@@ -98,12 +113,20 @@ def measure_cores(args: Namespace) -> list[Row]:
     """Return the steps per second of cars that the guide drives, shared by one process on each core."""
     count, context = os.cpu_count() or 1, torch.multiprocessing.get_context("spawn")
     cars, queue = args.compare_cars // count, context.SimpleQueue()
-    torch.multiprocessing.spawn(_drive_at_once, (args, cars, context.Barrier(count), queue), nprocs=count)
-    rates = {"together (steps/s)": [sum(turn) for turn in zip(*(queue.get() for _ in range(count)), strict=True)]}
+    torch.multiprocessing.spawn(
+        _drive_at_once, (args, cars, context.Barrier(count), queue), nprocs=count
+    )
+    rates = {
+        "together (steps/s)": [
+            sum(turn) for turn in zip(*(queue.get() for _ in range(count)), strict=True)
+        ]
+    }
     return [{"cars": cars * count, "processes": count, **medians(rates), "rounds": rates}]
 
 
-def _drive_at_once(process: int, args: Namespace, cars: int, barrier: Barrier, queue: SimpleQueue) -> None:
+def _drive_at_once(
+    process: int, args: Namespace, cars: int, barrier: Barrier, queue: SimpleQueue
+) -> None:
     """Put the steps per second of each turn into the queue; all processes begin a turn at the same time."""
     torch.set_num_threads(1)
     driving = Driving(driving_env(args, cars, guide=True), follow=True)
@@ -118,7 +141,9 @@ def measure_compiled(args: Namespace) -> list[Row]:
     """Return the speed of the guide's drives with compiled steps beside that without."""
     rows = []
     for cars in args.compile:
-        env = compile_steps(train_config(args, "coil", "compile=true"), driving_env(args, cars, guide=True))
+        env = compile_steps(
+            train_config(args, "coil", "compile=true"), driving_env(args, cars, guide=True)
+        )
         compiled, start = Driving(env, follow=True), time.perf_counter()
         compiled()
         synchronise()
@@ -126,7 +151,15 @@ def measure_compiled(args: Namespace) -> list[Row]:
         eager = Driving(driving_env(args, cars, guide=True), follow=True)
         rates = measure(args, {"eager": eager, "compiled": compiled})
         ratio = median_ratio(rates["compiled"], rates["eager"])
-        rows.append({"cars": cars, **medians(rates), "ratio": ratio, "compiling (s)": seconds, "rounds": rates})
+        rows.append(
+            {
+                "cars": cars,
+                **medians(rates),
+                "ratio": ratio,
+                "compiling (s)": seconds,
+                "rounds": rates,
+            }
+        )
     return rows
 
 
@@ -148,7 +181,10 @@ def measure_robot(args: Namespace) -> list[Row]:
         save_drive(simulated_drive("both", 0), path)
         recording = read_recording(path)
         ranges, angles = recording.ranges, recording.angles(0)
-        perceive, scan = Perception(simulated_cone_classifier()), itertools.cycle(range(len(ranges)))
+        perceive, scan = (
+            Perception(simulated_cone_classifier()),
+            itertools.cycle(range(len(ranges))),
+        )
 
         def single_scan() -> int:
             row = next(scan)

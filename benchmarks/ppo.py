@@ -1,7 +1,7 @@
 """PPO in plain PyTorch, as a yardstick of the overhead of `coil_rl.learners.PPO`.
 
-The numbers are the same (tests/benchmarks/test_ppo.py). Collection and update are one class, as in CleanRL: it calls
-the env directly, without transforms, actors, loss modules or value estimators.
+The numbers are the same (tests/benchmarks/test_ppo.py). Collection and update are one class, as in
+CleanRL: it calls the env directly, without transforms, actors, loss modules or value estimators.
 """
 
 from __future__ import annotations
@@ -60,9 +60,13 @@ class PlainPPO:
         size, inputs = env.action_spec.shape[-1], self.observation.shape[-1]
         self.actor = network(inputs, hyper.hidden, size, gain=hyper.action_gain).to(env.device)
         self.critic = network(inputs, hyper.hidden, 1, gain=1.0).to(env.device)
-        self.log_scale = nn.Parameter(torch.full((size,), math.log(hyper.action_scale), device=env.device))
+        self.log_scale = nn.Parameter(
+            torch.full((size,), math.log(hyper.action_scale), device=env.device)
+        )
         self.parameters = [*self.actor.parameters(), self.log_scale, *self.critic.parameters()]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True)
+        self.optimiser = torch.optim.Adam(
+            self.parameters, lr=self.learning_rate(0), eps=1e-5, fused=True
+        )
         self.generator = torch.Generator().manual_seed(hyper.seed)
 
     def observe(self, state: TensorDictBase) -> Tensor:
@@ -83,12 +87,16 @@ class PlainPPO:
             raw = mean + self.log_scale.exp() * torch.randn_like(mean)
             state = self.env._step(TensorDict({"action": raw.tanh()}, self.env.batch_size))
             self.observation = after = self.observe(state)
-            reward, terminated, done = (state[key].squeeze(-1) for key in ("reward", "terminated", "done"))
+            reward, terminated, done = (
+                state[key].squeeze(-1) for key in ("reward", "terminated", "done")
+            )
             if done.any():
                 fresh = self.env._reset(TensorDict({"_reset": done}, self.env.batch_size))
                 self.observation = after.clone()
                 self.observation[done] = self.observe(fresh.select(*keys)[done])
-            rows.append((observation, raw, self.log_prob(raw, mean), reward, terminated, done, after))
+            rows.append(
+                (observation, raw, self.log_prob(raw, mean), reward, terminated, done, after)
+            )
         return Batch(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
     def log_prob(self, raw: Tensor, mean: Tensor) -> Tensor:
@@ -102,7 +110,8 @@ class PlainPPO:
         """Return generalised advantage estimates and the targets of the critic, [T, B] each."""
         value = self.critic(torch.cat([batch.observation, batch.after[-1:]])).squeeze(-1)
         value, following = value[:-1], value[1:].clone()
-        # The next row of a truncated episode is another episode, so its value is computed separately.
+        # The next row of a truncated episode is another episode, so its value is computed
+        # separately.
         truncated = batch.done & ~batch.terminated
         following[truncated] = self.critic(batch.after[truncated]).squeeze(-1)
         delta = batch.reward + self.hyper.gamma * following * ~batch.terminated - value
@@ -113,7 +122,9 @@ class PlainPPO:
             advantage[t] = running
         return advantage, advantage + value
 
-    def loss(self, observation: Tensor, raw: Tensor, log_prob: Tensor, advantage: Tensor, target: Tensor) -> Tensor:
+    def loss(
+        self, observation: Tensor, raw: Tensor, log_prob: Tensor, advantage: Tensor, target: Tensor
+    ) -> Tensor:
         """Return the clipped objective plus the weighted critic loss of a minibatch [N]."""
         advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
         ratio = (self.log_prob(raw, self.actor(observation)) - log_prob).exp()
@@ -127,10 +138,14 @@ class PlainPPO:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(progress)
         columns = (batch.observation, batch.raw, batch.log_prob, *self.advantages(batch))
-        flat = [column.transpose(0, 1).flatten(0, 1) for column in columns]  # car by car, as a TorchRL batch
+        flat = [
+            column.transpose(0, 1).flatten(0, 1) for column in columns
+        ]  # car by car, as a TorchRL batch
         size = len(flat[0]) // self.hyper.minibatches
         for _ in range(self.hyper.epochs):
-            order = torch.randperm(len(flat[0]), generator=self.generator)[: size * self.hyper.minibatches]
+            order = torch.randperm(len(flat[0]), generator=self.generator)[
+                : size * self.hyper.minibatches
+            ]
             for rows in order.to(flat[0].device).split(size):
                 loss = self.loss(*(column[rows] for column in flat))
                 self.optimiser.zero_grad()

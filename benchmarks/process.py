@@ -21,9 +21,19 @@ def measure_processes(args: Namespace) -> list[Row]:
     """Return a row for each number of cars in `memory_cars`, and one for an update of COIL with the first batch."""
     rows = []
     for cars, steps in [*((cars, 0) for cars in args.memory_cars), args.batches[0]]:
-        command = [sys.executable, "-m", __name__, str(cars), str(steps), args.device, str(args.threads)]
+        command = [
+            sys.executable,
+            "-m",
+            __name__,
+            str(cars),
+            str(steps),
+            args.device,
+            str(args.threads),
+        ]
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
-        rows.append({"cars": cars, "trained steps": steps, **json.loads(done.stdout.splitlines()[-1])})
+        rows.append(
+            {"cars": cars, "trained steps": steps, **json.loads(done.stdout.splitlines()[-1])}
+        )
     return rows
 
 
@@ -54,14 +64,18 @@ def main(cars: int, steps: int, device: str, threads: int) -> Row:
         learner.update(Rollout(env, learner.policy, steps, learner.keys).collect())
     else:
         env.rollout(5, break_when_any_done=False)
-    state_bytes = sum(b.numel() * b.element_size() for b in env.base_env.buffers() if cars in b.shape)
+    state_bytes = sum(
+        b.numel() * b.element_size() for b in env.base_env.buffers() if cars in b.shape
+    )
     return {
         "import (s)": imported - start,
         "building (s)": built - imported,
         "first step (s)": stepped - built,
         "state per car (B)": state_bytes / cars,
         "peak (MB)": peak_memory(),
-        "device peak (MB)": torch.cuda.max_memory_allocated() / 1e6 if device.startswith("cuda") else None,
+        "device peak (MB)": torch.cuda.max_memory_allocated() / 1e6
+        if device.startswith("cuda")
+        else None,
     }
 
 

@@ -15,11 +15,14 @@ Work = Callable[[], int]  # does a piece of work and returns its number of frame
 Clock = Callable[[], float]
 
 
-def measure(args: Namespace, subjects: Mapping[str, Work], clock: Clock = time.perf_counter) -> dict[str, list[float]]:
+def measure(
+    args: Namespace, subjects: Mapping[str, Work], clock: Clock = time.perf_counter
+) -> dict[str, list[float]]:
     """Return frames per second of each subject, one number for each of `args.repeats` rounds.
 
-    In every round each subject has its turn, so a slow moment of the machine affects all of them. A turn is at least
-    one call; all turns of a subject take about `args.seconds`. Each subject is called once before the first round.
+    In every round each subject has its turn, so a slow moment of the machine affects all of them. A
+    turn is at least one call; all turns of a subject take about `args.seconds`. Each subject is
+    called once before the first round.
     """
     for work in subjects.values():
         work()

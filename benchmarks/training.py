@@ -22,7 +22,14 @@ from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, media
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
-from coil_rl.train.build import build, build_bare_env, build_env, build_guides, build_learner, compile_steps
+from coil_rl.train.build import (
+    build,
+    build_bare_env,
+    build_env,
+    build_guides,
+    build_learner,
+    compile_steps,
+)
 from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import GuideActions
@@ -40,7 +47,9 @@ class Training:
     Replay of off-policy learners is filled first.
     """
 
-    def __init__(self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False) -> None:
+    def __init__(
+        self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False
+    ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         env = compile_steps(config, build_env(config, {"num_envs": cars}))
         learner = build_learner(config, env)
@@ -62,7 +71,11 @@ class Training:
         timed = [(env.base_env, "_step", "env"), (env.base_env, "_reset", "env")]
         for guides in (module for module in env.transform if isinstance(module, GuideActions)):
             timed += [(guides, "_call", "guide"), (guides, "_reset", "guide")]
-        for owner, method, name in [*timed, (learner.policy, "forward", "policy"), (learner, "update", "update")]:
+        for owner, method, name in [
+            *timed,
+            (learner.policy, "forward", "policy"),
+            (learner, "update", "update"),
+        ]:
             stopwatch.wrap(owner, method, name)
 
 
@@ -90,21 +103,40 @@ def measure_training(args: Namespace) -> list[Row]:
     """Return a row for each batch: frames per second with and without a guide, of PPO also by hand."""
     rows = []
     for cars, steps in args.batches:
-        subjects: dict[str, Work] = {method: Training(args, method, cars, steps) for method in METHODS}
+        subjects: dict[str, Work] = {
+            method: Training(args, method, cars, steps) for method in METHODS
+        }
         hand = METHODS if has_yardstick(args) else ()
         compiled = METHODS if args.compile_updates else ()
-        subjects |= {f"{method} compiled": Training(args, method, cars, steps, compile=True) for method in compiled}
+        subjects |= {
+            f"{method} compiled": Training(args, method, cars, steps, compile=True)
+            for method in compiled
+        }
         subjects |= {f"{method} by hand": by_hand(args, method, cars, steps) for method in hand}
         rates = measure(args, subjects)
-        ratios = {f"{method} / by hand": median_ratio(rates[method], rates[f"{method} by hand"]) for method in hand}
+        ratios = {
+            f"{method} / by hand": median_ratio(rates[method], rates[f"{method} by hand"])
+            for method in hand
+        }
         ratios |= {
-            f"{method} compiled / by hand": median_ratio(rates[f"{method} compiled"], rates[f"{method} by hand"])
+            f"{method} compiled / by hand": median_ratio(
+                rates[f"{method} compiled"], rates[f"{method} by hand"]
+            )
             for method in hand
             if method in compiled
         }
         floor = {"floor, ppo": floor_rate(args, cars * steps)} if hand else {}
         cost = {"cost of a frame, coil / ppo": median_ratio(rates["ppo"], rates["coil"])}
-        rows.append({"batch": f"{cars} x {steps}", **medians(rates), **floor, **cost, **ratios, "rounds": rates})
+        rows.append(
+            {
+                "batch": f"{cars} x {steps}",
+                **medians(rates),
+                **floor,
+                **cost,
+                **ratios,
+                "rounds": rates,
+            }
+        )
     return rows
 
 
@@ -113,10 +145,14 @@ def floor_rate(args: Namespace, frames: int) -> float:
     config = train_config(args, "ppo")
     learner = build_learner(config, build_env(config, {"num_envs": 1}))
     sizes = [parameter.numel() for parameter in learner.gradient.parameters if parameter.ndim == 2]
-    # Of each weight a multiplication and an addition: forward, and twice backward; and once to act and to value.
+    # Of each weight a multiplication and an addition: forward, and twice backward; and once to act
+    # and to value.
     operations = 2 * sum(sizes) * (3 * learner.epochs + 1)
     rows, width = max(frames // learner.minibatches, 1), config.learner.hidden[0]
-    left, right = torch.ones(rows, width, device=args.device), torch.ones(width, width, device=args.device)
+    left, right = (
+        torch.ones(rows, width, device=args.device),
+        torch.ones(width, width, device=args.device),
+    )
 
     def multiply() -> int:
         torch.mm(left, right)
@@ -130,7 +166,13 @@ def measure_command(args: Namespace) -> list[Row]:
     rows = []
     for name in ("first", "second"):
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "coil_rl.programs.train", f"hydra.run.dir={folder}/run", *args.overrides]
+            command = [
+                sys.executable,
+                "-m",
+                "coil_rl.programs.train",
+                f"hydra.run.dir={folder}/run",
+                *args.overrides,
+            ]
             command += [f"device={args.device}", *args.command]
             start = time.perf_counter()
             subprocess.run(command, check=True, capture_output=True)
@@ -166,7 +208,14 @@ def measure_one_car(args: Namespace) -> list[Row]:
     ours = Driving(driving_env(args, args.compare_cars, guide=True), follow=True)
     rates = measure(args, {"one car": one_car(args), "ours": ours})
     row = {f"{name} (steps/s)": rate for name, rate in medians(rates).items()}
-    return [{"cars": args.compare_cars, **row, "ratio": median_ratio(rates["ours"], rates["one car"]), "rounds": rates}]
+    return [
+        {
+            "cars": args.compare_cars,
+            **row,
+            "ratio": median_ratio(rates["ours"], rates["one car"]),
+            "rounds": rates,
+        }
+    ]
 
 
 def one_car(args: Namespace) -> Work:
@@ -175,10 +224,16 @@ def one_car(args: Namespace) -> Work:
     import oracle  # type: ignore[import-not-found,import-untyped,unused-ignore]
 
     config = train_config(args, "coil")
-    options = {key: config.env[key] for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")}
+    options = {
+        key: config.env[key]
+        for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")
+    }
     node = config.guide.get("spline", {})
     guide = {key: node[key] for key in ("spline", "smoothing", "gain") if key in node}
-    cars = [oracle.OneCar(t.left, t.right, t.start, **options) for t in build(config.track.train, "track.train")]
+    cars = [
+        oracle.OneCar(t.left, t.right, t.start, **options)
+        for t in build(config.track.train, "track.train")
+    ]
 
     def steps() -> int:
         for _ in range(ORACLE_STEPS):
@@ -200,17 +255,26 @@ def measure_sb3(args: Namespace) -> list[Row]:
     if not has_yardstick(args):
         return [{"not measured": "Stable-Baselines3 runs PPO with continuous actions"}]
     if find_spec("stable_baselines3") is None or find_spec("gymnasium") is None:
-        return [{"not measured": "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"}]
+        return [
+            {
+                "not measured": "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"
+            }
+        ]
     (cars, steps), *_ = args.batches
     subjects: dict[str, Work] = {"ours": Training(args, "ppo", cars, steps)}
     subjects |= {str(envs): sb3(args, envs) for envs in SB3_ENVS}
     rates = measure(args, subjects)
     median = medians(rates)
     return [
-        {"envs": envs, "frames/s": median[str(envs)], f"ours, {cars} x {steps}": median["ours"],
-         "ratio": median_ratio(rates["ours"], rates[str(envs)]), "rounds": rates}
+        {
+            "envs": envs,
+            "frames/s": median[str(envs)],
+            f"ours, {cars} x {steps}": median["ours"],
+            "ratio": median_ratio(rates["ours"], rates[str(envs)]),
+            "rounds": rates,
+        }
         for envs in SB3_ENVS
-    ]  # fmt: skip
+    ]
 
 
 def sb3(args: Namespace, envs: int) -> Work:
@@ -223,13 +287,19 @@ def sb3(args: Namespace, envs: int) -> Work:
 
     config = train_config(args, "ppo")
     options: Any = OmegaConf.to_container(config.env, resolve=True)
-    options = {key: value for key, value in options.items() if key not in ("_target_", "num_envs", "device")}
+    options = {
+        key: value
+        for key, value in options.items()
+        if key not in ("_target_", "num_envs", "device")
+    }
     options["tracks"] = build(config.track.train, "track.train")
     hidden = list(config.learner.hidden)
     policy: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": nn.Tanh}
     policy["log_std_init"] = math.log(config.learner.action_scale)
     vector = make_vec_env(ConeTrackGym, envs, env_kwargs=options)
-    model = PPO("MlpPolicy", vector, n_steps=args.sb3_frames // envs, policy_kwargs=policy, device="cpu")
+    model = PPO(
+        "MlpPolicy", vector, n_steps=args.sb3_frames // envs, policy_kwargs=policy, device="cpu"
+    )
 
     def update() -> int:
         model.learn(args.sb3_frames, reset_num_timesteps=False)

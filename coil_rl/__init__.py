@@ -1,6 +1,7 @@
 """Reinforcement learning with guide policies.
 
-The names in `__all__` are the public API. They are imported on first use, so that `import coil_rl` is fast.
+The names in `__all__` are the public API. They are imported on first use, so that `import coil_rl`
+is fast.
 """
 
 from __future__ import annotations

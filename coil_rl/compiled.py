@@ -1,8 +1,9 @@
 """Machine code for functions of tensors, compiled once and kept on disk.
 
-With small networks and few cars the calls of single operations take longer than their arithmetic. Here a function is
-recorded as one graph of operations, which TorchInductor compiles ahead of time to a library. The library is kept under
-a name made from the graph, so that later processes load it within milliseconds and need no compiler.
+With small networks and few cars the calls of single operations take longer than their arithmetic.
+Here a function is recorded as one graph of operations, which TorchInductor compiles ahead of time
+to a library. The library is kept under a name made from the graph, so that later processes load it
+within milliseconds and need no compiler.
 """
 
 import hashlib
@@ -25,7 +26,8 @@ from tqdm import tqdm
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 
-# Random numbers come from PyTorch's generators, as without compilation; tanh from exp, which is twice as fast.
+# Random numbers come from PyTorch's generators, as without compilation; tanh from exp, which is
+# twice as fast.
 OPTIONS = {"fallback_random": True, "cpp.use_decompose_tanh": True}
 # Operations whose result has a shape that depends on values.
 DYNAMIC = torch.Tag.dynamic_output_shape
@@ -37,14 +39,16 @@ class Compiled:
     The results differ from those of the function in the last digits.
 
     Args:
-        function: takes tensors and returns tensors. It may change its arguments in place. Every tensor that it reads
-            and that changes between calls must be among the arguments. It is run once for each set of shapes; after
-            that only its operations on tensors are repeated, so Python's decisions are those of that run.
-        once: whether to compile it for the shapes of the first call only, and to run it as it is for others.
+        function: takes tensors and returns tensors. It may change its arguments in place. Every
+            tensor that it reads and that changes between calls must be among the arguments. It is
+            run once for each set of shapes; after that only its operations on tensors are repeated,
+            so Python's decisions are those of that run.
+        once: whether to compile it for the shapes of the first call only, and to run it as it is
+            for others.
 
     Raises:
-        UserError: at a call, if there is no C++ compiler or no place for the library, or if the shape of a tensor
-            depends on values.
+        UserError: at a call, if there is no C++ compiler or no place for the library, or if the
+            shape of a tensor depends on values.
     """
 
     def __init__(self, function: Callable[..., Sequence[Tensor]], once: bool = False) -> None:
@@ -54,7 +58,9 @@ class Compiled:
 
     def __call__(self, *arguments: Tensor) -> Sequence[Tensor]:
         """Return the results of the function."""
-        layout = tuple((argument.shape, argument.stride(), argument.dtype) for argument in arguments)
+        layout = tuple(
+            (argument.shape, argument.stride(), argument.dtype) for argument in arguments
+        )
         if layout not in self.libraries:
             shapes = tuple(argument.shape for argument in arguments)
             if self.once and self.shapes and shapes not in self.shapes:
@@ -92,15 +98,20 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     from torch.fx.experimental import proxy_tensor  # takes half a second to import
 
     before = [argument.detach().clone() for argument in arguments]
-    # Shapes of the nodes take two thirds of the time of recording, and the compiler finds them again.
+    # Shapes of the nodes take two thirds of the time of recording, and the compiler finds them
+    # again.
     set_meta = proxy_tensor.set_meta
     without_shapes = patch.object(
-        proxy_tensor, "set_meta", lambda proxy, value: proxy if isinstance(value, Tensor) else set_meta(proxy, value)
+        proxy_tensor,
+        "set_meta",
+        lambda proxy, value: proxy if isinstance(value, Tensor) else set_meta(proxy, value),
     )
     with compiling(), without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Checks of values, as in TorchRL's distributions, are Python's decisions.
-        record_calls = proxy_tensor.make_fx(lambda *tensors: function(*tensors), _error_on_data_dependent_ops=False)
+        record_calls = proxy_tensor.make_fx(
+            lambda *tensors: function(*tensors), _error_on_data_dependent_ops=False
+        )
         graph = record_calls(*arguments)
     with torch.no_grad():
         for argument, value in zip(arguments, before, strict=True):
@@ -110,12 +121,20 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     graph.graph.eliminate_dead_code()
     graph.recompile()
     memory = {argument.untyped_storage().data_ptr() for argument in arguments}
-    shared = [name for name, constant in graph.named_buffers() if constant.untyped_storage().data_ptr() in memory]
+    shared = [
+        name
+        for name, constant in graph.named_buffers()
+        if constant.untyped_storage().data_ptr() in memory
+    ]
     if shared:
-        raise UserError("this cannot be compiled, because it reads a tensor that shares its memory with another one")
+        raise UserError(
+            "this cannot be compiled, because it reads a tensor that shares its memory with another one"
+        )
     for node in graph.graph.nodes:
         if DYNAMIC in getattr(node.target, "tags", ()):
-            raise UserError(f"this cannot be compiled, because {node.target} gives shapes that depend on values")
+            raise UserError(
+                f"this cannot be compiled, because {node.target} gives shapes that depend on values"
+            )
     return graph
 
 
@@ -132,8 +151,14 @@ def compiling() -> Iterator[None]:
 def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
     """Return a name for the compiled code of a graph on this machine."""
     parts: list[Any] = [graph.code, torch.__version__, torch.get_num_threads(), OPTIONS]
-    parts += [platform.node(), torch.backends.cpu.get_cpu_capability()]  # the code is for this processor
-    parts += [(argument.shape, argument.stride(), argument.dtype, argument.device) for argument in arguments]
+    parts += [
+        platform.node(),
+        torch.backends.cpu.get_cpu_capability(),
+    ]  # the code is for this processor
+    parts += [
+        (argument.shape, argument.stride(), argument.dtype, argument.device)
+        for argument in arguments
+    ]
     digest = hashlib.sha256(repr(parts).encode())
     for name, constant in sorted(graph.named_buffers()):
         digest.update(f"{name} {constant.dtype} {constant.shape}".encode())
@@ -149,7 +174,9 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         remedy = "set XDG_CACHE_HOME to another folder, or take compile=false"
-        raise UserError(f"{path.parent} cannot be made for compiled code ({error.strerror}); {remedy}") from error
+        raise UserError(
+            f"{path.parent} cannot be made for compiled code ({error.strerror}); {remedy}"
+        ) from error
     tqdm.write("compiling, once for these sizes and this machine (20 to 60 s) ...", file=sys.stderr)
     examples = tuple(argument.detach() for argument in arguments)
     try:

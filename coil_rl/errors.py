@@ -9,12 +9,22 @@ from pathlib import Path
 
 from hydra.errors import MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationKeyError, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    InterpolationKeyError,
+    OmegaConfBaseException,
+)
 
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 # Another kind of file than expected, or one that may not be used.
 IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP)
-LAUNCHERS = {"joblib": "joblib", "submitit_slurm": "slurm", "submitit_local": "slurm", "ray": "ray"}  # and their extras
+LAUNCHERS = {
+    "joblib": "joblib",
+    "submitit_slurm": "slurm",
+    "submitit_local": "slurm",
+    "ray": "ray",
+}  # and their extras
 
 
 class UserError(Exception):
@@ -58,14 +68,21 @@ def _message(error: BaseException) -> str:
     if isinstance(error, MissingConfigException):
         return _unknown_file(error)
     if isinstance(error, OSError):
-        name, remedy = error.filename or "the output", "choose another folder with hydra.run.dir=FOLDER"
+        name, remedy = (
+            error.filename or "the output",
+            "choose another folder with hydra.run.dir=FOLDER",
+        )
         if error.errno == errno.ENAMETOOLONG:
             name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
         elif error.errno in IN_THE_WAY:
             remedy = "put the right file or folder there, with the right to use it"
         return f"{name} cannot be used ({error.strerror}); {remedy}"
-    if isinstance(error, (AssertionError, TypeError)):  # of Hydra, for a choice of a group that is no text
-        return "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
+    if isinstance(
+        error, (AssertionError, TypeError)
+    ):  # of Hydra, for a choice of a group that is no text
+        return (
+            "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
+        )
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
     for key_error in (error, cause):
@@ -90,7 +107,9 @@ def _unknown_file(error: MissingConfigException) -> str:
     if group == "hydra/launcher" and name in LAUNCHERS:
         return f"hydra/launcher={name} is not installed: python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
     options = sorted(error.options or [])
-    choices = f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
+    choices = (
+        f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
+    )
     return f"there is no {group}={name}{choices}"
 
 
@@ -99,12 +118,20 @@ def _unknown_key(error: OmegaConfBaseException) -> str:
     names = parent if isinstance(parent, DictConfig) else []
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
-    add = f"; +{key}=VALUE adds it" if parent is not None and OmegaConf.get_type(parent) is dict else ""
+    add = (
+        f"; +{key}=VALUE adds it"
+        if parent is not None and OmegaConf.get_type(parent) is dict
+        else ""
+    )
     return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{did_you_mean(str(error.key), known)}"
 
 
 def _first_paragraph(error: BaseException) -> str:
     # Indented lines hold OmegaConf's internals.
     lines = str(error).partition("\n\n")[0].splitlines()
-    kept = [line.strip() for line in lines if line.strip() and not line.startswith((" ", "\t", "See http"))]
+    kept = [
+        line.strip()
+        for line in lines
+        if line.strip() and not line.startswith((" ", "\t", "See http"))
+    ]
     return " ".join(kept) or type(error).__name__

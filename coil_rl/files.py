@@ -14,15 +14,17 @@ from coil_rl.errors import UserError
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path with the same suffix that becomes `path` at the end of the block.
 
-    Parents are made and an older file is replaced. If the block raises, the temporary file is removed. A folder in its
-    place, or a file in that of a parent, is a `UserError`.
+    Parents are made and an older file is replaced. If the block raises, the temporary file is
+    removed. A folder in its place, or a file in that of a parent, is a `UserError`.
     """
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
         obstacle = next((place for place in path.parents if place.is_file()), path.parent)
-        raise UserError(f"{obstacle} is a file, but a folder is to be made there; remove it") from error
+        raise UserError(
+            f"{obstacle} is a file, but a folder is to be made there; remove it"
+        ) from error
     unfinished = temporary(path)
     try:
         yield unfinished

@@ -1,6 +1,7 @@
 """Schedules: values that change over a run.
 
-A schedule is called with the progress of the run, 0 at the start and 1 at the end, and returns a number.
+A schedule is called with the progress of the run, 0 at the start and 1 at the end, and returns a
+number.
 """
 
 from collections.abc import Callable
@@ -25,15 +26,21 @@ class Linear:
 
     def __post_init__(self) -> None:
         if not 0 < self.until <= 1:
-            raise ValueError(f"until={self.until} must be more than 0 and at most 1: it is a share of the run")
+            raise ValueError(
+                f"until={self.until} must be more than 0 and at most 1: it is a share of the run"
+            )
         if not 0 <= self.since <= self.until:
-            raise ValueError(f"since={self.since} must be at least 0 and at most until={self.until}")
+            raise ValueError(
+                f"since={self.since} must be at least 0 and at most until={self.until}"
+            )
 
     def __call__(self, progress: float) -> float:
         """Return the value at this progress."""
         if progress >= self.until:
             return self.end
-        return self.start + (self.end - self.start) * max(0.0, progress - self.since) / (self.until - self.since or 1.0)
+        return self.start + (self.end - self.start) * max(0.0, progress - self.since) / (
+            self.until - self.since or 1.0
+        )
 
 
 def schedule(value: float | Schedule) -> Schedule:

@@ -15,13 +15,15 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 def check_env(env: EnvBase, steps: int = 10) -> None:
     """Check an env in training mode.
 
-    Data fits the specs (else `check_env_specs` raises an `AssertionError`), numbers are finite, the same seed gives the
-    same rollout, a step leaves the data before it alone, and a partial reset leaves the other rows alone (else a
-    `ValueError` names the entry).
+    Data fits the specs (else `check_env_specs` raises an `AssertionError`), numbers are finite, the
+    same seed gives the same rollout, a step leaves the data before it alone, and a partial reset
+    leaves the other rows alone (else a `ValueError` names the entry).
     """
     set_progress(env.train(), 0.0)
     check_env_specs(env)
-    state = env.state_dict() if isinstance(env, TransformedEnv) else None  # of the transforms, which have no seed
+    state = (
+        env.state_dict() if isinstance(env, TransformedEnv) else None
+    )  # of the transforms, which have no seed
     rollouts = []
     for _ in range(2):
         if state is not None:
@@ -34,7 +36,9 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
         if value.is_floating_point() and not value.isfinite().all():
             raise ValueError(f"{key} holds a number that is not finite")
         if value.shape != again[key].shape or not torch.equal(value, again[key]):
-            raise ValueError(f"the same seed gives other values of {key}; draw random numbers from a seeded generator")
+            raise ValueError(
+                f"the same seed gives other values of {key}; draw random numbers from a seeded generator"
+            )
     data = env.rand_action(env.reset())
     copy = data.clone()
     env.step(data)
@@ -64,7 +68,9 @@ def _check_partial_reset(env: EnvBase) -> None:
         torch.manual_seed(0)  # of the action
         return env.step(env.rand_action(present))["next"]
 
-    plain, seeded, after_reset = (second_step(change) for change in (lambda present: present, seed, reset))
+    plain, seeded, after_reset = (
+        second_step(change) for change in (lambda present: present, seed, reset)
+    )
     if (plain == seeded).all():
         for key, value in plain.items(True, True):
             if not torch.equal(value[1:], after_reset[key][1:]):
@@ -80,8 +86,9 @@ def check_guide(
 ) -> None:
     """Check that a guide writes valid actions, does not change its input, and depends on nothing but its own row.
 
-    With an env the guide is asked through `GuideActions`, and the history is checked too: the same history gives the
-    same action, an episode begins without the memory of the one before, and the reset of a row leaves the others alone.
+    With an env the guide is asked through `GuideActions`, and the history is checked too: the same
+    history gives the same action, an episode begins without the memory of the one before, and the
+    reset of a row leaves the others alone.
 
     A `ValueError` states the first property that does not hold.
 
@@ -98,12 +105,16 @@ def check_guide(
     if isinstance(data, EnvBase):
         return _check_history(guide, data, action_key, tolerance, steps)
     if GuideActions({"guide": guide}, action_key).needs_past:
-        raise ValueError("the guide depends on earlier steps: give check_guide an env in place of data")
+        raise ValueError(
+            "the guide depends on earlier steps: give check_guide an env in place of data"
+        )
     inputs = data.select(*guide.in_keys)
     copy = inputs.clone()
     with torch.no_grad():
         together = guide(inputs.copy())[action_key]
-        alone = torch.cat([guide(inputs[row : row + 1].copy())[action_key] for row in range(len(inputs))])
+        alone = torch.cat(
+            [guide(inputs[row : row + 1].copy())[action_key] for row in range(len(inputs))]
+        )
     if not together.isfinite().all():
         raise ValueError("the guide's action is not finite")
     if not (inputs == copy).all():
@@ -133,7 +144,9 @@ class _Recorded(EnvBase):
         return self._present().update(self.full_reward_spec.zero())
 
     def _present(self) -> TensorDictBase:
-        present = self.data[:, self.step_number].select(*self.observation_spec.keys(True, True)).clone()
+        present = (
+            self.data[:, self.step_number].select(*self.observation_spec.keys(True, True)).clone()
+        )
         return present.update(self.full_done_spec.zero())
 
     def _set_seed(self, seed: int | None) -> None:
@@ -144,13 +157,23 @@ def _check_history(
     guide: TensorDictModuleBase, env: EnvBase, action_key: NestedKey, tolerance: float, steps: int
 ) -> None:
     with torch.no_grad():
-        data = [env.rollout(steps, break_when_any_done=False) for _ in range(1 if env.batch_size else 2)]
+        data = [
+            env.rollout(steps, break_when_any_done=False) for _ in range(1 if env.batch_size else 2)
+        ]
     shortest = min(map(len, data))
-    recorded: TensorDictBase = data[0] if env.batch_size else TensorDict.stack([one[:shortest] for one in data])
+    recorded: TensorDictBase = (
+        data[0] if env.batch_size else TensorDict.stack([one[:shortest] for one in data])
+    )
     if len(recorded.batch_size) != 2 or len(recorded) < 2:
-        raise ValueError(f"check_guide needs an env with one batch dimension of at least 2 rows, not {env.batch_size}")
+        raise ValueError(
+            f"check_guide needs an env with one batch dimension of at least 2 rows, not {env.batch_size}"
+        )
     env = TransformedEnv(_Recorded(env, recorded), GuideActions({"guide": guide}, action_key))
-    space, middle, last = ActionSpace(env.full_action_spec[action_key], 1), recorded.shape[1] // 2, recorded.shape[1]
+    space, middle, last = (
+        ActionSpace(env.full_action_spec[action_key], 1),
+        recorded.shape[1] // 2,
+        recorded.shape[1],
+    )
 
     def check_action(_: object, __: object, written: TensorDictBase) -> None:
         action = written[action_key]
@@ -167,11 +190,15 @@ def _check_history(
         present = env.reset()
         for step in range(recordings.shape[1]):
             if reset and step == middle:
-                mask = torch.tensor([True, *[False] * (len(recorded) - 1)], device=env.device).unsqueeze(-1)
+                mask = torch.tensor(
+                    [True, *[False] * (len(recorded) - 1)], device=env.device
+                ).unsqueeze(-1)
                 present = env.reset(present.set("_reset", mask))
             taken.append(present["guide_action"])
             if step + 1 < recordings.shape[1]:
-                action = TensorDict({action_key: recordings[action_key][:, step]}, present.batch_size)
+                action = TensorDict(
+                    {action_key: recordings[action_key][:, step]}, present.batch_size
+                )
                 present = env.step(present.update(action))["next"]
         return torch.stack(taken, 1)
 
@@ -182,7 +209,9 @@ def _check_history(
             interrupted = advice(reset=True)
         except (IndexError, RuntimeError) as error:
             cause = "so it may remember in itself, not in entries"
-            raise ValueError(f"the guide fails after a single row was reset, {cause}: {error}") from error
+            raise ValueError(
+                f"the guide fails after a single row was reset, {cause}: {error}"
+            ) from error
     finally:
         hook.remove()
 
@@ -195,7 +224,9 @@ def _check_history(
     if not equal(interrupted[1:], first[1:]):
         raise ValueError("the guide's action for a row depends on the reset of another row")
     if not equal(interrupted[0, middle:], fresh[0, : last - middle]):
-        raise ValueError("the guide's action after the reset of a row depends on what was before it")
+        raise ValueError(
+            "the guide's action after the reset of a row depends on what was before it"
+        )
 
 
 def check_transform(env: EnvBase, transform: Transform) -> None:

@@ -1,7 +1,8 @@
 """The cone world of the paper (section 4.1) as a batched TorchRL env.
 
-Each car drives on a closed track between two rings of cones at constant speed and chooses its steering. It observes the
-cones ahead. The reward pays for laps, newly visible cones and each step, and charges for rough steering and crashes.
+Each car drives on a closed track between two rings of cones at constant speed and chooses its
+steering. It observes the cones ahead. The reward pays for laps, newly visible cones and each step,
+and charges for rough steering and crashes.
 """
 
 import math
@@ -17,7 +18,15 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
-from coil_rl.envs.reward import HISTORY, TERMS, Outcome, RewardWeights, check_weights, recent_mean, weighted_terms
+from coil_rl.envs.reward import (
+    HISTORY,
+    TERMS,
+    Outcome,
+    RewardWeights,
+    check_weights,
+    recent_mean,
+    weighted_terms,
+)
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SAMPLES, SIGHT, Frame, View, encode_samples, view
 from coil_rl.envs.sorting import append, first_come, rows_in_use
 from coil_rl.envs.splines import spline_fit
@@ -33,7 +42,9 @@ class SeededEnv(EnvBase):
     generator: torch.Generator
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in (buffers := self.__dict__.get("_buffers", {})):  # PyTorch's checks take longer than an operation
+        if name in (
+            buffers := self.__dict__.get("_buffers", {})
+        ):  # PyTorch's checks take longer than an operation
             buffers[name] = value
         else:
             super().__setattr__(name, value)
@@ -54,35 +65,41 @@ class SeededEnv(EnvBase):
 class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B, 20], `cones`
-    [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering` [B, 1] the action in force,
-    `motion` [B, 3] (m ahead, m to the left, radians) since the last observation in the car's frame there, `reward`,
-    `done`, `terminated`, `truncated` [B, 1], and for evaluation only, under `info`: `track`, `lap` (completed laps),
-    `lap_time` s (of the lap just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness`
-    |a - mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per term.
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B,
+    20], `cones` [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering`
+    [B, 1] the action in force, `motion` [B, 3] (m ahead, m to the left, radians) since the last
+    observation in the car's frame there, `reward`, `done`, `terminated`, `truncated` [B, 1], and
+    for evaluation only, under `info`: `track`, `lap` (completed laps), `lap_time` s (of the lap
+    just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness` |a -
+    mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per
+    term.
 
     Args:
         tracks: the tracks.
         num_envs: B.
         rate: control steps per second.
-        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares parabola).
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
+            parabola).
         smoothing: lambda of the cubic smoothing spline, m^3.
-        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes into sight.
+        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes
+            into sight.
         reward: weights, see `RewardWeights`.
         laps: completed laps that end an episode.
         time_limit: s, after which an episode is truncated.
         held_steps: number of steps at the start of an episode with steering 0.
-        starts: number of places where an episode may begin; place i is on track i mod len(tracks), and those of a track
-            are spread along its middle. A lap that begins there counts as driven from the finish at full speed. None
-            for the starts of the tracks.
-        assignment: "random" draws a place at each reset; with `starts` it also draws at the first reset how much of
-            `time_limit` is over, so that the episodes do not end together. "cyclic" keeps car i on place i mod places.
+        starts: number of places where an episode may begin; place i is on track i mod len(tracks),
+            and those of a track are spread along its middle. A lap that begins there counts as
+            driven from the finish at full speed. None for the starts of the tracks.
+        assignment: "random" draws a place at each reset; with `starts` it also draws at the first
+            reset how much of `time_limit` is over, so that the episodes do not end together.
+            "cyclic" keeps car i on place i mod places.
         sight: m, range of view.
-        hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It is then made
-            without cones that share their x or y with a nearer one; a side with fewer than two lies at the origin.
+        hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It
+            is then made without cones that share their x or y with a nearer one; a side with fewer
+            than two lies at the origin.
         late_observation: whether `observation` is the one of the step before; `cones` are not late.
-        finish_in_sight: whether the finish line is between the first cones of the level file that are visible from the
-            track's start, in place of the first ones.
+        finish_in_sight: whether the finish line is between the first cones of the level file that
+            are visible from the track's start, in place of the first ones.
         kept_cones: K.
         speed: m/s.
         car_length: m.
@@ -134,7 +151,14 @@ class ConeTrackEnv(SeededEnv):
     ) -> None:
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
         check_choice(("random", "cyclic"), assignment=assignment)
-        check_range(0, above=True, num_envs=num_envs, kept_cones=kept_cones, speed=speed, car_length=car_length)
+        check_range(
+            0,
+            above=True,
+            num_envs=num_envs,
+            kept_cones=kept_cones,
+            speed=speed,
+            car_length=car_length,
+        )
         check_range(0, 100, above=True, sight=sight)
         check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, 1000, above=True, rate=rate)
@@ -147,7 +171,13 @@ class ConeTrackEnv(SeededEnv):
         check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype_, self.generator = dtype, torch.Generator()
-        self.rate, self.laps, self.held_steps, self.assignment, self.info = rate, laps, held_steps, assignment, info
+        self.rate, self.laps, self.held_steps, self.assignment, self.info = (
+            rate,
+            laps,
+            held_steps,
+            assignment,
+            info,
+        )
         self.max_steps = round(time_limit * rate)
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
@@ -173,18 +203,36 @@ class ConeTrackEnv(SeededEnv):
         bounded = partial(Bounded, -1, 1, dtype=self.dtype_, device=self.device)
         flag = Binary(1, dtype=torch.bool, device=self.device)
         observation = Composite(
-            observation=bounded((4 * SAMPLES,)), cones=real((2, self.kept_cones, 2)), cone_count=count((2,)),
-            steering=bounded((1,)), motion=real((3,)),
-        )  # fmt: skip
+            observation=bounded((4 * SAMPLES,)),
+            cones=real((2, self.kept_cones, 2)),
+            cone_count=count((2,)),
+            steering=bounded((1,)),
+            motion=real((3,)),
+        )
         if self.info:
             terms = Composite({term: real((1,)) for term in self.reward_terms})
             observation["info"] = Composite(
-                track=count((1,)), lap=count((1,)), lap_time=real((1,)), crashed=flag, completed=flag,
-                clearance=real((1,)), smoothness=real((1,)), pose=real((3,)), reward=terms,
-            )  # fmt: skip
-        ends = Composite({key: flag.clone() for key in ("done", "terminated", "truncated")}, device=self.device)
-        self.observation_spec, self.done_spec = observation.expand(self.batch_size), ends.expand(self.batch_size)
-        self.action_spec, self.reward_spec = bounded((*self.batch_size, 1)), real((*self.batch_size, 1))
+                track=count((1,)),
+                lap=count((1,)),
+                lap_time=real((1,)),
+                crashed=flag,
+                completed=flag,
+                clearance=real((1,)),
+                smoothness=real((1,)),
+                pose=real((3,)),
+                reward=terms,
+            )
+        ends = Composite(
+            {key: flag.clone() for key in ("done", "terminated", "truncated")}, device=self.device
+        )
+        self.observation_spec, self.done_spec = (
+            observation.expand(self.batch_size),
+            ends.expand(self.batch_size),
+        )
+        self.action_spec, self.reward_spec = (
+            bounded((*self.batch_size, 1)),
+            real((*self.batch_size, 1)),
+        )
 
     def _register_state(self, cars: int) -> None:
         """Register all state as buffers; their last dimension is the cars."""
@@ -197,21 +245,38 @@ class ConeTrackEnv(SeededEnv):
         self.history: Tensor = zeros(HISTORY)  # actions, newest first
         self.steps: Tensor = zeros(dtype=torch.int32)  # of the episode
         self.lap: Tensor = zeros(dtype=torch.int32)  # completed laps
-        self.lap_start: Tensor = zeros(dtype=torch.int32)  # step of the last entry of the finish circle
+        self.lap_start: Tensor = zeros(
+            dtype=torch.int32
+        )  # step of the last entry of the finish circle
         self.in_finish: Tensor = zeros(dtype=torch.bool)  # whether inside the finish circle
-        self.epoch: Tensor = zeros(dtype=torch.int32)  # number of steps over all episodes, and of resets
+        self.epoch: Tensor = zeros(
+            dtype=torch.int32
+        )  # number of steps over all episodes, and of resets
         self.lap_epoch: Tensor = zeros(dtype=torch.int32)  # epoch in which the lap began
-        self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)  # epoch of each cone's last sighting
-        self.samples: Tensor = zeros(2, SAMPLES, 2)  # m, last boundary estimate, in world coordinates
+        self.last_seen: Tensor = zeros(
+            2 * self.map.slots, dtype=torch.int32
+        )  # epoch of each cone's last sighting
+        self.samples: Tensor = zeros(
+            2, SAMPLES, 2
+        )  # m, last boundary estimate, in world coordinates
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
-        self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)  # observation that is not yet output
-        self.state_names = [name for name, _ in self.named_buffers(recurse=False) if name != "weights"]
+        self.latest: Tensor = zeros(
+            4 * SAMPLES if self.late_observation else 0
+        )  # observation that is not yet output
+        self.state_names = [
+            name for name, _ in self.named_buffers(recurse=False) if name != "weights"
+        ]
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
         index, pose, driven = map(torch.as_tensor, places(self.map.tracks, starts))
         tracks, pose = index.to(self.device), pose.T.contiguous().to(self.map.starts)
-        lap_start = torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed).round().int().to(self.device)
+        lap_start = (
+            torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed)
+            .round()
+            .int()
+            .to(self.device)
+        )
         frame = Frame(pose)
         location = self.map.locate(tracks, frame.position)
         visible, _, cones = self._view(location, pose, frame)
@@ -220,7 +285,13 @@ class ConeTrackEnv(SeededEnv):
         observation, samples, sampled = self._observe(frame, visible, cones, new, samples, sampled)
         latest = observation.t()
         outputs = {"observation": latest, "cones": visible.cones, "count": visible.count.long()}
-        state = {"track": tracks, "pose": pose, "lap_start": lap_start, "samples": samples, "sampled": sampled}
+        state = {
+            "track": tracks,
+            "pose": pose,
+            "lap_start": lap_start,
+            "samples": samples,
+            "sampled": sampled,
+        }
         state["latest"] = latest[: len(self.latest)]
         state["in_finish"] = _in_finish(location) & (lap_start > NEVER)
         for name, value in {**outputs, **state}.items():
@@ -239,7 +310,9 @@ class ConeTrackEnv(SeededEnv):
             drawn = torch.randint(count, self.batch_size, generator=self.generator)
             place = drawn.to(self.device).index_select(0, cars)
             if mask is None and self.staggered:
-                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator).to(steps)
+                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator).to(
+                    steps
+                )
 
         def start(of_places: Tensor) -> Tensor:
             return of_places.index_select(-1, place)
@@ -265,7 +338,9 @@ class ConeTrackEnv(SeededEnv):
         motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
         return self._output(observation.t(), cones, count, motion, info, terms)
 
-    def compile_steps(self, compiled: Callable[[Callable[..., list[Tensor]]], Callable[..., Sequence[Tensor]]]) -> None:
+    def compile_steps(
+        self, compiled: Callable[[Callable[..., list[Tensor]]], Callable[..., Sequence[Tensor]]]
+    ) -> None:
         """Compile the steps by a function that compiles one of tensors; the last digits of the numbers change."""
         self.compiled = compiled(self._step_on_tensors)
 
@@ -273,11 +348,15 @@ class ConeTrackEnv(SeededEnv):
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         if self.compiled is None:
             return self._advance(action)
-        values = self.compiled(action, *(getattr(self, name) for name in self.state_names), *self.tables)
+        values = self.compiled(
+            action, *(getattr(self, name) for name in self.state_names), *self.tables
+        )
         entries = len(self.entries)
         for name, value in zip(self.changed, values[entries:], strict=True):
             setattr(self, name, value)
-        return TensorDict(dict(zip(self.entries, values, strict=False)), self.batch_size, device=self.device)
+        return TensorDict(
+            dict(zip(self.entries, values, strict=False)), self.batch_size, device=self.device
+        )
 
     def _step_on_tensors(self, action: Tensor, *tensors: Tensor) -> list[Tensor]:
         """Return the entries after a step and the state that it replaces, for compilation."""
@@ -312,7 +391,11 @@ class ConeTrackEnv(SeededEnv):
 
         crashed = clearance <= constant(0, clearance)
         alive = (~crashed).to(action.dtype)
-        terms = self._reward(Outcome(action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive))
+        terms = self._reward(
+            Outcome(
+                action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive
+            )
+        )
         completed = (self.lap >= constant(self.laps, self.lap)) & ~crashed
         terminated = crashed | completed
         truncated = (self.steps >= constant(self.max_steps, self.steps)) & ~terminated
@@ -321,7 +404,14 @@ class ConeTrackEnv(SeededEnv):
         flags = {"crashed": crashed, "completed": completed}
         info = {"lap_time": lap_time, **flags, "clearance": clearance, "smoothness": roughness}
         return self._output(
-            observation, visible.cones, visible.count.long(), motion, info, terms, reward=reward, **ends
+            observation,
+            visible.cones,
+            visible.count.long(),
+            motion,
+            info,
+            terms,
+            reward=reward,
+            **ends,
         )
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
@@ -331,7 +421,9 @@ class ConeTrackEnv(SeededEnv):
         step = self.speed / self.rate
         strides = constant((step, step, step / self.car_length), self.pose)
         pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
-        return pose, torch.cat([constant((step, 0.0), pose).expand(2, len(turn)), (turn * strides[2]).unsqueeze(0)])
+        return pose, torch.cat(
+            [constant((step, 0.0), pose).expand(2, len(turn)), (turn * strides[2]).unsqueeze(0)]
+        )
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
         """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
@@ -350,12 +442,18 @@ class ConeTrackEnv(SeededEnv):
         return view(frame.to_car(cones), self.kept_cones, self.sight), slots, cones
 
     def _observe(
-        self, frame: Frame, visible: View, cones: Tensor, new: Tensor, samples: Tensor, sampled: Tensor
+        self,
+        frame: Frame,
+        visible: View,
+        cones: Tensor,
+        new: Tensor,
+        samples: Tensor,
+        sampled: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return the observation [B, 20] and the new `samples` and `sampled`.
 
-        A side with fewer than two visible cones keeps its last estimate. A held boundary is estimated where a cone of
-        the candidates is `new` [B] in sight.
+        A side with fewer than two visible cones keeps its last estimate. A held boundary is
+        estimated where a cone of the candidates is `new` [B] in sight.
         """
         if self.hold_boundary:
             rows = rows_in_use(new)
@@ -363,7 +461,9 @@ class ConeTrackEnv(SeededEnv):
                 index = visible.index.view(visible.real.shape).index_select(-1, rows)
                 chosen = cones.flatten(1).index_select(1, index.flatten()).view(2, *index.shape)
                 estimate = self._estimate_distinct(chosen, visible.count.index_select(1, rows))
-                estimate = torch.where(new.index_select(0, rows), estimate, samples.index_select(-1, rows))
+                estimate = torch.where(
+                    new.index_select(0, rows), estimate, samples.index_select(-1, rows)
+                )
                 samples = samples.index_copy(-1, rows, estimate)
             sampled = torch.ones_like(sampled)
             return encode_samples(frame.to_car(samples), sampled, self.sight), samples, sampled
@@ -371,23 +471,33 @@ class ConeTrackEnv(SeededEnv):
         local = self.fit(visible.cones, visible.count).equidistant(SAMPLES)
         samples = torch.lerp(samples, frame.to_world(local), fresh)
         sampled = torch.maximum(sampled, fresh)
-        return encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled, self.sight), samples, sampled
+        return (
+            encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled, self.sight),
+            samples,
+            sampled,
+        )
 
     def _estimate_distinct(self, cones: Tensor, count: Tensor) -> Tensor:
         """Return the samples of a held boundary in world coordinates [2, 5, 2, R], for cones [2, K, 2, R]."""
         real = count > constant(range(cones.shape[1]), cones[0])
         distinct = first_come(real, (cones.unsqueeze(1) == cones.unsqueeze(2)).any(0))
-        points, count = append(torch.zeros_like(cones), torch.zeros_like(count, dtype=torch.int64), cones, distinct)
+        points, count = append(
+            torch.zeros_like(cones), torch.zeros_like(count, dtype=torch.int64), cones, distinct
+        )
         return self.fit(points, count).equidistant(SAMPLES) * (count > 1)
 
-    def _count_new_cones(self, visible: View, slots: Tensor, finished: Tensor) -> tuple[Tensor, Tensor]:
+    def _count_new_cones(
+        self, visible: View, slots: Tensor, finished: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Note the visible cones; return the number of sides with a rewarded one and whether one came into view."""
         before = self.epoch
         self.epoch = before + constant(1, before)
         self.lap_epoch = torch.where(finished, self.epoch, self.lap_epoch)
         slots = slots.flatten().index_select(0, visible.index).view_as(visible.candidate)
         cars = len(self.epoch)
-        index = torch.add(constant(range(cars), self.epoch, torch.int64), slots, alpha=cars).flatten()
+        index = torch.add(
+            constant(range(cars), self.epoch, torch.int64), slots, alpha=cars
+        ).flatten()
         last_seen = self.last_seen.view(-1)
         last = last_seen.index_select(0, index).view_as(slots)
         rewarded = visible.real * torch.lt(last, before if self.every_sighting else self.lap_epoch)
@@ -397,23 +507,40 @@ class ConeTrackEnv(SeededEnv):
 
     def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
         """Return the terms of the reward, [B] each."""
-        return weighted_terms(outcome, dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True)))
+        return weighted_terms(
+            outcome, dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True))
+        )
 
     def _output(
-        self, observation: Tensor, cones: Tensor, count: Tensor, motion: Tensor, info: dict[str, Tensor],
-        terms: dict[str, Tensor], **ends: Tensor,
-    ) -> TensorDict:  # fmt: skip
+        self,
+        observation: Tensor,
+        cones: Tensor,
+        count: Tensor,
+        motion: Tensor,
+        info: dict[str, Tensor],
+        terms: dict[str, Tensor],
+        **ends: Tensor,
+    ) -> TensorDict:
         missing = self.kept_cones - cones.shape[1]
         if missing > 0:
             cones = torch.cat([cones, cones.new_zeros(2, missing, *cones.shape[2:])], 1)
-        data: dict[str, Any] = {"observation": observation, "cones": cones.permute(3, 2, 1, 0), "cone_count": count.t()}
+        data: dict[str, Any] = {
+            "observation": observation,
+            "cones": cones.permute(3, 2, 1, 0),
+            "cone_count": count.t(),
+        }
         data["motion"] = motion.t()
-        data |= {key: value.unsqueeze(-1) for key, value in {"steering": self.history[0], **ends}.items()}
+        data |= {
+            key: value.unsqueeze(-1) for key, value in {"steering": self.history[0], **ends}.items()
+        }
         if self.info:
             info = {"track": self.track, "lap": self.lap.long(), **info}
             entries: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in info.items()}
             rewards = {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}
-            entries |= {"pose": self.pose.t(), "reward": TensorDict(rewards, self.batch_size, device=self.device)}
+            entries |= {
+                "pose": self.pose.t(),
+                "reward": TensorDict(rewards, self.batch_size, device=self.device),
+            }
             data["info"] = TensorDict(entries, self.batch_size, device=self.device)
         return TensorDict(data, self.batch_size, device=self.device)
 

@@ -1,7 +1,8 @@
 """Cached constant tensors.
 
-On a small batch an operation with a Python number takes twice as long as one with a tensor, because PyTorch converts
-the number on every call. Creating the numbers 0, 1, 2, ... takes as long as two operations.
+On a small batch an operation with a Python number takes twice as long as one with a tensor, because
+PyTorch converts the number on every call. Creating the numbers 0, 1, 2, ... takes as long as two
+operations.
 """
 
 from collections.abc import Sequence
@@ -11,11 +12,13 @@ import torch
 from torch import Tensor
 
 
-def constant(value: float | Sequence[float], like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+def constant(
+    value: float | Sequence[float], like: Tensor, dtype: torch.dtype | None = None
+) -> Tensor:
     """Return a read-only constant that broadcasts against `like` [any, *batch], with its device and, by default, dtype.
 
-    A number gives a tensor without dimensions; one number per row, as a tuple or a range, gives [rows, 1, ...] with as
-    many dimensions as `like`.
+    A number gives a tensor without dimensions; one number per row, as a tuple or a range, gives
+    [rows, 1, ...] with as many dimensions as `like`.
     """
     make = _new if torch.compiler.is_compiling() else _cached
     return make(value, like.ndim - 1, dtype or like.dtype, like.device)
@@ -26,17 +29,23 @@ def flat_index(rows: Tensor) -> Tensor:
     rows = rows.view(len(rows), -1)
     columns = rows.shape[1]
     make = _new if torch.compiler.is_compiling() else _cached
-    return torch.add(make(range(columns), 0, rows.dtype, rows.device), rows, alpha=columns).flatten()
+    return torch.add(
+        make(range(columns), 0, rows.dtype, rows.device), rows, alpha=columns
+    ).flatten()
 
 
-def _new(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _new(
+    value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     if isinstance(value, int | float):
         return torch.tensor(value, dtype=dtype, device=device)
     return torch.tensor(list(value), dtype=dtype, device=device).view(-1, *[1] * dims)
 
 
 @lru_cache(maxsize=1024)
-def _cached(value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _cached(
+    value: float | Sequence[float], dims: int, dtype: torch.dtype, device: torch.device
+) -> Tensor:
     # Autograd rejects tensors created in inference mode, which may be active at the first call.
     with torch.inference_mode(False):
         return _new(value, dims, dtype, device)

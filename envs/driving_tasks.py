@@ -1,8 +1,8 @@
 """The cone world with driving tasks: the weights of the reward change within the episode.
 
-Each car has a task, such as keeping to the left, which is a set of weights of the reward. The task is observed and
-changes at random, so one agent has to learn all tasks, as in the puppeteer example of Dynamic COIL: one guide per task,
-and one agent that learns from all guides.
+Each car has a task, such as keeping to the left, which is a set of weights of the reward. The task
+is observed and changes at random, so one agent has to learn all tasks, as in the puppeteer example
+of Dynamic COIL: one guide per task, and one agent that learns from all guides.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,9 @@ class PositionWeights(NamedTuple):
 
     centre: float = 0.0  # per step and unit of |position|
     left: float = 0.0  # per step and unit of position
-    inside: float = 0.0  # per step and unit of position times action, positive on the inner side of a bend
+    inside: float = (
+        0.0  # per step and unit of position times action, positive on the inner side of a bend
+    )
 
 
 WEIGHTS = (*RewardWeights._fields, *PositionWeights._fields)
@@ -32,15 +34,16 @@ WEIGHTS = (*RewardWeights._fields, *PositionWeights._fields)
 class DrivingTasksEnv(ConeTrackEnv):
     """Cars on tracks between cones, each with a task that changes.
 
-    Writes in addition to `ConeTrackEnv`: `task` [B, tasks], one-hot, the task of the next step; and under `info`:
-    `task`, with one entry [B, 1] per task, whether the step was rewarded by it, and in `reward` the terms of
-    `PositionWeights`.
+    Writes in addition to `ConeTrackEnv`: `task` [B, tasks], one-hot, the task of the next step; and
+    under `info`: `task`, with one entry [B, 1] per task, whether the step was rewarded by it, and
+    in `reward` the terms of `PositionWeights`.
 
     Args:
         tracks, num_envs, world: as for `ConeTrackEnv`.
         tasks: name to weights, of `RewardWeights` and `PositionWeights`.
         only: a task that all cars keep; by default they change between all tasks.
-        duration: s, mean time until a task changes to another one, drawn every step with equal probabilities.
+        duration: s, mean time until a task changes to another one, drawn every step with equal
+            probabilities.
         reward: weights that a task does not set.
 
     Example:
@@ -69,7 +72,9 @@ class DrivingTasksEnv(ConeTrackEnv):
         for name, weights in tasks.items():
             check_weights(f"tasks.{name}", weights, WEIGHTS)
         if not tasks:
-            raise ValueError("tasks is empty; give at least one, such as tasks={centred: {centre: -1.0}}")
+            raise ValueError(
+                "tasks is empty; give at least one, such as tasks={centred: {centre: -1.0}}"
+            )
         if only is not None and only not in tasks:
             raise ValueError(f"only={only!r} must be one of {', '.join(tasks)}")
         super().__init__(tracks, num_envs, **world)
@@ -84,10 +89,14 @@ class DrivingTasksEnv(ConeTrackEnv):
         self.one_hot: Tensor = nn.Buffer(torch.eye(len(tasks), **options), persistent=False)
         first = 0 if only is None else self.tasks.index(only)
         self.task: Tensor = nn.Buffer(torch.full(self.batch_size, first, device=self.device))
-        self.observation_spec["task"] = OneHot(len(tasks), (*self.batch_size, len(tasks)), **options)
+        self.observation_spec["task"] = OneHot(
+            len(tasks), (*self.batch_size, len(tasks)), **options
+        )
         if self.info:
             flag = Binary(1, (*self.batch_size, 1), dtype=torch.bool, device=self.device)
-            self.observation_spec["info", "task"] = Composite(dict.fromkeys(self.tasks, flag), shape=self.batch_size)
+            self.observation_spec["info", "task"] = Composite(
+                dict.fromkeys(self.tasks, flag), shape=self.batch_size
+            )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         out = super()._reset(tensordict, **kwargs)
@@ -107,13 +116,17 @@ class DrivingTasksEnv(ConeTrackEnv):
 
     def _next_task(self) -> Tensor:
         """Return the tasks of the next step [B]; one draw per car decides about the change and the new task."""
-        drawn = torch.rand(self.batch_size, generator=self.generator).to(self.device, non_blocking=True)
+        drawn = torch.rand(self.batch_size, generator=self.generator).to(
+            self.device, non_blocking=True
+        )
         others = len(self.tasks) - 1
         shift = (drawn * (self.duration * self.rate * others)).floor_().to(self.task.dtype) + 1
         return torch.where(shift <= others, (self.task + shift) % len(self.tasks), self.task)
 
     def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
-        weights = dict(zip(WEIGHTS, self.task_weights.index_select(1, self.task).unbind(0), strict=True))
+        weights = dict(
+            zip(WEIGHTS, self.task_weights.index_select(1, self.task).unbind(0), strict=True)
+        )
         to_left, to_right = outcome.to_boundaries
         position = (to_right - to_left) / (to_right + to_left)
         terms = {"centre": position.abs(), "left": position, "inside": position * outcome.action}

@@ -24,22 +24,29 @@ REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is r
 class SeededRows(SeededEnv):
     """Base of batched envs made of single ones; every episode begins with a seed of its own.
 
-    `state_dict` holds the generator and, for each running episode, its seed and actions. `load_state_dict` repeats
-    these actions: a deterministic env goes on to the bit. `continues` says whether it did. If not, because the last
-    observations differ or an episode is longer than 20,000 steps, a warning is given, and the env must be reset.
+    `state_dict` holds the generator and, for each running episode, its seed and actions.
+    `load_state_dict` repeats these actions: a deterministic env goes on to the bit. `continues`
+    says whether it did. If not, because the last observations differ or an episode is longer than
+    20,000 steps, a warning is given, and the env must be reset.
 
     Args:
-        rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or none if the episode is
-            over; then the row stays as it is, with reward 0.
+        rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or
+            none if the episode is over; then the row stays as it is, with reward 0.
         seed: of the draw of the episodes' seeds.
-        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to draw the seeds.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
+            draw the seeds.
         cases: number of different episodes, by default that of the rows.
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
 
     def __init__(
-        self, rows: Sequence[Any], seed: int, first_seed: int | None, cases: int | None, device: torch.device | str
+        self,
+        rows: Sequence[Any],
+        seed: int,
+        first_seed: int | None,
+        cases: int | None,
+        device: torch.device | str,
     ) -> None:
         check_range(0, LARGEST_SEED, seed=seed, first_seed=first_seed or 0)
         check_range(1, cases=1 if cases is None else cases)
@@ -122,7 +129,9 @@ class SeededRows(SeededEnv):
 
 def _same(one: Any, other: Any) -> bool:
     if isinstance(one, dict):
-        return one.keys() == other.keys() and all(_same(value, other[key]) for key, value in one.items())
+        return one.keys() == other.keys() and all(
+            _same(value, other[key]) for key, value in one.items()
+        )
     return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
 
 
@@ -150,14 +159,15 @@ class _EnvRow:
 class EnvBatch(SeededRows):
     """TorchRL envs without batch as one env of batch size [num_envs], stepped one after the other.
 
-    The entries are those of the single env, with the batch dimension in front. Entries that the single env reads beside
-    its action come from its own last step. An env that draws from PyTorch's global generator in its steps cannot be
-    continued to the bit; see `continues` of `SeededRows`.
+    The entries are those of the single env, with the batch dimension in front. Entries that the
+    single env reads beside its action come from its own last step. An env that draws from PyTorch's
+    global generator in its steps cannot be continued to the bit; see `continues` of `SeededRows`.
 
     Args:
         of: makes one env, without a batch and with one action.
         num_envs: B.
-        max_steps: steps after which an episode is truncated, for an env that does not end by itself.
+        max_steps: steps after which an episode is truncated, for an env that does not end by
+            itself.
         seed, first_seed, cases: of the episodes, as for `SeededRows`.
 
     Example:
@@ -183,10 +193,16 @@ class EnvBatch(SeededRows):
         one = envs[0]
         name = type(one).__name__
         if one.batch_size:
-            raise ValueError(f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without batch")
+            raise ValueError(
+                f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without batch"
+            )
         if len(one.action_keys) != 1:
-            raise ValueError(f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}")
-        super().__init__([_EnvRow(env) for env in envs], seed, first_seed, cases, one.device or "cpu")
+            raise ValueError(
+                f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
+            )
+        super().__init__(
+            [_EnvRow(env) for env in envs], seed, first_seed, cases, one.device or "cpu"
+        )
         for spec in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
             full = f"full_{spec}"
             setattr(self, full, getattr(one, full).expand(num_envs).to(self.device))
@@ -195,6 +211,10 @@ class EnvBatch(SeededRows):
         return torch.from_numpy(actions)
 
     def _output(self, *, stepped: bool) -> TensorDict:
-        specs = [self.full_observation_spec, self.full_done_spec, *([self.full_reward_spec] if stepped else [])]
+        specs = [
+            self.full_observation_spec,
+            self.full_done_spec,
+            *([self.full_reward_spec] if stepped else []),
+        ]
         keys = [key for spec in specs for key in spec.keys(True, True)]
         return torch.stack([row.after.select(*keys) for row in self.rows]).to(self.device)

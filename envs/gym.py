@@ -1,6 +1,7 @@
 """The cone world as `coil_rl/ConeTrack-v0` of Gymnasium, one car or a batch.
 
-Importing this module registers the id; `gymnasium.make("coil_rl.envs.gym:coil_rl/ConeTrack-v0")` does both at once.
+Importing this module registers the id; `gymnasium.make("coil_rl.envs.gym:coil_rl/ConeTrack-v0")`
+does both at once.
 """
 
 from collections.abc import Sequence
@@ -54,7 +55,11 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         **options: Any,
     ) -> None:
         tracks = shipped_tracks(tracks) if isinstance(tracks, str) else tracks
-        self.num_envs, self.env, self.advice = num_envs, ConeTrackEnv(tracks, num_envs, **options), advice
+        self.num_envs, self.env, self.advice = (
+            num_envs,
+            ConeTrackEnv(tracks, num_envs, **options),
+            advice,
+        )
         numbers = self.env.observation_spec["observation"].shape[-1] + (advice is not None)
         self.single_observation_space = Box(-1.0, 1.0, (numbers,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
@@ -62,7 +67,9 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     @torch.no_grad()
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
         """Put all cars on the starts of newly drawn tracks; a seed determines all draws from now on."""
         first = self._np_random is None
         super().reset(seed=seed)
@@ -76,13 +83,20 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         """Drive one step and reset the cars whose episode ended."""
         step, state = self.env.step_and_maybe_reset(self.action(actions))
         after = step["next"]
-        reward, terminated, truncated = (_numpy(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated"))
+        reward, terminated, truncated = (
+            _numpy(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated")
+        )
         done = terminated | truncated
         final: dict[str, Any] = {}
         if done.any():
             last = np.full(self.num_envs, None, dtype=object)
             last[done] = np.fromiter(self.observe(after[after["done"].squeeze(-1)]), dtype=object)
-            final = {"final_obs": last, "final_info": _info(after), "_final_obs": done, "_final_info": done}
+            final = {
+                "final_obs": last,
+                "final_info": _info(after),
+                "_final_obs": done,
+                "_final_info": done,
+            }
         return self.observe(state), reward, terminated, truncated, _info(state) | final
 
     def action(self, actions: Floats) -> TensorDict:
@@ -94,7 +108,9 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         """Return the observations of a state, with the advice appended."""
         observation = state["observation"]
         if self.advice is not None:
-            observation = torch.cat([observation, self.advice(state.select(*self.advice.in_keys))["action"]], -1)
+            observation = torch.cat(
+                [observation, self.advice(state.select(*self.advice.in_keys))["action"]], -1
+            )
         return _numpy(observation.float())
 
 
@@ -116,7 +132,9 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
         self.observation_space = self.cars.single_observation_space
         self.action_space = self.cars.single_action_space
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Floats, dict[str, Any]]:
         """Put the car on the start of a newly drawn track; a seed determines all draws from now on."""
         super().reset(seed=seed)
         observation, info = self.cars.reset(seed=seed)
@@ -126,7 +144,9 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
     def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Drive one step."""
         state = self.cars.env.step(self.cars.action(action))["next"]
-        reward, terminated, truncated = (state[key].item() for key in ("reward", "terminated", "truncated"))
+        reward, terminated, truncated = (
+            state[key].item() for key in ("reward", "terminated", "truncated")
+        )
         return self.cars.observe(state)[0], reward, terminated, truncated, _first_row(_info(state))
 
 
@@ -143,9 +163,19 @@ def _info(state: TensorDictBase) -> dict[str, Any]:
 
 def _first_row(info: dict[str, Any]) -> dict[str, Any]:
     """Return the first car's entries, scalars as Python numbers."""
-    rows = {key: _first_row(entry) if isinstance(entry, dict) else entry[0] for key, entry in info.items()}
-    return {key: row if isinstance(row, dict) or np.ndim(row) else row.item() for key, row in rows.items()}
+    rows = {
+        key: _first_row(entry) if isinstance(entry, dict) else entry[0]
+        for key, entry in info.items()
+    }
+    return {
+        key: row if isinstance(row, dict) or np.ndim(row) else row.item()
+        for key, row in rows.items()
+    }
 
 
 if ID not in gymnasium.registry:
-    gymnasium.register(ID, entry_point=f"{__name__}:ConeTrackGym", vector_entry_point=f"{__name__}:ConeTrackVectorGym")
+    gymnasium.register(
+        ID,
+        entry_point=f"{__name__}:ConeTrackGym",
+        vector_entry_point=f"{__name__}:ConeTrackVectorGym",
+    )

@@ -31,15 +31,16 @@ Env = gymnasium.Env[Any, Any]
 class GymnasiumEnv(SeededRows):
     """Gymnasium envs as one env of batch size [num_envs], stepped one after the other in this process.
 
-    Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation: `observation`, or one
-    entry a key of a Dict space (nested as there; a Tuple has the keys "0", "1", ...). A Box is a tensor of `dtype`, but
-    uint8 stays uint8; Discrete and MultiDiscrete are one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts
-    are left out. Actions are bounded or unbounded for a Box (and clamped to its bounds), indices for Discrete [B] and
+    Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation:
+    `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
+    "1", ...). A Box is a tensor of `dtype`, but uint8 stays uint8; Discrete and MultiDiscrete are
+    one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts are left out. Actions are
+    bounded or unbounded for a Box (and clamped to its bounds), indices for Discrete [B] and
     MultiDiscrete [B, n], and 0 or 1 for MultiBinary.
 
-    A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state goes on to the bit if
-    the env is deterministic, see `SeededRows`. `rate` is the steps per second at which the env is drawn, NaN if it does
-    not say.
+    A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state
+    goes on to the bit if the env is deterministic, see `SeededRows`. `rate` is the steps per second
+    at which the env is drawn, NaN if it does not say.
 
     Args:
         id: registered name; "MODULE:NAME" imports the module first.
@@ -48,16 +49,20 @@ class GymnasiumEnv(SeededRows):
         wrappers: callables that take an env and return one, applied in this order.
         max_steps: steps after which an episode is truncated, instead of the registered number.
         seed: of the draw of the episodes' seeds.
-        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to draw the seeds.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
+            draw the seeds.
         cases: number of different episodes, by default `num_envs`.
-        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where missing.
-        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets one object an env,
-            `THING(env)`, with a method `act(observation)` and, if it wants, `reset()`, called at the start of an
-            episode; a function is called as `THING(env, observation)`. Either may be a `functools.partial`. Its action
-            for the present observation is written as ("controller", NAME), not clamped; after a termination it is the
-            last one.
-        fresh: whether every episode has a new env, for those whose reset leaves something of the past. BipedalWalker is
-            one: without `fresh`, its episodes depend on the seed and, a little, on those before.
+        info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where
+            missing.
+        controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
+            one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
+            `reset()`, called at the start of an episode; a function is called as `THING(env,
+            observation)`. Either may be a `functools.partial`. Its action for the present
+            observation is written as ("controller", NAME), not clamped; after a termination it is
+            the last one.
+        fresh: whether every episode has a new env, for those whose reset leaves something of the
+            past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
+            little, on those before.
         render: whether `render` gives pictures.
         device: of all tensors.
         dtype: of all floating-point tensors.
@@ -91,7 +96,10 @@ class GymnasiumEnv(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
-        settings = {**(options or {}), **({} if max_steps is None else {"max_episode_steps": max_steps})}
+        settings = {
+            **(options or {}),
+            **({} if max_steps is None else {"max_episode_steps": max_steps}),
+        }
         makes = [partial(_make, id, wrappers, settings)] * num_envs
         self.shown = render and "rgb_array" in makes[0]().metadata.get("render_modes", ())
         if self.shown:
@@ -104,21 +112,32 @@ class GymnasiumEnv(SeededRows):
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
-        self.entries = [Entry(id, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)]
+        self.entries = [
+            Entry(id, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
+        ]
         observation = Composite()
         for entry in self.entries:
             if entry.key[0] in RESERVED:
-                raise ValueError(f"the observation of {id} has an entry {entry.key[0]!r}: rename it with a wrapper")
+                raise ValueError(
+                    f"the observation of {id} has an entry {entry.key[0]!r}: rename it with a wrapper"
+                )
             observation[entry.key] = entry.spec
         for name in self.info:
             observation["info", name] = number.clone()
         for name in makers:
             # Advice is written as given, and may be out of bounds.
-            advice = Unbounded(action.shape, dtype=dtype) if isinstance(action, Bounded) else action.clone()
+            advice = (
+                Unbounded(action.shape, dtype=dtype)
+                if isinstance(action, Bounded)
+                else action.clone()
+            )
             observation["controller", name] = advice
-        ends = Composite({name: Binary(1, dtype=torch.bool) for name in ("done", "terminated", "truncated")})
+        ends = Composite(
+            {name: Binary(1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
+        )
         self.observation_spec, self.done_spec, self.action_spec, self.reward_spec = (
-            spec.to(self.device).expand(*self.batch_size, *spec.shape) for spec in (observation, ends, action, number)
+            spec.to(self.device).expand(*self.batch_size, *spec.shape)
+            for spec in (observation, ends, action, number)
         )
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -138,7 +157,11 @@ class GymnasiumEnv(SeededRows):
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
         if isinstance(self.space, spaces.Box):
-            shaped = actions.astype(self.space.dtype) if self.space.shape else actions.astype(self.space.dtype)[..., 0]
+            shaped = (
+                actions.astype(self.space.dtype)
+                if self.space.shape
+                else actions.astype(self.space.dtype)[..., 0]
+            )
             return np.clip(shaped, self.space.low, self.space.high)
         return actions + start(self.space)
 
@@ -147,7 +170,9 @@ class GymnasiumEnv(SeededRows):
         terminated = np.array([[row.terminated] for row in rows], dtype=bool)
         truncated = np.array([[row.truncated] for row in rows], dtype=bool)
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        data = TensorDict({name: torch.from_numpy(end) for name, end in ends.items()}, self.batch_size)
+        data = TensorDict(
+            {name: torch.from_numpy(end) for name, end in ends.items()}, self.batch_size
+        )
         if stepped:
             data["reward"] = self._numbers([row.reward for row in rows])
         for entry in self.entries:
@@ -170,14 +195,18 @@ class GymnasiumEnv(SeededRows):
 class _Row:
     """One Gymnasium env and the controllers beside it; see `rows` of `SeededRows`."""
 
-    def __init__(self, make: Callable[[], Env], makers: Mapping[str, Callable[..., Any]], fresh: bool) -> None:
+    def __init__(
+        self, make: Callable[[], Env], makers: Mapping[str, Callable[..., Any]], fresh: bool
+    ) -> None:
         self.make, self.makers, self.fresh = make, makers, fresh
         self.advice: dict[str, NDArray[Any]] = {}
         self._open()
 
     def _open(self) -> None:
         self.env = self.make()
-        self.controllers = {name: _controller(name, maker, self.env) for name, maker in self.makers.items()}
+        self.controllers = {
+            name: _controller(name, maker, self.env) for name, maker in self.makers.items()
+        }
 
     def begin(self, seed: int) -> None:
         if self.fresh:
@@ -207,7 +236,9 @@ class _Row:
             else:
                 fits = space.contains(advice)
             if not fits:
-                raise ValueError(f"controller {name} gave {advice.tolist()}, not an action of {space}")
+                raise ValueError(
+                    f"controller {name} gave {advice.tolist()}, not an action of {space}"
+                )
             self.advice[name] = advice - start(space)
 
 
@@ -216,11 +247,17 @@ def _make(id: str, wrappers: Sequence[Callable[[Env], Env]], settings: Mapping[s
     try:
         env: Env = gymnasium.make(id, **{"disable_env_checker": True, **settings})
     except (errors.Error, ImportError, TypeError, AssertionError, OSError, ValueError) as error:
-        reason = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".") or type(error).__name__
+        reason = (
+            re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
+            or type(error).__name__
+        )
         extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
         if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
             reason = f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
-        elif isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)) and "mean" not in reason:
+        elif (
+            isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound))
+            and "mean" not in reason
+        ):
             reason += f"; if a package registers it, write PACKAGE:{id}"
         raise ValueError(f"the env {id} cannot be made: {reason}") from error
     for wrapper in wrappers:
@@ -239,7 +276,9 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
         raise ValueError(f"{problem}; write PACKAGE.MODULE:THING") from error
 
 
-def _controller(name: str, maker: Callable[..., Any], env: Env) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
+def _controller(
+    name: str, maker: Callable[..., Any], env: Env
+) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
     """Return what gives the action for an observation, and what to call at the start of an episode."""
     if not inspect.isclass(getattr(maker, "func", maker)):
         return partial(maker, env), lambda: None
@@ -248,5 +287,7 @@ def _controller(name: str, maker: Callable[..., Any], env: Env) -> tuple[Callabl
     except TypeError as error:
         raise ValueError(f"controller {name} cannot be made with its env: {error}") from error
     if not callable(getattr(controller, "act", None)):
-        raise ValueError(f"controller {name}: {type(controller).__name__} needs a method act(observation)")
+        raise ValueError(
+            f"controller {name}: {type(controller).__name__} needs a method act(observation)"
+        )
     return controller.act, getattr(controller, "reset", lambda: None)

@@ -7,7 +7,15 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from numpy.typing import NDArray
-from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, TensorSpec, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    MultiCategorical,
+    MultiOneHot,
+    TensorSpec,
+    Unbounded,
+)
 
 
 class Entry:
@@ -20,7 +28,9 @@ class Entry:
         floats: dtype of entries that are not uint8.
     """
 
-    def __init__(self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]) -> None:
+    def __init__(
+        self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]
+    ) -> None:
         self.path, self.dtype, self.start = path, floats, start(space)
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
         whole = not path or isinstance(path[0], int)
@@ -32,27 +42,36 @@ class Entry:
             # Places of the first choices in the vector.
             self.first = np.cumsum([0, *self.choices[:-1]])
         elif isinstance(space, spaces.Box) and space.dtype == np.uint8:
-            self.dtype, self.spec = np.dtype(np.uint8), Unbounded(space.shape or (1,), dtype=torch.uint8)
+            self.dtype, self.spec = (
+                np.dtype(np.uint8),
+                Unbounded(space.shape or (1,), dtype=torch.uint8),
+            )
         elif isinstance(space, spaces.Box):
             self.spec = Unbounded(space.shape or (1,), dtype=dtype)
         elif isinstance(space, spaces.MultiBinary):
             self.spec = Bounded(0, 1, space.shape, dtype=dtype)
         else:
-            raise ValueError(f"the observation of {id} has a {type(space).__name__} space: replace it with a wrapper")
+            raise ValueError(
+                f"the observation of {id} has a {type(space).__name__} space: replace it with a wrapper"
+            )
 
     def __call__(self, observations: Sequence[Any]) -> NDArray[Any]:
         """Return this entry of observations, [B, *shape]."""
         for part in self.path:
             observations = [observation[part] for observation in observations]
         if not self.choices:
-            return np.array(observations, dtype=self.dtype).reshape(len(observations), *self.spec.shape)
+            return np.array(observations, dtype=self.dtype).reshape(
+                len(observations), *self.spec.shape
+            )
         chosen = (np.array(observations) - self.start).reshape(len(observations), -1) + self.first
         vectors = np.zeros((len(observations), *self.spec.shape), self.dtype)
         np.put_along_axis(vectors, chosen, 1, 1)
         return vectors
 
 
-def leaves(space: spaces.Space[Any], path: tuple[str | int, ...] = ()) -> Iterator[tuple[Any, spaces.Space[Any]]]:
+def leaves(
+    space: spaces.Space[Any], path: tuple[str | int, ...] = ()
+) -> Iterator[tuple[Any, spaces.Space[Any]]]:
     """Yield the path and the space of all entries but texts."""
     if isinstance(space, (spaces.Dict, spaces.Tuple)):
         parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
@@ -79,7 +98,9 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         shape = space.shape or (1,)
         if not space.is_bounded():
             return Unbounded(shape, dtype=dtype)
-        low, high = (torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high))
+        low, high = (
+            torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)
+        )
         return Bounded(low, high, shape, dtype=dtype)
     if isinstance(space, spaces.Discrete):
         return Categorical(int(space.n), dtype=torch.int64)
@@ -87,4 +108,6 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         return MultiCategorical(_choices(space), dtype=torch.int64)
     if isinstance(space, spaces.MultiBinary):
         return Binary(shape=space.shape, dtype=torch.int8)
-    raise ValueError(f"the action of {id} is a {type(space).__name__} space: replace it with a wrapper")
+    raise ValueError(
+        f"the action of {id} is a {type(space).__name__} space: replace it with a wrapper"
+    )

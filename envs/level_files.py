@@ -26,14 +26,17 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
     """Read a level file: CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down).
 
     Args:
-        path: the file; extra columns, blank lines and case are ignored. A `TrackError` names it and its fault.
+        path: the file; extra columns, blank lines and case are ignored. A `TrackError` names it and
+            its fault.
         start: x in m, y in m (pointing up), heading in degrees; see `Track` for the default.
     """
     path = Path(path)
     sides: dict[str, list[tuple[float, float]]] = {"LEFT": [], "RIGHT": []}
     for line, (side, *cells) in _rows(path):
         if side.upper() not in sides:
-            raise TrackError(f"{path}, line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT.")
+            raise TrackError(
+                f"{path}, line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT."
+            )
         try:
             x, y = np.asarray_chkfinite(cells, dtype=np.float64)
         except ValueError:
@@ -59,11 +62,21 @@ def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = No
     """Read a level file, or all *.csv of a folder in natural order, with one `start` for all; see `load_track`."""
     if not os.path.isdir(path):
         return [load_track(path, start)]
-    files = [file for file in Path(path).glob("*") if file.suffix.lower() == ".csv" and not file.name.startswith(".")]
+    files = [
+        file
+        for file in Path(path).glob("*")
+        if file.suffix.lower() == ".csv" and not file.name.startswith(".")
+    ]
     if not files:
-        raise TrackError(f"The folder {path} holds no level files (*.csv); give a folder with some, or one file.")
+        raise TrackError(
+            f"The folder {path} holds no level files (*.csv); give a folder with some, or one file."
+        )
     # MAP_2 comes before MAP_10: every second part of the split is a number.
-    files.sort(key=lambda file: [int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", file.name))])
+    files.sort(
+        key=lambda file: [
+            int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", file.name))
+        ]
+    )
     return [load_track(file, start) for file in files]
 
 
@@ -72,7 +85,10 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
     cones = [("LEFT", *cone) for cone in track.left] + [("RIGHT", *cone) for cone in track.right]
     lines = [",".join(["", *COLUMNS])]
     # Adding zero turns -0.0 into 0.0.
-    lines += [f"{k},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}" for k, (side, x, y) in enumerate(cones)]
+    lines += [
+        f"{k},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}"
+        for k, (side, x, y) in enumerate(cones)
+    ]
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.unfinished")
@@ -83,8 +99,12 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
 def shipped_tracks(split: Split) -> list[Track]:
     """Return the project's own tracks: seven to "train" on, three to "test" on, or "all" ten."""
     if split not in ("train", "test", "all"):
-        raise ValueError(f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'.")
-    return [track for part in ("train", "test") if split in (part, "all") for track in _shipped(part)]
+        raise ValueError(
+            f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'."
+        )
+    return [
+        track for part in ("train", "test") if split in (part, "all") for track in _shipped(part)
+    ]
 
 
 def track_names(tracks: Sequence[Track]) -> list[str]:
@@ -118,21 +138,31 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise TrackError(f"{path} is not a text file; save the level as CSV in UTF-8.") from None
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise TrackError(f"{path} cannot be read ({reason}); give the path of a level file.") from None
+        raise TrackError(
+            f"{path} cannot be read ({reason}); give the path of a level file."
+        ) from None
     if text is None:
-        raise TrackError(f"{path} is no file of at most {MAX_BYTES} bytes; give the path of a level file.")
+        raise TrackError(
+            f"{path} is no file of at most {MAX_BYTES} bytes; give the path of a level file."
+        )
     if not text.strip():
-        raise TrackError(f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}.")
+        raise TrackError(
+            f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}."
+        )
     reader = csv.reader(io.StringIO(text))
     try:
         header = [name.strip() for name in next(reader)]
         columns = [name.casefold() for name in header]
         for column in COLUMNS:
             if column.casefold() not in columns:
-                raise TrackError(f"{path} has no column {column}; the columns of its first line are {header}.")
+                raise TrackError(
+                    f"{path} has no column {column}; the columns of its first line are {header}."
+                )
         order = [columns.index(column.casefold()) for column in COLUMNS]
         for row in reader:
             if any(cell.strip() for cell in row):
                 yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in order]
     except csv.Error as error:
-        raise TrackError(f"{path}, line {reader.line_num}: {error}; save the level as plain CSV.") from None
+        raise TrackError(
+            f"{path}, line {reader.line_num}: {error}; save the level as plain CSV."
+        ) from None

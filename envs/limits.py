@@ -7,7 +7,9 @@ LARGEST_COUNT = 10**6  # of laps, and of seconds or held steps of an episode
 LARGEST_STARTS = 10**5  # places of a world where an episode may begin
 
 
-def check_range(low: float, high: float = math.inf, *, above: bool = False, **values: float) -> None:
+def check_range(
+    low: float, high: float = math.inf, *, above: bool = False, **values: float
+) -> None:
     """Raise a `ValueError` for the first value outside of [low, high], and for NaN and infinity.
 
     `above` excludes `low` itself.
@@ -15,7 +17,9 @@ def check_range(low: float, high: float = math.inf, *, above: bool = False, **va
     upper = f"and at most {high}" if high < math.inf else "and finite"
     for name, value in values.items():
         if not (low < value if above else low <= value) or value > high or math.isinf(value):
-            raise ValueError(f"{name}={value} must be {'more than' if above else 'at least'} {low} {upper}")
+            raise ValueError(
+                f"{name}={value} must be {'more than' if above else 'at least'} {low} {upper}"
+            )
 
 
 def check_choice(choices: tuple[str, ...], **values: str) -> None:

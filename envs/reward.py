@@ -42,7 +42,10 @@ def weighted_terms(outcome: Outcome, weights: Mapping[str, Tensor]) -> dict[str,
     """Return the terms of the paper's reward (4.1.1), [B] each, for weights that are scalars or [B]."""
     alive = outcome.alive
     return {
-        "finish": torch.addcmul(outcome.finished * weights["finish"], outcome.lap_time, weights["second"]) * alive,
+        "finish": torch.addcmul(
+            outcome.finished * weights["finish"], outcome.lap_time, weights["second"]
+        )
+        * alive,
         "crash": outcome.crashed * weights["crash"],
         "cone": outcome.discovered * weights["cone"] * alive,
         "smooth": outcome.roughness * weights["smooth"] * alive,
@@ -63,6 +66,8 @@ def check_weights(name: str, weights: Mapping[str, float], known: Sequence[str])
 def recent_mean(history: Tensor) -> Tensor:
     """Return the mean of the last actions [20, B], newest first, weighted by exp(-0.1 k); fixed summation order."""
     weights = [math.exp(-0.1 * k) for k in range(HISTORY)]
-    fours = (history * constant(tuple(weight / sum(weights) for weight in weights), history)).view(2, 2, 5, -1)
+    fours = (history * constant(tuple(weight / sum(weights) for weight in weights), history)).view(
+        2, 2, 5, -1
+    )
     pairs = torch.add(*fours.unbind(0))
     return reduce(torch.add, torch.add(*pairs.unbind(0)).unbind(0))

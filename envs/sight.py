@@ -85,9 +85,12 @@ def encode_samples(samples: Tensor, known: Tensor, sight: float = SIGHT) -> Tens
     """
     x, y = samples.transpose(1, 2).unbind(0)
     distance = torch.addcmul(x * x, y, y).sqrt_()
-    # The half-angle formula is exact for angles within the clipping range. `atan2` rounds differently at the end of a
-    # tensor. The term of 1e-30 keeps a sample straight behind the car at 180 degrees.
-    tangent = torch.add(y, distance - x, alpha=1e-30) / (distance + x).clamp_(min=torch.finfo(x.dtype).tiny)
+    # The half-angle formula is exact for angles within the clipping range. `atan2` rounds
+    # differently at the end of a tensor. The term of 1e-30 keeps a sample straight behind the car
+    # at 180 degrees.
+    tangent = torch.add(y, distance - x, alpha=1e-30) / (distance + x).clamp_(
+        min=torch.finfo(x.dtype).tiny
+    )
     both = torch.stack([distance, tangent.atan_()], 2)
     low, scale = constant((-1, 0), known), constant((2 / sight, 2 / WIDEST_ANGLE), known)
     both = torch.addcmul(low, both, scale).clamp_(-1, 1) * known.view(2, 1, 1, -1)

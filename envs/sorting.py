@@ -1,7 +1,8 @@
 """Batched selection: the smallest entries of each column, entries without a conflict, and lists that grow.
 
-`Tensor.topk` processes one column after another, up to a microsecond each. A sorting network of minima and maxima
-applies a few dozen operations to all columns at once, which is faster for many columns.
+`Tensor.topk` processes one column after another, up to a microsecond each. A sorting network of
+minima and maxima applies a few dozen operations to all columns at once, which is faster for many
+columns.
 """
 
 import torch
@@ -17,14 +18,15 @@ _TOPK_LIMIT = 16_384  # entries; up to this size `topk` is faster than the netwo
 def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     """Return the rows of the k smallest unmasked entries of each column, smallest first.
 
-    Non-negative floats order like the integers with the same bits. The lowest bits of each entry are replaced by its
-    row, so entries that differ in those bits only (for 64 rows, 8e-6 in float32) count as equal and keep their order.
+    Non-negative floats order like the integers with the same bits. The lowest bits of each entry
+    are replaced by its row, so entries that differ in those bits only (for 64 rows, 8e-6 in
+    float32) count as equal and keep their order.
 
     Args:
         values: [N, *batch], from 0 to 1e12.
         masked: [N, *batch], 1 for entries to skip, else 0.
-        k: number of rows to return, at most N: [k, *batch], int32 (int64 for float64). Masked entries fill up columns
-            with fewer, in any order.
+        k: number of rows to return, at most N: [k, *batch], int32 (int64 for float64). Masked
+            entries fill up columns with fewer, in any order.
     """
     rows_padded = 1 << max(1, (len(values) - 1).bit_length())
     integer = _BITS[values.dtype]
@@ -33,7 +35,11 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     keys = keys.bitwise_and_(constant(-rows_padded, rows)).bitwise_or_(rows)
     if k == 1:
         first = keys.amin(0, keepdim=True)
-    elif keys.device.type == "cpu" and keys.numel() <= _TOPK_LIMIT and not torch.compiler.is_compiling():
+    elif (
+        keys.device.type == "cpu"
+        and keys.numel() <= _TOPK_LIMIT
+        and not torch.compiler.is_compiling()
+    ):
         first = keys.topk(k, 0, largest=False).values
     else:
         first = _bitonic_sort(keys, rows_padded, k)
@@ -43,12 +49,15 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
 def _bitonic_sort(keys: Tensor, rows_padded: int, k: int) -> Tensor:
     """Return the first k rows of [N, *batch], sorted by Batcher's bitonic network of a power of two of rows.
 
-    A pair of sorted runs is merged by comparing the first run with the reversed second one, which separates the smaller
-    from the larger half, and by splitting each half in the same way down to single rows. Rows beyond k are dropped.
+    A pair of sorted runs is merged by comparing the first run with the reversed second one, which
+    separates the smaller from the larger half, and by splitting each half in the same way down to
+    single rows. Rows beyond k are dropped.
     """
     batch = keys.shape[1:]
     if rows_padded > len(keys):
-        keys = torch.cat([keys, keys.new_full((rows_padded - len(keys), *batch), torch.iinfo(keys.dtype).max)])
+        keys = torch.cat(
+            [keys, keys.new_full((rows_padded - len(keys), *batch), torch.iinfo(keys.dtype).max)]
+        )
     keys = keys.view(rows_padded, -1)
     run = 1
     while run < len(keys):
@@ -88,8 +97,8 @@ def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
 def append(points: Tensor, count: Tensor, more: Tensor, selected: Tensor) -> tuple[Tensor, Tensor]:
     """Append the selected ones of `more` [D, M, *batch] to lists of points in order, as far as there is room.
 
-    The lists `points` are [D, N, *batch], of which `count` [*batch], integers, are in use; `selected` is [M, *batch],
-    bool. Returns the new lists and counts.
+    The lists `points` are [D, N, *batch], of which `count` [*batch], integers, are in use;
+    `selected` is [M, *batch], bool. Returns the new lists and counts.
     """
     room = points.shape[1]
     slot = torch.where(selected, count + selected.cumsum(0) - 1, room).clamp_(max=room)

@@ -1,15 +1,17 @@
 """Parametric splines through padded batches of points (appendix A.2).
 
-The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, fitted again when it sees a new cone.
-A spline is stored as its positions and second derivatives at its knots, which determine the curve between two knots.
-The cubic smoothing spline and the least-squares parabola are therefore one class with two fits. Both take `points`
-[D, K, *batch] in m, in order, K >= 2, and `count` [*batch], the number of real points of each row; other slots may hold
-any finite number. They raise ValueError for other shapes. A row with two points yields a line, with one a constant,
+The self-evolving spline of definition A.2 is the path of `SplineMemoryGuide`, fitted again when it
+sees a new cone. A spline is stored as its positions and second derivatives at its knots, which
+determine the curve between two knots. The cubic smoothing spline and the least-squares parabola are
+therefore one class with two fits. Both take `points` [D, K, *batch] in m, in order, K >= 2, and
+`count` [*batch], the number of real points of each row; other slots may hold any finite number.
+They raise ValueError for other shapes. A row with two points yields a line, with one a constant,
 with none zeros.
 
-The batch comes last, so each step of a recursion over the K slots is one contiguous operation for the whole batch.
-Sums are taken in slot order and no branch depends on data, so a row's result depends on its own points only, to the
-last bit. Masks are numbers 0 and 1, which are much faster than booleans in PyTorch's CPU kernels.
+The batch comes last, so each step of a recursion over the K slots is one contiguous operation for
+the whole batch. Sums are taken in slot order and no branch depends on data, so a row's result
+depends on its own points only, to the last bit. Masks are numbers 0 and 1, which are much faster
+than booleans in PyTorch's CPU kernels.
 """
 
 import math
@@ -32,7 +34,9 @@ class Spline:
 
     knots: Tensor  # [K, *batch], m, chord length up to each point
     values: Tensor  # [D, K, *batch], m, positions at the knots
-    bends: Tensor  # [D, K, *batch], 1/m, second derivatives at the knots, linear between two of them
+    bends: (
+        Tensor  # [D, K, *batch], 1/m, second derivatives at the knots, linear between two of them
+    )
 
     @property
     def polyline_length(self) -> Tensor:
@@ -54,7 +58,8 @@ class Spline:
 
     def _at(self, u: Tensor) -> Tensor:
         dim, rows = len(self.values), self.knots[0].numel()
-        # Strict comparison places the end of the spline in the last real interval instead of the padding.
+        # Strict comparison places the end of the spline in the last real interval instead of the
+        # padding.
         inner = self.knots.detach()[1:-1].unsqueeze(1)
         below = torch.gt(u.detach(), inner, out=u.new_empty(len(inner), *u.shape))
         start = flat_index(below.sum(0).long())
@@ -64,36 +69,47 @@ class Spline:
         g0, g1 = self.bends.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
 
         width, before, after = x1 - x0, u - x0, x1 - u
-        # Real intervals are much wider than eps (see _chords); splines of one point or none have width 0.
+        # Real intervals are much wider than eps (see _chords); splines of one point or none have
+        # width 0.
         t = before / width.clamp(min=torch.finfo(u.dtype).eps)
         chord = torch.lerp(y0, y1, t)
         return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
 
 
-def spline_fit(spline: Literal["cubic", "quadratic"], smoothing: float) -> Callable[[Tensor, Tensor], Spline]:
+def spline_fit(
+    spline: Literal["cubic", "quadratic"], smoothing: float
+) -> Callable[[Tensor, Tensor], Spline]:
     """Return the fit of that name, else a `ValueError`; the least-squares parabola has no `smoothing`."""
     check_choice(("cubic", "quadratic"), spline=spline)
-    return partial(smoothing_spline, smoothing=smoothing) if spline == "cubic" else least_squares_parabola
+    return (
+        partial(smoothing_spline, smoothing=smoothing)
+        if spline == "cubic"
+        else least_squares_parabola
+    )
 
 
 def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     """Fit a natural cubic smoothing spline, parametric in chord length (appendix A.2).
 
-    Minimises sum |y_i - f(u_i)|^2 + smoothing * integral |f''|^2 du by Reinsch's system for the second derivatives g,
-    (R + smoothing Q'Q) g = Q'y and f = y - smoothing Q g. `smoothing` is in m^3; 0 interpolates.
+    Minimises sum |y_i - f(u_i)|^2 + smoothing * integral |f''|^2 du by Reinsch's system for the
+    second derivatives g, (R + smoothing Q'Q) g = Q'y and f = y - smoothing Q g. `smoothing` is in
+    m^3; 0 interpolates.
     """
     if not 0 <= smoothing < math.inf:
         raise ValueError(f"smoothing={smoothing} must be a finite number of at least 0")
     real, knots, step, h = _chords(points, count)
     per_m = h.reciprocal()
-    # R = tridiag(h/6, (h+h)/3, h/6) and the columns of Q are (1/h, -1/h - 1/h', 1/h'), scaled by sqrt(smoothing).
+    # R = tridiag(h/6, (h+h)/3, h/6) and the columns of Q are (1/h, -1/h - 1/h', 1/h'), scaled by
+    # sqrt(smoothing).
     side = per_m * constant(math.sqrt(smoothing), h)
     left, right = side[:-1], side[1:]
     middle, far, span = left + right, left * right, h[:-1] + h[1:]
     # Minus half the sum of the squares of the three entries of a column.
     squares = torch.addcmul(far, middle, middle, value=-1)
     diagonal = torch.add(span * constant(1 / 3, h), squares, alpha=-2)
-    near = torch.addcmul(h[1:-1] * constant(1 / 6, h), side[1:-1], middle[:-1] + middle[1:], value=-1)
+    near = torch.addcmul(
+        h[1:-1] * constant(1 / 6, h), side[1:-1], middle[:-1] + middle[1:], value=-1
+    )
     slope = step * per_m
     turns = slope[:, 1:] - slope[:, :-1]  # at each inner point, Q'y: [D, K-2, *batch], at most 2
     bends = _solve(diagonal, near, far[1:-1], turns, real[2:-1], span * constant(1 / 4, h))
@@ -116,8 +132,9 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     n = count.clamp(min=1).to(points.dtype)
     two, three = ((count - k).clamp(0, 1).to(points.dtype) for k in (1, 2))
     scale = torch.maximum(knots[-1], h[0])
-    # Polynomials orthogonal on the knots, each coefficient fitted to the residual of the previous ones, are well
-    # conditioned in float32 too. A polynomial that too few points determine is 0, its norm 1.
+    # Polynomials orthogonal on the knots, each coefficient fitted to the residual of the previous
+    # ones, are well conditioned in float32 too. A polynomial that too few points determine is 0,
+    # its norm 1.
     t = knots / scale
     p1 = (t - _total(t * real, 0) / n) * real
     n1 = _total(p1 * p1, 0) + (1 - two)
@@ -131,13 +148,16 @@ def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
     c1 = (_total(left * p1, 1) / n1).unsqueeze(1)
     c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
     fitted = origin + (c0 + c1 * p1 + c2 * p2)
-    return Spline(knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points))
+    return Spline(
+        knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points)
+    )
 
 
 def slots_in_use(count: Tensor, slots: int) -> int:
     """Return the number of slots to compute for counts [*batch], at least 2.
 
-    Padding does not change results, so it is skipped where reading the data is cheap: on a CPU, outside compiled code.
+    Padding does not change results, so it is skipped where reading the data is cheap: on a CPU,
+    outside compiled code.
     """
     if count.device.type != "cpu" or torch.compiler.is_compiling() or not count.numel():
         return slots
@@ -152,8 +172,9 @@ def _total(x: Tensor, dim: int) -> Tensor:
 def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return masks of real slots [K+1, *batch], knots [K, *batch], steps [D, K-1, *batch] and their lengths, m.
 
-    The last of the K+1 slots is never real. Lengths have a floor of eps^(1/3) times 1 m or the longest step (1 cm in
-    float32, 10 um in float64), which keeps quotients finite and Q'Q precise for coincident points and in the padding.
+    The last of the K+1 slots is never real. Lengths have a floor of eps^(1/3) times 1 m or the
+    longest step (1 cm in float32, 10 um in float64), which keeps quotients finite and Q'Q precise
+    for coincident points and in the padding.
     """
     if points.ndim < 2 or points.shape[1] < 2 or points.shape[2:] != count.shape:
         given = f"points {list(points.shape)} and count {list(count.shape)}"
@@ -175,13 +196,16 @@ def _repeat_last(x: Tensor, real: Tensor) -> Tensor:
     return torch.lerp((x * last).sum(1, keepdim=True), x, real)
 
 
-def _solve(diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Tensor, least: Tensor) -> Tensor:
+def _solve(
+    diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Tensor, least: Tensor
+) -> Tensor:
     """Solve the symmetric pentadiagonal systems for the second derivatives at inner points by L D L', slot by slot.
 
-    The main diagonal is [K-2, *batch], the off-diagonals `near` and `far` one and two shorter, the right-hand side
-    `turns` [D, K-2, *batch]. Unknowns that are not `real` are 0. Pivots fall below `least` only by rounding errors of
-    nearly coincident points: those of R alone are at least (h + h') / 4, and Q'Q adds to them. The result is
-    [D, K, *batch], zeros in the first and the last slot.
+    The main diagonal is [K-2, *batch], the off-diagonals `near` and `far` one and two shorter, the
+    right-hand side `turns` [D, K-2, *batch]. Unknowns that are not `real` are 0. Pivots fall below
+    `least` only by rounding errors of nearly coincident points: those of R alone are at least (h +
+    h') / 4, and Q'Q adds to them. The result is [D, K, *batch], zeros in the first and the last
+    slot.
     """
     nears, fars = list(near.unbind(0)), far.unbind(0)
     lower, lowest, right, inverse = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()

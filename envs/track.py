@@ -15,8 +15,8 @@ Side = Literal["left", "right"]
 
 SIDES: tuple[Side, Side] = ("left", "right")
 AS_COMPLEX = np.array([1, 1j])
-# Limits of a track. Boundaries are sampled every few centimetres and an env stores a grid of the whole area, so a level
-# in millimetres would fill the memory.
+# Limits of a track. Boundaries are sampled every few centimetres and an env stores a grid of the
+# whole area, so a level in millimetres would fill the memory.
 MIN_CONES, MAX_CONES = 4, 1000
 MAX_COORDINATE = 10_000.0  # m
 MAX_EXTENT, MAX_LENGTH = 500.0, 5000.0  # m, of a side
@@ -34,8 +34,9 @@ class TrackError(ValueError):
 class Track:
     """A closed track between two rings of cones.
 
-    A `TrackError` is raised for too few, too many, coincident or non-finite cones, sides beyond the limits, boundaries
-    that cross themselves or each other, a left side that is not on the left, or a start or finish off the track.
+    A `TrackError` is raised for too few, too many, coincident or non-finite cones, sides beyond the
+    limits, boundaries that cross themselves or each other, a left side that is not on the left, or
+    a start or finish off the track.
 
     Example:
         >>> import numpy as np
@@ -49,11 +50,12 @@ class Track:
     name: str  # for display
     left: Array  # [N, 2] m, the cones of the left side in driving order, x right and y up
     right: Array  # [M, 2] m, the cones of the right side
-    # x in m, y in m, heading in rad anticlockwise from +x; by default the midpoint of the last left and the last right
-    # cone, heading for the finish.
+    # x in m, y in m, heading in rad anticlockwise from +x; by default the midpoint of the last left
+    # and the last right cone, heading for the finish.
     start: tuple[float, float, float] = None  # type: ignore[assignment]  # set in __post_init__
 
-    # Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon through the cones.
+    # Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon
+    # through the cones.
     def __post_init__(self) -> None:
         for side in SIDES:
             cones = np.array(getattr(self, side), dtype=np.float64)
@@ -85,12 +87,15 @@ class Track:
     @property
     def length(self) -> float:
         """Return the length of a lap in m: the mean length of the two boundaries."""
-        return float(np.mean([np.linalg.norm(_edges(self.boundary(side)), axis=1).sum() for side in SIDES]))
+        return float(
+            np.mean([np.linalg.norm(_edges(self.boundary(side)), axis=1).sum() for side in SIDES])
+        )
 
     def boundary(self, side: Side, spacing: float = 0.05) -> Array:
         """Sample a boundary, the closed cubic spline through a side's cones by chord length: [P, 2], m.
 
-        Points are at most `spacing` m apart along the chords, from the first cone on, which is not repeated at the end.
+        Points are at most `spacing` m apart along the chords, from the first cone on, which is not
+        repeated at the end.
         """
         cones: Array = getattr(self, side)
         chord = np.concatenate([[0.0], np.linalg.norm(_edges(cones), axis=1).cumsum()])
@@ -105,21 +110,31 @@ class Track:
     def _check_boundaries(self, rings: dict[Side, Array]) -> None:
         for side, ring in rings.items():
             if not np.isfinite(ring).all() or np.ptp(ring, axis=0).max() > 2 * MAX_EXTENT:
-                fault = f"The {side} boundary of track {self.name!r} swings far out between its cones"
+                fault = (
+                    f"The {side} boundary of track {self.name!r} swings far out between its cones"
+                )
                 raise TrackError(f"{fault}; space them evenly, in driving order.")
         crossing = _first_crossing(rings)
         if crossing is not None:
             sides, point = crossing
-            fault = "two sides cross each other" if len(sides) == 2 else f"{sides.pop()} side crosses itself"
+            fault = (
+                "two sides cross each other"
+                if len(sides) == 2
+                else f"{sides.pop()} side crosses itself"
+            )
             remedy = "list each side's cones in driving order and keep the two sides apart"
-            raise TrackError(f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; {remedy}.")
+            raise TrackError(
+                f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; {remedy}."
+            )
         # By the sign of the enclosed areas.
         lines = [rings[side] @ AS_COMPLEX for side in SIDES]
         anticlockwise = [(line.conj() * np.roll(line, -1)).imag.sum() > 0 for line in lines]
         # The left ring is the inner one of a track driven anticlockwise.
         inner, outer = SIDES if anticlockwise[0] else SIDES[::-1]
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
-            fault = f"The left side of track {self.name!r} is not on the left of its driving direction"
+            fault = (
+                f"The left side of track {self.name!r} is not on the left of its driving direction"
+            )
             raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
 
 
@@ -144,16 +159,19 @@ def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
 def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:
     """Choose places where an episode may begin: place i is on track i mod len(tracks), in the middle of its width.
 
-    The places of a track are spread along the lap, also if only the first ones are used; None gives the tracks' starts.
+    The places of a track are spread along the lap, also if only the first ones are used; None gives
+    the tracks' starts.
 
     Returns:
-        Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish in m, [P], NaN for
-        the start of a track, from where the first lap has not begun.
+        Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish
+        in m, [P], NaN for the start of a track, from where the first lap has not begun.
     """
     if count is None:
         starts = np.array([track.start for track in tracks])
         return np.arange(len(tracks)), starts, np.full(len(tracks), np.nan)
-    poses, driven = zip(*(_spread(track, -(-count // len(tracks))) for track in tracks), strict=True)
+    poses, driven = zip(
+        *(_spread(track, -(-count // len(tracks))) for track in tracks), strict=True
+    )
     index = np.arange(count) % len(tracks)
     return index, np.stack(poses, 1).reshape(-1, 3)[:count], np.stack(driven, 1).ravel()[:count]
 
@@ -179,11 +197,15 @@ def resample(ring: Array, spacing: float) -> Array:
 def _check_cones(side: str, cones: Array) -> None:
     if cones.ndim != 2 or cones.shape[1] != 2 or not MIN_CONES <= len(cones) <= MAX_CONES:
         remedy = f"give {MIN_CONES} to {MAX_CONES}, of shape [N, 2]"
-        raise TrackError(f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; {remedy}.")
+        raise TrackError(
+            f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; {remedy}."
+        )
     outside = np.flatnonzero(~(np.abs(cones) <= MAX_COORDINATE).all(axis=1))
     if len(outside):
         remedy = f"give finite coordinates in m, at most {MAX_COORDINATE:.0f} from the origin"
-        raise TrackError(f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; {remedy}.")
+        raise TrackError(
+            f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; {remedy}."
+        )
     lengths = np.linalg.norm(_edges(cones), axis=1)
     if np.ptp(cones, axis=0).max() > MAX_EXTENT or lengths.sum() > MAX_LENGTH:
         limits = f"{MAX_EXTENT:.0f} m across and {MAX_LENGTH:.0f} m long"
@@ -192,7 +214,9 @@ def _check_cones(side: str, cones: Array) -> None:
     if len(coincident):
         first, second = coincident[0], (coincident[0] + 1) % len(cones)
         remedy = "remove one of them (the ring closes by itself, its first cone is not repeated)"
-        raise TrackError(f"Cones {first} and {second} of the {side} lie on the same spot; {remedy}.")
+        raise TrackError(
+            f"Cones {first} and {second} of the {side} lie on the same spot; {remedy}."
+        )
 
 
 def _edges(ring: Array) -> Array:
@@ -212,11 +236,14 @@ def _first_crossing(rings: dict[Side, Array]) -> tuple[set[Side], Array] | None:
     count = len(rings["left"])
     successor = np.arange(1, len(begin) + 1)
     successor[[count - 1, -1]] = 0, count
-    # Two segments can only cross if their midpoints are no farther apart than the longest segment is long.
+    # Two segments can only cross if their midpoints are no farther apart than the longest segment
+    # is long.
     reach = np.linalg.norm(edge, axis=1).max()
     tree = cKDTree(begin + edge / 2)
     if tree.count_neighbors(tree, reach) > MAX_PAIRS:
-        raise TrackError("The boundaries overlap nearly everywhere; list each side's cones in driving order.")
+        raise TrackError(
+            "The boundaries overlap nearly everywhere; list each side's cones in driving order."
+        )
     one, other = tree.query_pairs(reach, output_type="ndarray").T
 
     def on_left(point: NDArray[np.intp], line: NDArray[np.intp]) -> NDArray[np.bool_]:

@@ -1,9 +1,10 @@
 """Random tracks: circuits with straights, esses and hairpins, each determined by its seed.
 
-The centre line is the outline of a few grid cells that grow at random without enclosing a hole, so it is one loop. The
-grid has uneven rows and columns; some corners of the outline are dropped, the others are moved, rounded by arcs and
-smoothed. Draws that are too tight or too close to themselves are rejected. Points are complex numbers x + iy in this
-module, lengths are in m and curvatures in 1/m.
+The centre line is the outline of a few grid cells that grow at random without enclosing a hole, so
+it is one loop. The grid has uneven rows and columns; some corners of the outline are dropped, the
+others are moved, rounded by arcs and smoothed. Draws that are too tight or too close to themselves
+are rejected. Points are complex numbers x + iy in this module, lengths are in m and curvatures in
+1/m.
 """
 
 from functools import lru_cache
@@ -21,11 +22,14 @@ LAP = (59.0, 146.0)
 WIDTH = (1.9, 2.9)
 RADIUS, INNER_RADIUS = 2.5, 1.6
 FREE_SPACE = 2.0
-NEIGHBOURS = 8.0  # distance along the lap within which the radius alone keeps two points apart, half a hairpin
+# distance along the lap within which the radius alone keeps two points apart, half a hairpin
+NEIGHBOURS = 8.0
 CONE_GAP = 1.62
 # Parameters of the draw.
 CELL = (5.8, 8.8)
-CELLS_PER_METRE = 0.078  # an outline of n cells has up to 2 n + 2 edges, some of which the corners remove
+CELLS_PER_METRE = (
+    0.078  # an outline of n cells has up to 2 n + 2 edges, some of which the corners remove
+)
 SMOOTHING = 1.0
 STEP, FINE_STEP = 0.25, 0.1
 TRIES = 5000
@@ -84,7 +88,8 @@ def _rounded(edges: Line, cut: Array) -> Line:
     """Replace the corners of a closed polygon of `edges` [C] by arcs that begin and end `cut` [C] from the corner."""
     turns = np.angle(np.roll(edges, -1) / edges)
     straights = np.abs(edges) - cut - np.roll(cut, 1)
-    # The radius is cut / tan(turn / 2); without a turn, any small angle gives the right length, 2 cut.
+    # The radius is cut / tan(turn / 2); without a turn, any small angle gives the right length, 2
+    # cut.
     angles = np.maximum(np.abs(turns), 1e-3)
     arcs = cut * angles / np.tan(angles / 2)
     travelled = np.cumsum(np.stack([straights, arcs], axis=1))
@@ -106,9 +111,15 @@ def _outline(rng: np.random.Generator, size: int) -> list[tuple[int, int]]:
         step = ring[2 * rng.integers(4)]
         cell = (origin[0] + step[0], origin[1] + step[1])
         taken = [(cell[0] + i, cell[1] + j) in cells for i, j in ring]
-        # Contiguous neighbours leave no hole and no corner at which the outline touches itself. Thin branches make the
-        # hairpins, so cells with several neighbours are accepted less often.
-        contiguous = sum(now and not before for now, before in zip(taken, taken[-1:] + taken[:-1], strict=True)) == 1
+        # Contiguous neighbours leave no hole and no corner at which the outline touches itself.
+        # Thin branches make the hairpins, so cells with several neighbours are accepted less often.
+        contiguous = (
+            sum(
+                now and not before
+                for now, before in zip(taken, taken[-1:] + taken[:-1], strict=True)
+            )
+            == 1
+        )
         if cell not in cells and contiguous and rng.random() < 0.15 ** (sum(taken[::2]) - 1):
             cells.add(cell)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -138,7 +149,9 @@ def _width(rng: np.random.Generator, points: int) -> Array:
     """Draw a track width that varies slowly along the lap: [points]."""
     turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
     waves = np.arange(1, 2 + points * STEP // 20)
-    wave = np.cos(np.outer(turn, waves) + rng.uniform(0, 2 * np.pi, len(waves))) @ rng.normal(size=len(waves))
+    wave = np.cos(np.outer(turn, waves) + rng.uniform(0, 2 * np.pi, len(waves))) @ rng.normal(
+        size=len(waves)
+    )
     middle = rng.uniform(0.3, 0.7)
     return WIDTH[0] + (WIDTH[1] - WIDTH[0]) * (middle + 0.3 * wave / np.abs(wave).max())
 

@@ -1,7 +1,8 @@
 """Lookup tables of tracks: candidate cones for sight, and the distance to a crash.
 
-All static geometry is computed once: for each square metre and each of 12 heading sectors the cones that may be
-visible, and on a fine grid the distance to each boundary. A step of thousands of cars then reads a few numbers per car.
+All static geometry is computed once: for each square metre and each of 12 heading sectors the cones
+that may be visible, and on a fine grid the distance to each boundary. A step of thousands of cars
+then reads a few numbers per car.
 """
 
 from collections.abc import Sequence
@@ -48,7 +49,8 @@ class TrackMap(nn.Module):
 
     cones: Tensor  # [2, slots of all sides of all tracks] m
     starts: Tensor  # [3, tracks]
-    # A block holds the candidates of one cell in all sectors; cells without candidates share block 0.
+    # A block holds the candidates of one cell in all sectors; cells without candidates share block
+    # 0.
     block: Tensor  # [cells]
     candidate: Tensor  # [blocks * SECTORS, most * 2], slots
     candidate_count: Tensor  # [blocks * SECTORS], of the side with more candidates
@@ -57,7 +59,9 @@ class TrackMap(nn.Module):
     points: Tensor  # [8, tracks]: finish and low corner in m, last cell and last node
     counts: Tensor  # [4, tracks]: columns and first number of the cells, and of the nodes
 
-    def __init__(self, tracks: Sequence[Track], *, sight: float = SIGHT, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self, tracks: Sequence[Track], *, sight: float = SIGHT, dtype: torch.dtype = torch.float32
+    ) -> None:
         super().__init__()
         if not tracks:
             raise ValueError("a track map needs at least one track, none was given")
@@ -88,10 +92,14 @@ class TrackMap(nn.Module):
         """Return a superset of the cones visible to cars with headings [B], in radians.
 
         Returns:
-            Slot of each candidate among its track's cones [N, 2, B], ascending, the right side from `slots` on, and its
-            position [2, N, 2, B] in m; padding is 10 km away.
+            Slot of each candidate among its track's cones [N, 2, B], ascending, the right side from
+            `slots` on, and its position [2, N, 2, B] in m; padding is 10 km away.
         """
-        sector = (heading * constant(SECTORS / (2 * np.pi), heading)).floor_().remainder_(constant(SECTORS, heading))
+        sector = (
+            (heading * constant(SECTORS / (2 * np.pi), heading))
+            .floor_()
+            .remainder_(constant(SECTORS, heading))
+        )
         row = torch.add(sector.long(), self.block.index_select(0, location.cell), alpha=SECTORS)
         most = slots_in_use(self.candidate_count.index_select(0, row), self.most)
         slot = _batch_last(self.candidate.index_select(0, row)[:, : 2 * most]).view(most, 2, -1)
@@ -104,7 +112,8 @@ class TrackMap(nn.Module):
         index = torch.add(constant(range(4), nodes), nodes, alpha=2).flatten()
         left, right = self.field.index_select(0, index).view(2, 2, 2, -1).unbind(0)
         low, high = torch.lerp(left, right, location.fraction[0]).unbind(1)
-        # The sides are interpolated separately, because the minimum of both has a kink in the middle of the track.
+        # The sides are interpolated separately, because the minimum of both has a kink in the
+        # middle of the track.
         return torch.lerp(low, high, location.fraction[1])
 
     def clearance(self, location: Location, to_boundaries: Tensor) -> Tensor:
@@ -112,10 +121,14 @@ class TrackMap(nn.Module):
 
         Exact up to 1 m; beyond that, cones may be missing from the table.
         """
-        cones = self._positions(location.track, _batch_last(self.near.index_select(0, location.cell)))
+        cones = self._positions(
+            location.track, _batch_last(self.near.index_select(0, location.cell))
+        )
         to_cone = (cones - location.position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
         nearer = to_boundaries.amin(0)
-        return torch.minimum(to_cone - constant(CONE_RADIUS, to_cone), nearer - constant(BOUNDARY_MARGIN, nearer))
+        return torch.minimum(
+            to_cone - constant(CONE_RADIUS, to_cone), nearer - constant(BOUNDARY_MARGIN, nearer)
+        )
 
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
         index = torch.add(slot, track, alpha=2 * self.slots).flatten()
@@ -133,11 +146,15 @@ class Grid:
 
     def nodes(self) -> NDArray[np.float64]:
         """Return the lower left corners of the cells, [cells, 2] m."""
-        x, y = (low + self.cell * np.arange(count) for low, count in zip(self.low, self.shape, strict=True))
+        x, y = (
+            low + self.cell * np.arange(count)
+            for low, count in zip(self.low, self.shape, strict=True)
+        )
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-# Cached and shared, because programs build several envs with the same tracks, which takes seconds for a hundred.
+# Cached and shared, because programs build several envs with the same tracks, which takes seconds
+# for a hundred.
 @lru_cache(maxsize=8)
 def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict[str, Tensor]:
     """Return the buffers of a `TrackMap` by name."""
@@ -167,22 +184,30 @@ def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict
         "candidate": (slot.swapaxes(-1, -2).reshape(-1, 2 * candidate.shape[-1]), torch.int16),
         "candidate_count": ((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16),
         "near": (np.where(decisive < 0, slots - 1, decisive), torch.int32),
-        "field": (np.concatenate([boundary_distances(track, dtype) for track in tracks]).ravel(), dtype),
+        "field": (
+            np.concatenate([boundary_distances(track, dtype) for track in tracks]).ravel(),
+            dtype,
+        ),
         "points": (np.vstack([finish, low, *[shape - 2 for shape in shapes]]), dtype),
         "counts": (np.stack([*[shape[0] for shape in shapes], *offsets]), torch.int64),
     }
-    return {name: torch.tensor(np.ascontiguousarray(table), dtype=kind) for name, (table, kind) in numbers.items()}
+    return {
+        name: torch.tensor(np.ascontiguousarray(table), dtype=kind)
+        for name, (table, kind) in numbers.items()
+    }
 
 
 # Cached, because some sets of tracks have tracks in common.
 @lru_cache(maxsize=64)
-def nearby_cones(track: Track, sight: float, dtype: torch.dtype) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
+def nearby_cones(
+    track: Track, sight: float, dtype: torch.dtype
+) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
     """Return the relevant cones of each cell of a track, by number, ascending, then -1; `sight` is in m.
 
     Returns:
-        Whether any cone may be visible, [cells]; the cones of the left and of the right side that may be visible,
-        [cells with any, SECTORS, 2, most]; and the cones that may decide the clearance, the right ones numbered after
-        the left ones, [cells, most].
+        Whether any cone may be visible, [cells]; the cones of the left and of the right side that
+        may be visible, [cells with any, SECTORS, 2, most]; and the cones that may decide the
+        clearance, the right ones numbered after the left ones, [cells, most].
     """
     centre = Grid(track, CELL, dtype).nodes() + CELL / 2
     # The car is anywhere in its cell, its heading anywhere in its sector.
@@ -200,7 +225,9 @@ def nearby_cones(track: Track, sight: float, dtype: torch.dtype) -> tuple[NDArra
         bearing = np.arctan2(offset[:, 1], offset[:, 0])[:, None] - heading
         bearing = np.abs((bearing + np.pi) % (2 * np.pi) - np.pi)
         slack = np.arcsin(np.minimum(1, half_diagonal / np.maximum(distance, 1e-9)))[:, None]
-        ahead = (bearing <= HALF_FIELD_OF_VIEW + np.pi / SECTORS + slack + 1e-3) | (slack >= np.pi / 2)
+        ahead = (bearing <= HALF_FIELD_OF_VIEW + np.pi / SECTORS + slack + 1e-3) | (
+            slack >= np.pi / 2
+        )
         visible[cell, :, side, cone] = ahead
     used = np.asarray(visible.any(axis=(1, 2, 3)))
     return used, _true_columns(visible[used]), _true_columns(np.concatenate(near, axis=1))
@@ -210,9 +237,15 @@ def nearby_cones(track: Track, sight: float, dtype: torch.dtype) -> tuple[NDArra
 def boundary_distances(track: Track, dtype: torch.dtype) -> NDArray[np.float64]:
     """Return the distances of the grid nodes from the left and the right boundary: [nodes, 2] m, at most 3."""
     nodes = Grid(track, FIELD_CELL, dtype).nodes()
-    # For points this dense along a line, a plain tree is twice as fast as a compact and balanced one.
-    trees = [cKDTree(track.boundary(side, 0.02), compact_nodes=False, balanced_tree=False) for side in SIDES]
-    distances = [tree.query(nodes, distance_upper_bound=MAX_DISTANCE, workers=-1)[0] for tree in trees]
+    # For points this dense along a line, a plain tree is twice as fast as a compact and balanced
+    # one.
+    trees = [
+        cKDTree(track.boundary(side, 0.02), compact_nodes=False, balanced_tree=False)
+        for side in SIDES
+    ]
+    distances = [
+        tree.query(nodes, distance_upper_bound=MAX_DISTANCE, workers=-1)[0] for tree in trees
+    ]
     return np.minimum(np.stack(distances, axis=1), MAX_DISTANCE)
 
 
@@ -235,4 +268,6 @@ def _stack(tables: Sequence[NDArray[np.integer]]) -> NDArray[np.integer]:
     """Concatenate tables [rows, ..., N], the narrower ones filled up with -1."""
     most = max(table.shape[-1] for table in tables)
     ends = [[*[(0, 0)] * (table.ndim - 1), (0, most - table.shape[-1])] for table in tables]
-    return np.concatenate([np.pad(t, end, constant_values=-1) for t, end in zip(tables, ends, strict=True)])
+    return np.concatenate(
+        [np.pad(t, end, constant_values=-1) for t, end in zip(tables, ends, strict=True)]
+    )

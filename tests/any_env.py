@@ -15,11 +15,15 @@ class AnyEnv(SeededEnv):
     The reward is highest for the action 0.5, or for the last option of each choice.
     """
 
-    def __init__(self, count=8, action=None, observations=None, dtype=torch.float32, agents=False, seed=0):
+    def __init__(
+        self, count=8, action=None, observations=None, dtype=torch.float32, agents=False, seed=0
+    ):
         super().__init__(batch_size=[count])
         action = Bounded(-1, 1, (2,)) if action is None else action
         shown = observations or {"observation": Unbounded((3,), dtype=dtype)}
-        self.key, self.reward = (("agents", "action"), ("agents", "reward")) if agents else ("action", "reward")
+        self.key, self.reward = (
+            (("agents", "action"), ("agents", "reward")) if agents else ("action", "reward")
+        )
         self.observation_spec = Composite(
             {key: spec.expand(count, *spec.shape) for key, spec in shown.items()}, shape=(count,)
         )
@@ -27,7 +31,9 @@ class AnyEnv(SeededEnv):
         shape = (count, action.shape[0], 1) if agents else (count, 1)
         self.full_reward_spec = self.nested(self.reward, Unbounded(shape, dtype=dtype))
         flag = Categorical(2, (count, 1), dtype=torch.bool)
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,))
+        self.full_done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,)
+        )
         self.steps = torch.zeros(count, 1, dtype=torch.long)
         self.generator = torch.Generator().manual_seed(seed)
 
@@ -51,10 +57,16 @@ class AnyEnv(SeededEnv):
         elif hasattr(spec, "nvec"):
             score = (action == spec.nvec - 1).float()
         else:
-            score = (action[..., -1] if isinstance(spec, OneHot) else action == spec.space.n - 1).float()
+            score = (
+                action[..., -1] if isinstance(spec, OneHot) else action == spec.space.n - 1
+            ).float()
         reward = self.full_reward_spec[self.reward]
         score = score.reshape(*reward.shape[:-1], -1).mean(-1, keepdim=True).to(reward.dtype)
         self.steps += 1
         truncated = self.steps >= 5
-        ends = {"done": truncated, "truncated": truncated, "terminated": torch.zeros_like(truncated)}
+        ends = {
+            "done": truncated,
+            "truncated": truncated,
+            "terminated": torch.zeros_like(truncated),
+        }
         return TensorDict(self.observe() | {self.reward: score} | ends, self.batch_size)

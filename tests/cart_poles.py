@@ -18,14 +18,20 @@ class CartPoles(SeededEnv):
         self.observation_spec = Composite(observation=Unbounded((count, 4)), shape=(count,))
         self.action_spec = Categorical(2, (count,))
         self.reward_spec = Bounded(0, 1, (count, 1))
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,))
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,)
+        )
         self.generator = torch.Generator().manual_seed(seed)
         self.carts = CartPoleVectorEnv(count)
         self.carts.reset()
 
     def _reset(self, tensordict=None, **_):
         everywhere = torch.ones(*self.batch_size, 1, dtype=torch.bool)
-        mask = (everywhere if tensordict is None else tensordict.get("_reset", everywhere)).view(-1).numpy()
+        mask = (
+            (everywhere if tensordict is None else tensordict.get("_reset", everywhere))
+            .view(-1)
+            .numpy()
+        )
         state = torch.rand(*self.batch_size, 4, generator=self.generator).numpy() * 0.1 - 0.05
         self.carts.state[:, mask], self.carts.steps[mask] = state.T[:, mask], 0
         observation = torch.from_numpy(self.carts.state.T.astype(np.float32))

@@ -20,14 +20,19 @@ def levels() -> list[Track]:
     """Return three levels of the authors of the paper, which are not part of this project."""
     missing = [path for path in (LEVELS / f"MAP_{k}.csv" for k in (1, 2, 3)) if not path.exists()]
     if missing:
-        pytest.skip(f"{missing[0]} does not exist: the levels of the authors are not in the repository")
+        pytest.skip(
+            f"{missing[0]} does not exist: the levels of the authors are not in the repository"
+        )
     return [load_track(LEVELS / f"MAP_{k}.csv", start=(7, -10, 0)) for k in (1, 2, 3)]
 
 
 @pytest.fixture(scope="session")
 def ring() -> Track:
     """Return a round track of 31 m, driven anticlockwise."""
-    inner, outer = np.linspace(0, 2 * np.pi, 16, endpoint=False), np.linspace(0, 2 * np.pi, 26, endpoint=False)
+    inner, outer = (
+        np.linspace(0, 2 * np.pi, 16, endpoint=False),
+        np.linspace(0, 2 * np.pi, 26, endpoint=False),
+    )
     left, right = (np.stack([np.cos(turn), np.sin(turn)], axis=1) for turn in (inner, outer))
     return Track("ring", left=3.7 * left, right=6.3 * right)
 

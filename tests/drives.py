@@ -4,11 +4,27 @@ import numpy as np
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 from rosbags import rosbag2
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 
 from coil_rl.envs import simulated_drive
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, definition, encode, header, ros_types, twist
+from coil_rl.envs.recordings.messages import (
+    ODOMETRY,
+    SCAN,
+    TWIST,
+    definition,
+    encode,
+    header,
+    ros_types,
+    twist,
+)
 
 PERIOD = 182_000_000  # ns
 START = 1_700_000_000_000_000_000  # ns
@@ -20,13 +36,21 @@ def scan(number, points=360, seed=0, **changed):
     ranges = (draw.integers(600, 12_000, points) * 0.00025).astype(np.float32)
     ranges[draw.random(points) < 0.1] = np.inf
     increment = 2 * 3.1241 / (points - 1)
-    fields = {"angle_min": -3.1241, "angle_increment": increment, "range_min": 0.15, "range_max": 12.0}
+    fields = {
+        "angle_min": -3.1241,
+        "angle_increment": increment,
+        "range_min": 0.15,
+        "range_max": 12.0,
+    }
     return fields | {"header": header(START + number * PERIOD, "laser"), "ranges": ranges} | changed
 
 
 def odometry_fields(stamp, x, y, heading):
     """An Odometry message."""
-    pose = {"position": {"x": x, "y": y}, "orientation": {"z": np.sin(heading / 2), "w": np.cos(heading / 2)}}
+    pose = {
+        "position": {"x": x, "y": y},
+        "orientation": {"z": np.sin(heading / 2), "w": np.cos(heading / 2)},
+    }
     return {"header": header(stamp, "odom"), "pose": {"pose": pose}}
 
 
@@ -37,7 +61,12 @@ def drive(path, scans=60, odometry=False, commands=False, seed=0):
             time, angle = START + number * PERIOD, 0.15 * number * PERIOD / 1e9
             writer.add("/scan", SCAN, time, scan(number, seed=seed))
             if odometry:
-                writer.add("/odom", ODOMETRY, time, odometry_fields(time, np.sin(angle), 1 - np.cos(angle), angle))
+                writer.add(
+                    "/odom",
+                    ODOMETRY,
+                    time,
+                    odometry_fields(time, np.sin(angle), 1 - np.cos(angle), angle),
+                )
             if commands:
                 writer.add("/cmd_vel", TWIST, time, twist(0.15, 0.15))
     return path
@@ -55,7 +84,11 @@ def store(path, *messages, kind=SCAN, topic="/scan", **channel):
         for second, message in enumerate(messages):
             time = START + second * 10**9
             data = message if isinstance(message, bytes) else encode(kind, message)
-            writer.copy(RawMessage(Channel(topic, kind, **({"definition": standard} | channel)), time, time, data))
+            writer.copy(
+                RawMessage(
+                    Channel(topic, kind, **({"definition": standard} | channel)), time, time, data
+                )
+            )
     return path
 
 
@@ -64,15 +97,24 @@ def rosbag_of(folder, *messages, latched=()):
     transient = QosDurability.TRANSIENT_LOCAL
     always = QosTime(2147483647, 4294967295)
     qos = Qos(
-        QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, transient, always, always,
-        QosLiveliness.AUTOMATIC, always, False,
-    )  # fmt: skip
+        QosHistory.KEEP_LAST,
+        1,
+        QosReliability.RELIABLE,
+        transient,
+        always,
+        always,
+        QosLiveliness.AUTOMATIC,
+        always,
+        False,
+    )
     topics = {}
     with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         for topic, kind, time, fields in messages:
             if topic not in topics:
                 profiles = [qos] if topic in latched else []
-                topics[topic] = writer.add_connection(topic, kind, typestore=ros_types(), offered_qos_profiles=profiles)
+                topics[topic] = writer.add_connection(
+                    topic, kind, typestore=ros_types(), offered_qos_profiles=profiles
+                )
             writer.write(topics[topic], time, encode(kind, fields))
     return folder
 
@@ -88,7 +130,11 @@ def uncompressed(path):
         for schema, channel, message in messages:
             if channel.topic not in channels:
                 kind = writer.register_schema(schema.name, schema.encoding, schema.data)
-                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, kind)
-            writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, kind
+                )
+            writer.add_message(
+                channels[channel.topic], message.log_time, message.data, message.publish_time
+            )
         writer.finish()
     return path

@@ -3,8 +3,9 @@
     python tests/fuzz.py --cases 10000 [--seed 0] [--minutes N] [--workers N] [--folder FOLDER]
     python tests/fuzz.py --case N [--seed 0]        repeats one case and keeps its files
 
-A case depends on the seed and its number only. It runs in a process that is forked from one with everything imported,
-in its own copies of finished runs, recordings, tracks and models. All cases are listed in FOLDER/cases.jsonl.
+A case depends on the seed and its number only. It runs in a process that is forked from one with
+everything imported, in its own copies of finished runs, recordings, tracks and models. All cases
+are listed in FOLDER/cases.jsonl.
 """
 
 import argparse
@@ -33,7 +34,12 @@ ROOT = Path(__file__).resolve().parents[1]
 # Started by its path, Python would take tests/coil_rl for the library.
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 # Before torch and tqdm are imported. Without progress bars a refusal is one line.
-os.environ |= {"TQDM_DISABLE": "1", "CUDA_VISIBLE_DEVICES": "", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+os.environ |= {
+    "TQDM_DISABLE": "1",
+    "CUDA_VISIBLE_DEVICES": "",
+    "OMP_NUM_THREADS": "1",
+    "PYTHONPATH": str(ROOT),
+}
 
 import mutations  # noqa: E402
 import torch  # noqa: E402
@@ -61,11 +67,21 @@ PROXY = "proxy.budget.frames=32 proxy.budget.num_envs=4 proxy.budget.steps=8 pro
 PHASES = "learner.phases.agent_phase.frames=32 learner.phases.guide_phase.frames=32"
 ONCE, MINIBATCHES = "learner.epochs=1 learner.minibatches=2", "learner.minibatches=2"
 REPLAY = "learner.starts=16 learner.batch_size=8 learner.capacity=100"
-FOREST, GROUPS = "learner.regressor.estimator.n_estimators=3 learner.group_key=null", "learner.group_key=null"
+FOREST, GROUPS = (
+    "learner.regressor.estimator.n_estimators=3 learner.group_key=null",
+    "learner.group_key=null",
+)
 LEARNERS = {
-    "ppo": ONCE, "a2c": MINIBATCHES, "reinforce": MINIBATCHES, "trpo": ONCE, "dqn": REPLAY, "sac": REPLAY,
-    "forest": FOREST, "linear": GROUPS, "network": f"{GROUPS} learner.regressor.epochs=2",
-}  # fmt: skip
+    "ppo": ONCE,
+    "a2c": MINIBATCHES,
+    "reinforce": MINIBATCHES,
+    "trpo": ONCE,
+    "dqn": REPLAY,
+    "sac": REPLAY,
+    "forest": FOREST,
+    "linear": GROUPS,
+    "network": f"{GROUPS} learner.regressor.epochs=2",
+}
 RUNS = {
     "ppo": f"method=ppo {ONCE}",
     "coil": f"method=coil {ONCE}",
@@ -85,12 +101,19 @@ USES = {  # of a run
     "reports": "report folder=runs actions=both",
     "robot": "reproduce table=6 results.table_6.repeats=1 results.table_6.laps=1 results.table_6.runs=[RUN]",
 }
-POLICY, LOGS = ["config.yaml", "policy_last.pt"], ["config.yaml", "metrics.csv", "guide_return.json"]
+POLICY, LOGS = (
+    ["config.yaml", "policy_last.pt"],
+    ["config.yaml", "metrics.csv", "guide_return.json"],
+)
 READ = {  # files by use; others are damaged now and then
     "resume": [*LOGS, "checkpoint.pt", "checkpoint_previous.pt", "policy_best.pt"],
     "report": [*LOGS, "evaluation.csv", "episodes.csv"],
 }
-ON_TRACKS = [f"train {TRAIN} {ONCE}", f"evaluate {SHORT}", "evaluate evaluation.repeats=1 run=runs/coil"]
+ON_TRACKS = [
+    f"train {TRAIN} {ONCE}",
+    f"evaluate {SHORT}",
+    "evaluate evaluation.repeats=1 run=runs/coil",
+]
 OF_RECORDINGS = [
     "replay recording=drive.mcap",
     "replay recording=[drive.mcap,other.mcap] runs=[runs/coil]",
@@ -102,7 +125,10 @@ CLASSIFIER = (
     "env.perception.classifier._target_=coil_rl.robot.classifier.load_classifier"
     " +env.perception.classifier.path=cones.json"
 )
-OF_CLASSIFIER = [f"evaluate {SHORT} env=simulated_robot {CLASSIFIER}", f"replay recording=drive.mcap {CLASSIFIER}"]
+OF_CLASSIFIER = [
+    f"evaluate {SHORT} env=simulated_robot {CLASSIFIER}",
+    f"replay recording=drive.mcap {CLASSIFIER}",
+]
 COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "train": [f"train {TRACKS} {TRAIN} {ONCE} method=coil"],
     "distill": [f"distill {TRACKS} {SHORT} {CURVE} {PROXY}"],
@@ -111,18 +137,51 @@ COMMANDS = {  # whose arguments are changed; several under a name are drawn from
     "replay": [USES["replay"]],
     "report": [USES["report"], USES["reports"]],
     "reproduce": [
-        *(f"reproduce budget=smoke {result}" for result in ("table=1", "figure=6", "table=[1,7]", "all=maybe")),
+        *(
+            f"reproduce budget=smoke {result}"
+            for result in ("table=1", "figure=6", "table=[1,7]", "all=maybe")
+        ),
         "reproduce claim=tabular_coil results.tabular_coil.worlds=1 results.tabular_coil.steps=[100]",
         OF_RECORDINGS[-1],
     ],
 }
 OPTIONS = [
-    "", "=", "=3", "a", "a=", "--nope", "-m", "--cfg", "--cfg=job", "--help", "--info", "--resolve", "--config-name=x",
-    "--version", "--config-dir=levels", "--config-path=..", "--hydra-help", "-p=env", "--shell-completion",
-    "hydra/launcher=joblib", "hydra/launcher=ray", "hydra.verbose=true", "hydra.mode=MULTIRUN", "hydra.job.chdir=true",
-    "hydra/job_logging=disabled", "hydra.output_subdir=x", "seed=0,1", "seed=range(0,2)", "+experiment=coil_vs_ppo",
-    "+guide=random", "~learner", "~env", "a.b.c=1", "[1]=2", "é=1",
-]  # fmt: skip
+    "",
+    "=",
+    "=3",
+    "a",
+    "a=",
+    "--nope",
+    "-m",
+    "--cfg",
+    "--cfg=job",
+    "--help",
+    "--info",
+    "--resolve",
+    "--config-name=x",
+    "--version",
+    "--config-dir=levels",
+    "--config-path=..",
+    "--hydra-help",
+    "-p=env",
+    "--shell-completion",
+    "hydra/launcher=joblib",
+    "hydra/launcher=ray",
+    "hydra.verbose=true",
+    "hydra.mode=MULTIRUN",
+    "hydra.job.chdir=true",
+    "hydra/job_logging=disabled",
+    "hydra.output_subdir=x",
+    "seed=0,1",
+    "seed=range(0,2)",
+    "+experiment=coil_vs_ppo",
+    "+guide=random",
+    "~learner",
+    "~env",
+    "a.b.c=1",
+    "[1]=2",
+    "é=1",
+]
 UNFINISHED = re.compile(r"\..+\.\d+(\.\w+)?")  # temporary files of atomic writes
 HYDRA = re.compile(r"(^|/)\.hydra(/|$)|(^|/)(multirun\.yaml|\.lock)$")
 NOTES = re.compile(
@@ -165,7 +224,11 @@ def keys_of(node: DictConfig, path: str = "") -> list[str]:
     for key in node:
         names.append(name := f"{path}.{key!s}".lstrip("."))
         value = node._get_node(key)
-        if isinstance(value, DictConfig) and not value._is_interpolation() and not value._is_missing():
+        if (
+            isinstance(value, DictConfig)
+            and not value._is_interpolation()
+            and not value._is_missing()
+        ):
             names += keys_of(value, name)
     return names
 
@@ -195,7 +258,9 @@ class Fuzzer:
         for program in COMMANDS:
             with initialize_config_module("coil_rl.conf", version_base="1.3"):
                 keys = keys_of(compose(program, return_hydra_config=True))
-            self.keys[program] = [key for key in keys if not key.startswith("hydra.") or key.endswith("dir")]
+            self.keys[program] = [
+                key for key in keys if not key.startswith("hydra.") or key.endswith("dir")
+            ]
         self._prepare()
         self.repository = self._repository()
 
@@ -211,7 +276,11 @@ class Fuzzer:
         drives = [self.base / "drive.mcap", self.base / "other.mcap"]
         record_drives(SimulatedRobotEnv(num_envs=2, time_limit=3), SplineGuide(), drives)
         for name, overrides in RUNS.items():
-            called("train", *f"{TRACKS} {TRAIN} {overrides} hydra.run.dir=runs/{name}".split(), cwd=self.base)
+            called(
+                "train",
+                *f"{TRACKS} {TRAIN} {overrides} hydra.run.dir=runs/{name}".split(),
+                cwd=self.base,
+            )
         for use in USES.values():
             called(*Case("", use.replace("RUN", "runs/coil")).words, cwd=self.base)
         for name in ("out", "outputs"):
@@ -222,7 +291,9 @@ class Fuzzer:
     def draw(self, number: int, here: Path) -> Case:
         """Draw a case and put its files into a new folder."""
         draw = random.Random(f"{self.seed} {number}")
-        kind = draw.choices(["arguments", "choices", "run", "track", "recording", "model"], [30, 10, 32, 8, 13, 7])[0]
+        kind = draw.choices(
+            ["arguments", "choices", "run", "track", "recording", "model"], [30, 10, 32, 8, 13, 7]
+        )[0]
         shutil.copytree(self.base, here, symlinks=True)
         case: Case = getattr(self, f"_{kind}")(draw, here)
         if draw.random() < 0.03:
@@ -235,16 +306,28 @@ class Fuzzer:
         command = draw.choice(COMMANDS[draw.choice([*COMMANDS, "train", "train", "train"])])
         case = Case("arguments", command.replace("RUN", f"runs/{draw.choice(list(RUNS))}"))
         for _ in range(draw.choice([1, 1, 2, 3])):
-            (sign,), (end,) = draw.choices(["", "+", "++", "~"], [12, 1, 2, 1]), draw.choices(["", "x"], [15, 1])
+            (sign,), (end,) = (
+                draw.choices(["", "+", "++", "~"], [12, 1, 2, 1]),
+                draw.choices(["", "x"], [15, 1]),
+            )
             key = f"{sign}{draw.choice(self.keys[command.split()[0]])}{end}"
             value = in_hydra(mutations.junk(draw), draw)
-            case.given.append(draw.choices([key if sign == "~" else f"{key}={value}", draw.choice(OPTIONS)], [6, 1])[0])
+            case.given.append(
+                draw.choices(
+                    [key if sign == "~" else f"{key}={value}", draw.choice(OPTIONS)], [6, 1]
+                )[0]
+            )
         return case
 
     def _choices(self, draw: random.Random, here: Path) -> Case:
         """Combine files of the configuration."""
-        method, learner = draw.choice(self.groups["method"]), draw.choice([*LEARNERS, "ppo", "dqn", "sac", "trpo"])
-        learner = draw.choice(["forest", "linear", "network"]) if method in ("oil", "dagger") else learner
+        method, learner = (
+            draw.choice(self.groups["method"]),
+            draw.choice([*LEARNERS, "ppo", "dqn", "sac", "trpo"]),
+        )
+        learner = (
+            draw.choice(["forest", "linear", "network"]) if method in ("oil", "dagger") else learner
+        )
         given, usual = [f"method={method}"], f"{TRAIN} {PROXY}"
         if method.startswith("dynamic") or method == "kickstart":  # they have learners of their own
             usual += f" {ONCE} {PHASES if method != 'kickstart' else ''}"
@@ -252,8 +335,12 @@ class Fuzzer:
             given.append(f"learner={learner}")
             usual += f" {LEARNERS[learner]}"
         tracks = ["generated", "generated", "folder track.dir=levels", "robot"]
-        if "generated" in (track := draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])):
-            track += f" track.train.count={draw.choice([1, 2])} track.test.count={draw.choice([1, 2])}"
+        if "generated" in (
+            track := draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])
+        ):
+            track += (
+                f" track.train.count={draw.choice([1, 2])} track.test.count={draw.choice([1, 2])}"
+            )
         given += f"track={track}".split()
         for group, chance in (("guide", 0.5), ("degrade", 0.4)):
             if draw.random() < chance:
@@ -275,7 +362,11 @@ class Fuzzer:
         folder, case = here / "runs" / run, Case("run", USES[use].replace("RUN", f"runs/{run}"))
         files = [file for file in folder.rglob("*") if file.suffix not in (".png", ".md")]
         names = sorted(str(file.relative_to(folder)) for file in files)
-        likely = [name for name in names if name in READ.get(use.rstrip("s"), POLICY) or name.startswith("proxies")]
+        likely = [
+            name
+            for name in names
+            if name in READ.get(use.rstrip("s"), POLICY) or name.startswith("proxies")
+        ]
         if use == "resume" and draw.random() < 0.8:
             (folder / "evaluation.csv").unlink()
             case.damaged.append("without evaluation.csv")
@@ -284,7 +375,9 @@ class Fuzzer:
             if not file.parent.is_dir():  # the first damage has put a file in place of its folder
                 continue
             if file.suffix == ".pt" and draw.random() < 0.1:
-                shutil.copyfile(self.base / "runs" / draw.choice(list(RUNS)) / "checkpoint.pt", file)
+                shutil.copyfile(
+                    self.base / "runs" / draw.choice(list(RUNS)) / "checkpoint.pt", file
+                )
                 case.damaged.append(f"{file.name}: checkpoint of another run")
             else:
                 case.damaged.append(mutations.damage(file, draw))
@@ -293,7 +386,9 @@ class Fuzzer:
     def _track(self, draw: random.Random, here: Path) -> Case:
         """Damage a level file, and drive on it."""
         given = ["track=folder", draw.choice(["track.dir=levels", "track.dir=levels/a.csv"])]
-        return self._damaged("track", draw.choice(ON_TRACKS), here / "levels" / "a.csv", draw, given)
+        return self._damaged(
+            "track", draw.choice(ON_TRACKS), here / "levels" / "a.csv", draw, given
+        )
 
     def _recording(self, draw: random.Random, here: Path) -> Case:
         """Damage a recording, and use it."""
@@ -303,11 +398,15 @@ class Fuzzer:
         """Damage the cone classifier, or the forest of an imitation, and use it."""
         if draw.random() < 0.5:
             return self._damaged("model", draw.choice(OF_CLASSIFIER), here / "cones.json", draw)
-        command = USES[draw.choice(["evaluate", "replay", "guide", "robot"])].replace("RUN", "runs/oil")
+        command = USES[draw.choice(["evaluate", "replay", "guide", "robot"])].replace(
+            "RUN", "runs/oil"
+        )
         return self._damaged("model", command, here / "runs" / "oil" / "policy_last.pt", draw)
 
     @staticmethod
-    def _damaged(kind: str, command: str, file: Path, draw: random.Random, given: list[str] | None = None) -> Case:
+    def _damaged(
+        kind: str, command: str, file: Path, draw: random.Random, given: list[str] | None = None
+    ) -> Case:
         damaged = [mutations.damage(file, draw) for _ in range(draw.choice([1, 1, 2]))]
         return Case(kind, command, given or [], damaged)
 
@@ -357,7 +456,9 @@ class Fuzzer:
                 os._exit(code)
 
     def _judge(self, case: Case, place: Path, before: dict[str, Any], status: int) -> None:
-        error, stacks = ((place / name).read_text(errors="replace") for name in ("stderr", "stacks"))
+        error, stacks = (
+            (place / name).read_text(errors="replace") for name in ("stderr", "stacks")
+        )
         lines = [line for line in error.splitlines() if line.strip() and not NOTES.search(line)]
         changed = {name for name, state in self._files(place).items() if before.get(name) != state}
         stopped, repository = status == 130 and case.patient, self._repository()
@@ -367,12 +468,16 @@ class Fuzzer:
         elif "File" in stacks and not stopped:
             case.failure = "hang" if case.seconds > PATIENCE else "crash"
             stack = re.split(r"\n(?!  File)", stacks[stacks.find("  File") :])[0]
-            case.cause = _cause("\n".join(stack.splitlines()[::-1]))  # as a traceback, the innermost line last
+            case.cause = _cause(
+                "\n".join(stack.splitlines()[::-1])
+            )  # as a traceback, the innermost line last
         elif status not in (0, 2) and not stopped:
             case.failure = "exit code"
         elif status and (len(lines) != 1 or not lines[0].startswith(f"{case.words[0]}: ")):
             case.failure, case.cause = "sentences", " | ".join(lines)[:200]
-        elif outside := {name for name in changed if not _may_write(case, name)} | (repository - self.repository):
+        elif outside := {name for name in changed if not _may_write(case, name)} | (
+            repository - self.repository
+        ):
             case.failure, case.cause = "outside", ", ".join(sorted(outside))[:200]
         elif half := _half_written(case, place, changed, status):
             case.failure, case.cause = "half-written", ", ".join(sorted(half))[:200]
@@ -383,15 +488,27 @@ class Fuzzer:
     @staticmethod
     def _files(place: Path) -> dict[str, Any]:
         names = {str(path.relative_to(place)): path for path in place.rglob("*")}
-        states = {name: (path.is_dir(), path.lstat()) for name, path in names.items() if "/" in name}
-        return {name: folder or (state.st_size, state.st_mtime_ns) for name, (folder, state) in states.items()}
+        states = {
+            name: (path.is_dir(), path.lstat()) for name, path in names.items() if "/" in name
+        }
+        return {
+            name: folder or (state.st_size, state.st_mtime_ns)
+            for name, (folder, state) in states.items()
+        }
 
     @staticmethod
     def _repository() -> set[str]:
         found = set()
         for folder, names, files in os.walk(ROOT):
-            names[:] = [name for name in names if not name.startswith(".") and name not in ("__pycache__", "outputs")]
-            found |= {f"{path} {path.lstat().st_mtime_ns}" for path in (Path(folder, name) for name in files)}
+            names[:] = [
+                name
+                for name in names
+                if not name.startswith(".") and name not in ("__pycache__", "outputs")
+            ]
+            found |= {
+                f"{path} {path.lstat().st_mtime_ns}"
+                for path in (Path(folder, name) for name in files)
+            }
         return found
 
 
@@ -431,15 +548,21 @@ def _half_written(case: Case, place: Path, changed: set[str], status: int) -> se
     left = {name for name in changed if not HYDRA.search(name) and (place / name).exists()}
     if case.words[0] in ("train", "distill", "reproduce") or case.file_limit < FILE:
         files = {name for name in left if not (place / name).is_dir()}
-        left = {name for name in left - files if not any(file.startswith(f"{name}/") for file in files)}
-        left = {name for name in left if Path(name).name not in ("policies", "proxies")}  # the run can be resumed
+        left = {
+            name for name in left - files if not any(file.startswith(f"{name}/") for file in files)
+        }
+        left = {
+            name for name in left if Path(name).name not in ("policies", "proxies")
+        }  # the run can be resumed
     return half | left
 
 
 def _cause(text: str) -> str:
     """Return the error and the innermost line of the library in a traceback."""
     frames = re.findall(r'File "([^"]+)", line (\d+),? in (\S+)', text)
-    own = [frame for frame in frames if frame[0].startswith(str(ROOT)) and "/tests/" not in frame[0]]
+    own = [
+        frame for frame in frames if frame[0].startswith(str(ROOT)) and "/tests/" not in frame[0]
+    ]
     file, line, name = (own or frames or [("?", "?", "?")])[-1]
     errors = re.findall(r"^([\w.]*(?:Error|Exception|Interrupt|Errors))\b", text, re.MULTILINE)
     inner = f" calling {frames[-1][2]}" if own and frames[-1] != own[-1] else ""
@@ -456,14 +579,20 @@ def _run(number: int) -> tuple[int, Case | None]:
 def main(argv: list[str] | None = None) -> int:
     """Run the cases, print the counts and the causes of failures, and return 1 if there are any."""
     global fuzzer
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no case after this time")
+    parser.add_argument(
+        "--minutes", type=float, default=float("inf"), help="begin no case after this time"
+    )
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--case", type=int, help="repeat this case alone and keep its files")
-    parser.add_argument("--folder", type=Path, default=ROOT / "outputs" / "fuzz", help="of cases.jsonl")
+    parser.add_argument(
+        "--folder", type=Path, default=ROOT / "outputs" / "fuzz", help="of cases.jsonl"
+    )
     options = parser.parse_args(argv)
     torch.set_num_threads(1)
     place = Path(tempfile.mkdtemp(prefix="fuzz_"))
@@ -498,19 +627,30 @@ def summary(cases: dict[int, Case]) -> int:
     print(f"{'':10}", *(f"{column:>12}" for column in columns))
     for kind in (*sorted({case.kind for case in cases.values()}), ""):
         chosen = [case for case in cases.values() if kind in (case.kind, "")]
-        count = Counter(case.failure or case.outcome for case in chosen) | Counter(tries=len(chosen))
-        cells = [*(count[column] for column in columns[:-1]), round(sum(case.seconds for case in chosen))]
+        count = Counter(case.failure or case.outcome for case in chosen) | Counter(
+            tries=len(chosen)
+        )
+        cells = [
+            *(count[column] for column in columns[:-1]),
+            round(sum(case.seconds for case in chosen)),
+        ]
         print(f"{kind or 'all':10}", *(f"{cell:12}" for cell in cells))
     groups: dict[tuple[str, str], list[int]] = {}
     for number, case in cases.items():
         if case.failure:
-            groups.setdefault((case.failure, re.sub(r"case_\d+|\d{4}-[\d_-]+", "N", case.cause)), []).append(number)
+            groups.setdefault(
+                (case.failure, re.sub(r"case_\d+|\d{4}-[\d_-]+", "N", case.cause)), []
+            ).append(number)
     for (failure, cause), numbers in sorted(groups.items(), key=lambda group: -len(group[1])):
-        shortest = min(numbers, key=lambda number: len(str(cases[number].given + cases[number].damaged)))
+        shortest = min(
+            numbers, key=lambda number: len(str(cases[number].given + cases[number].damaged))
+        )
         case = cases[shortest]
         usual = case.command.split()[: 1 if case.given else None]
         example = shlex.join([f"coil-{usual[0]}", *usual[1:], *case.given])
-        print(f"{len(numbers):5} {failure}: {cause}\n      --case {shortest}: {example[:300]} {case.damaged or ''}")
+        print(
+            f"{len(numbers):5} {failure}: {cause}\n      --case {shortest}: {example[:300]} {case.damaged or ''}"
+        )
     return int(bool(groups))
 
 

@@ -1,8 +1,10 @@
 """Kill a training run at random moments, resume it, and compare it with an uninterrupted run.
 
-    python tests/kill_and_resume.py --kills 20 [--seed 0] [--folder FOLDER] [OVERRIDES of coil-train ...]
+    python tests/kill_and_resume.py --kills 20 [--seed 0] [--folder FOLDER] [OVERRIDES of coil-train
+    ...]
 
-Every second kill hits a checkpoint or policy while it is written, and every second run is killed twice.
+Every second kill hits a checkpoint or policy while it is written, and every second run is killed
+twice.
 """
 
 from __future__ import annotations
@@ -29,10 +31,28 @@ from tqdm import tqdm  # noqa: E402
 
 from coil_rl.train import checkpoint  # noqa: E402
 
-SMALL = ["budget.frames=10240", "budget.num_envs=32", "budget.steps=16", "track=generated", "track.train.count=1",
-         "track.test.count=1", "env.laps=1", "env.time_limit=2", "evaluation.repeats=2", "evaluation.gif=false",
-         "learner.epochs=2", "checkpoint_every=1"]  # fmt: skip
-MILESTONES = ["config.yaml", "guide_return.json", "policy_last.pt", "learning_curve.png", "lines.png", "evaluation.csv"]
+SMALL = [
+    "budget.frames=10240",
+    "budget.num_envs=32",
+    "budget.steps=16",
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=2",
+    "evaluation.repeats=2",
+    "evaluation.gif=false",
+    "learner.epochs=2",
+    "checkpoint_every=1",
+]
+MILESTONES = [
+    "config.yaml",
+    "guide_return.json",
+    "policy_last.pt",
+    "learning_curve.png",
+    "lines.png",
+    "evaluation.csv",
+]
 LOGS = ["metrics.csv", "evaluation.csv", "episodes.csv", "guide_return.json"]
 STATES = ["policy_last.pt", "policy_best.pt", "checkpoint.pt"]
 TIMEOUT = 600  # s
@@ -45,12 +65,18 @@ def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Pope
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     with (folder.parent / f"{folder.name}.log").open("ab") as log:
         command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]
-        return subprocess.Popen(command, cwd=folder.parent, env=env, **{"stdout": log, "stderr": log, **options})
+        return subprocess.Popen(
+            command, cwd=folder.parent, env=env, **{"stdout": log, "stderr": log, **options}
+        )
 
 
 def marks(folder: Path) -> int:
     """Return the progress of a run: rows of its log and finished files."""
-    rows = (folder / "metrics.csv").read_bytes().count(b"\n") if (folder / "metrics.csv").exists() else 0
+    rows = (
+        (folder / "metrics.csv").read_bytes().count(b"\n")
+        if (folder / "metrics.csv").exists()
+        else 0
+    )
     return rows + sum((folder / name).exists() for name in MILESTONES)
 
 
@@ -67,7 +93,9 @@ def finish(folder: Path, overrides: list[str]) -> list[float]:
     return [*reached, time.monotonic() - began]
 
 
-def kill(folder: Path, overrides: list[str], moment: float, reached: list[float], hit_write: bool) -> str:
+def kill(
+    folder: Path, overrides: list[str], moment: float, reached: list[float], hit_write: bool
+) -> str:
     """Start or resume, kill at a moment of the uninterrupted run, and describe the state that the kill left.
 
     The moment is counted from the mark before it, so that the load of the machine matters less.
@@ -78,7 +106,9 @@ def kill(folder: Path, overrides: list[str], moment: float, reached: list[float]
     while process.poll() is None and marks(folder) < mark:
         time.sleep(0.002)
     until = time.monotonic() + rest
-    while process.poll() is None and (time.monotonic() < until or (hit_write and not unfinished(folder))):
+    while process.poll() is None and (
+        time.monotonic() < until or (hit_write and not unfinished(folder))
+    ):
         time.sleep(0.0002 if time.monotonic() > until else 0.001)
     ended = process.poll() is not None
     process.kill()
@@ -104,14 +134,20 @@ def describe_state(folder: Path) -> str:
     if "checkpoint_previous.pt" in files and "checkpoint.pt" not in files:
         state = "between two renames"
     elif unfinished(folder):
-        state = "writing " + ", ".join(re.sub(r"\.(.+)\.\d+(\.\w+)", r"\1\2", name) for name in unfinished(folder))
+        state = "writing " + ", ".join(
+            re.sub(r"\.(.+)\.\d+(\.\w+)", r"\1\2", name) for name in unfinished(folder)
+        )
     return f"{frames} frames, {state}"
 
 
 def differences(one: Path, other: Path) -> list[str]:
     """Return the files in which two runs differ."""
     wrong = [name for name in LOGS if (one / name).read_bytes() != (other / name).read_bytes()]
-    return wrong + [name for name in STATES if not same(checkpoint.load(one / name), checkpoint.load(other / name))]
+    return wrong + [
+        name
+        for name in STATES
+        if not same(checkpoint.load(one / name), checkpoint.load(other / name))
+    ]
 
 
 def same(one: object, other: object) -> bool:
@@ -123,18 +159,26 @@ def same(one: object, other: object) -> bool:
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--kills", type=int, default=20, help="number of killed runs")
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
     parser.add_argument("--folder", type=Path, help="of the runs; temporary by default")
     arguments, overrides = parser.parse_known_args(argv)
     draw, wrong = random.Random(arguments.seed), 0
-    with tempfile.TemporaryDirectory() as temporary, tqdm(total=arguments.kills + 1, unit="run") as bar:
+    with (
+        tempfile.TemporaryDirectory() as temporary,
+        tqdm(total=arguments.kills + 1, unit="run") as bar,
+    ):
         place = (arguments.folder or Path(temporary)).absolute()
         place.mkdir(parents=True, exist_ok=True)
         reached = finish(place / "whole", overrides)
         bar.update()
-        print(f"uninterrupted run: begins after {reached[0]:.1f} s, ends after {reached[-1]:.1f} s", flush=True)
+        print(
+            f"uninterrupted run: begins after {reached[0]:.1f} s, ends after {reached[-1]:.1f} s",
+            flush=True,
+        )
         for number in range(1, arguments.kills + 1):
             folder, hit_write, states = place / f"killed_{number}", number % 2 == 0, []
             for _ in range(1 + (number % 4 >= 2)):
@@ -148,7 +192,9 @@ def main(argv: list[str] | None = None) -> int:
             verdict = f"DIFFERENT: {', '.join(found)}" if found else "OK"
             print(f"{number:3}  {'; then '.join(states):90}  {verdict}", flush=True)
             bar.update()
-    print(f"{arguments.kills - wrong} of {arguments.kills} killed runs ended like the uninterrupted one")
+    print(
+        f"{arguments.kills - wrong} of {arguments.kills} killed runs ended like the uninterrupted one"
+    )
     return int(wrong > 0)
 
 

@@ -24,13 +24,41 @@ from coil_rl.train import checkpoint
 LARGE = [1000, 2**31, 2**63 - 1, 2**63, 10**30, 1e23, 1e300]
 NUMBERS = [-1, 0, 1, 2, 5, 1.5, -0.5, math.nan, math.inf, -math.inf, 1e-300, True]
 TEXTS = [
-    "", "abc", "1e400", "null", "???", "${seed}", "${nope}", "${env}", "${oc.env:HOME}", "${", "日本 é",
-    "\u202e\u0300", "a\nb", "a/b", "x" * 300, "../outside/file", "/dev/null/x", "~nobody_x", ".", "runs/ppo", "last",
-]  # fmt: skip
-TREES: list[Any] = [None, [], [[]], [1, "a"], {}, {"a": 1}, {"_target_": "coil_rl.guides.ZeroGuide"}]
+    "",
+    "abc",
+    "1e400",
+    "null",
+    "???",
+    "${seed}",
+    "${nope}",
+    "${env}",
+    "${oc.env:HOME}",
+    "${",
+    "日本 é",
+    "\u202e\u0300",
+    "a\nb",
+    "a/b",
+    "x" * 300,
+    "../outside/file",
+    "/dev/null/x",
+    "~nobody_x",
+    ".",
+    "runs/ppo",
+    "last",
+]
+TREES: list[Any] = [
+    None,
+    [],
+    [[]],
+    [1, "a"],
+    {},
+    {"a": 1},
+    {"_target_": "coil_rl.guides.ZeroGuide"},
+]
 MARK = "touch ../outside/marker"
 BOMB = b"cos\nsystem\n(S'" + MARK.encode() + b"'\ntR."  # a pickle that runs a command
-# What a configuration from a stranger must not call: it writes outside of the run, or runs the pickle.
+# What a configuration from a stranger must not call: it writes outside of the run, or runs the
+# pickle.
 CALLS: list[dict[str, Any]] = [
     {"_target_": "sympy.sympify", "a": f"__import__('os').system({MARK!r})"},
     {"_target_": "os.system", "command": MARK},
@@ -46,12 +74,25 @@ CALLS: list[dict[str, Any]] = [
     {"_target_": "shutil.copyfile", "src": "bomb.pkl", "dst": "../outside/marker"},
     {"_target_": "coil_rl.files.write_text", "path": "../outside/marker", "text": "x"},
 ]
-BILLION = "\n".join(f"{b}: &{b} [{', '.join(9 * [f'*{a}'])}]" for a, b in zip("abcdefg", "bcdefgh", strict=True))
+BILLION = "\n".join(
+    f"{b}: &{b} [{', '.join(9 * [f'*{a}'])}]" for a, b in zip("abcdefg", "bcdefgh", strict=True)
+)
 YAML_LINES = [
-    "a: &a [*a]", "seed: 1\nseed: 2", f"x: !!python/object/apply:os.system [{MARK!r}]", "\tx: 1", "%YAML 9.9",
-    "method: null", "\0", "? [a, b]\n: 1", "1: 2", "x: 2020-01-01", "x: !!binary aGk=", "x: !!set {a}", "- 1",
+    "a: &a [*a]",
+    "seed: 1\nseed: 2",
+    f"x: !!python/object/apply:os.system [{MARK!r}]",
+    "\tx: 1",
+    "%YAML 9.9",
+    "method: null",
+    "\0",
+    "? [a, b]\n: 1",
+    "1: 2",
+    "x: 2020-01-01",
+    "x: !!binary aGk=",
+    "x: !!set {a}",
+    "- 1",
     f"a: &a [x, x]\n{BILLION}",
-]  # fmt: skip
+]
 
 
 def junk(draw: random.Random) -> Any:
@@ -62,7 +103,9 @@ def junk(draw: random.Random) -> Any:
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:
     """Yield every container and key of a tree."""
-    for key in tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ():
+    for key in (
+        tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
+    ):
         yield tree, key
         yield from places(tree[key])
 
@@ -74,7 +117,11 @@ def mutate(tree: Any, draw: random.Random, kinds: str = "") -> tuple[Any, str]:
     if not known:
         return junk(draw), "replaced"
     (node, key), (other, other_key) = draw.choice(known), draw.choice(known)
-    kind, value, new = draw.choice(f"junk junk delete swap near extra wrap {kinds}".split()), node[key], junk(draw)
+    kind, value, new = (
+        draw.choice(f"junk junk delete swap near extra wrap {kinds}".split()),
+        node[key],
+        junk(draw),
+    )
     if isinstance(value, torch.Tensor):
         new = _tensor(value, draw)
     elif kind == "swap":
@@ -97,17 +144,37 @@ def mutate(tree: Any, draw: random.Random, kinds: str = "") -> tuple[Any, str]:
 def _tensor(value: torch.Tensor, draw: random.Random) -> Any:
     value = value.detach().clone()
     if value.numel() and draw.random() < 0.6:
-        numbers: list[Any] = [math.nan, math.inf, 1e30, -1.0] if value.is_floating_point() else [0, 1, 255]
+        numbers: list[Any] = (
+            [math.nan, math.inf, 1e30, -1.0] if value.is_floating_point() else [0, 1, 255]
+        )
         value.view(-1)[draw.randrange(value.numel())] = draw.choice(numbers)
         return value
-    return draw.choice([value[..., :1], value.double(), value.long(), value.flatten(), value.unsqueeze(0), None, "x"])
+    return draw.choice(
+        [
+            value[..., :1],
+            value.double(),
+            value.long(),
+            value.flatten(),
+            value.unsqueeze(0),
+            None,
+            "x",
+        ]
+    )
 
 
 def damage(path: Path, draw: random.Random) -> str:
     """Change a file, or replace it by something else, and return what was done."""
-    special = {".yaml": _yaml, ".json": _json, ".csv": _csv, ".pt": _state, ".mcap": _recording}.get(path.suffix)
+    special = {
+        ".yaml": _yaml,
+        ".json": _json,
+        ".csv": _csv,
+        ".pt": _state,
+        ".mcap": _recording,
+    }.get(path.suffix)
     if special and path.is_file() and draw.random() < 0.7:
-        with contextlib.suppress(Exception):  # a change may be impossible to write, or the file already damaged
+        with contextlib.suppress(
+            Exception
+        ):  # a change may be impossible to write, or the file already damaged
             return f"{path.name}: {special(path, draw)}"
     return f"{path.name}: {_any_file(path, draw)}"
 
@@ -119,7 +186,13 @@ def _any_file(path: Path, draw: random.Random) -> str:
     for _ in range(draw.choice([1, 3, 50]) if content else 0):
         flipped[draw.randrange(len(content))] = draw.randrange(256)
     cut = content[: draw.randrange(len(content) + 1)]
-    new = {"flip": flipped, "cut": cut, "empty": b"", "append": content + draw.randbytes(8), "bomb": BOMB}
+    new = {
+        "flip": flipped,
+        "cut": cut,
+        "empty": b"",
+        "append": content + draw.randbytes(8),
+        "bomb": BOMB,
+    }
     kind = draw.choice([*new, "flip", "delete", "folder", "loop", "other"])
     other = draw.choice(others).read_bytes() if others else b""
     if path.is_dir() and not path.is_symlink():
@@ -159,7 +232,9 @@ def _csv(path: Path, draw: random.Random) -> str:
     rows = list(csv.reader(path.read_text().splitlines()))
     row, factor = draw.randrange(len(rows)), draw.choice([0, 1e-6, 1e6, 1e300, -1])
     column = draw.randrange(len(rows[row]))
-    kind = draw.choice(["cell"] * 6 + ["row", "row", "column", "header", "double", "shuffle", "scale", "scale"])
+    kind = draw.choice(
+        ["cell"] * 6 + ["row", "row", "column", "header", "double", "shuffle", "scale", "scale"]
+    )
     if kind == "shuffle":
         draw.shuffle(rows)
     elif kind == "scale":
@@ -201,10 +276,15 @@ def _forest(archive: bytes, draw: random.Random) -> tuple[torch.Tensor, str]:
     tree = draw.choice(model.estimators_).tree_
     state = tree.__getstate__()
     nodes = state["nodes"] = state["nodes"].copy()
-    field, value = draw.choice(["left_child", "right_child", "feature"]), draw.choice([0, -1, 10**6, 2**62, -(10**6)])
+    field, value = (
+        draw.choice(["left_child", "right_child", "feature"]),
+        draw.choice([0, -1, 10**6, 2**62, -(10**6)]),
+    )
     nodes[field][draw.choice([0, draw.randrange(len(nodes))])] = value
     tree.__setstate__(state)
-    return torch.frombuffer(bytearray(skops.io.dumps(model)), dtype=torch.uint8), f"forest {field}={value}"
+    return torch.frombuffer(
+        bytearray(skops.io.dumps(model)), dtype=torch.uint8
+    ), f"forest {field}={value}"
 
 
 def _recording(path: Path, draw: random.Random) -> str:
@@ -212,23 +292,31 @@ def _recording(path: Path, draw: random.Random) -> str:
     messages = [message for topic in contents.messages.values() for message in topic]
     notes: Any = contents.notes
     of_one_topic = draw.choice([topic for topic in contents.messages.values() if topic])
-    chosen = set(draw.choice([range(len(of_one_topic)), [0], draw.sample(range(len(of_one_topic)), 2)]))
+    chosen = set(
+        draw.choice([range(len(of_one_topic)), [0], draw.sample(range(len(of_one_topic)), 2)])
+    )
     first = of_one_topic[0]
-    name = draw.choice([SCAN, "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"])
+    name = draw.choice(
+        [SCAN, "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry", "std_msgs/msg/Float64"]
+    )
     channels: dict[str, dict[str, Any]] = {
         "topic": {"topic": draw.choice(["", "/scan", "/odom", "/cmd_vel", "日"])},
         "type": {"message_type": draw.choice([name, "a/b", ""]), "definition": definition(name)},
         "encoding": {"encoding": draw.choice(["", "json"])},
         "definition": {"definition": draw.choice([b"", b"float64 x\n", b"\xff"])},
     }
-    kind = draw.choice([*channels, "field", "field", "field", "field", "bytes", "time", "drop", "notes", "extra"])
+    kind = draw.choice(
+        [*channels, "field", "field", "field", "field", "bytes", "time", "drop", "notes", "extra"]
+    )
     change: dict[str, Any] = {}
     if kind in channels:
         change = {"channel": first.channel._replace(**channels[kind])}
     elif kind == "time":
         change = {"log_time": draw.choice([0, 1, 2**63 - 1, 10**18])}
     elif kind == "bytes":
-        change = {"data": draw.choice([b"", first.data[:40], first.data + b"\0\0", draw.randbytes(40)])}
+        change = {
+            "data": draw.choice([b"", first.data[:40], first.data + b"\0\0", draw.randbytes(40)])
+        }
     elif kind == "field":
         change = {"data": _message(first, draw)}
     elif kind == "extra":
@@ -236,7 +324,9 @@ def _recording(path: Path, draw: random.Random) -> str:
     elif kind == "notes":
         record = draw.choice(sorted(notes))
         key = draw.choice(sorted(notes[record]))
-        notes[record][key] = draw.choice([str(junk(draw)), json.dumps(mutate(json.loads(notes[record][key]), draw)[0])])
+        notes[record][key] = draw.choice(
+            [str(junk(draw)), json.dumps(mutate(json.loads(notes[record][key]), draw)[0])]
+        )
     replaced = {id(of_one_topic[index]) for index in chosen}
     with RecordingWriter(path) as writer:
         for record, entries in notes.items():
@@ -253,14 +343,20 @@ def _message(message: RawMessage, draw: random.Random) -> bytes:
     """Return a message with another number or text, or with other ranges."""
 
     def fields(node: Any) -> Any:
-        names = [name for name in getattr(node, "__dataclass_fields__", ()) if not name.startswith("__")]
+        names = [
+            name for name in getattr(node, "__dataclass_fields__", ()) if not name.startswith("__")
+        ]
         return {name: fields(getattr(node, name)) for name in names} if names else node
 
     tree = fields(decode(message.data, message.channel.message_type))
-    node, key = draw.choice([(node, key) for node, key in places(tree) if not isinstance(node[key], dict)])
+    node, key = draw.choice(
+        [(node, key) for node, key in places(tree) if not isinstance(node[key], dict)]
+    )
     old, number = node[key], draw.choice([*NUMBERS, *LARGE])
     if isinstance(old, np.ndarray):
-        node[key] = draw.choice([old[:0], old[:1], old[:-1], np.full_like(old, number), np.tile(old, 3)])
+        node[key] = draw.choice(
+            [old[:0], old[:1], old[:-1], np.full_like(old, number), np.tile(old, 3)]
+        )
     else:
         node[key] = draw.choice(TEXTS) if isinstance(old, str) else type(old)(number)
     return encode(message.channel.message_type, tree)

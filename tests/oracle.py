@@ -43,18 +43,27 @@ def chord_length(points: Array) -> Array:
 def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
     """Fit the natural cubic smoothing spline by chord length; return the parameters of the points and the curve.
 
-    Least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second derivatives R^-1 Q' f at the
-    inner points, the integral is |L^-1 Q' f|^2, where R = L L'.
+    Least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second derivatives
+    R^-1 Q' f at the inner points, the integral is |L^-1 Q' f|^2, where R = L L'.
     """
     points, weights = merge(points)
     u = chord_length(points)
     if len(points) <= 2:
-        return u, lambda at: points[0] + np.multiply.outer(at, (points[-1] - points[0]) / max(u[-1], 1e-12))
+        return (
+            u,
+            lambda at: (
+                points[0] + np.multiply.outer(at, (points[-1] - points[0]) / max(u[-1], 1e-12))
+            ),
+        )
     h = np.diff(u)
     n = len(u)
     second = np.zeros((n - 2, n))
     row = np.arange(n - 2)
-    second[row, row], second[row, row + 1], second[row, row + 2] = 1 / h[:-1], -1 / h[:-1] - 1 / h[1:], 1 / h[1:]
+    second[row, row], second[row, row + 1], second[row, row + 2] = (
+        1 / h[:-1],
+        -1 / h[:-1] - 1 / h[1:],
+        1 / h[1:],
+    )
     gram = np.diag((h[:-1] + h[1:]) / 3) + np.diag(h[1:-1] / 6, 1) + np.diag(h[1:-1] / 6, -1)
     rough = np.sqrt(smoothing) * solve_triangular(cholesky(gram, lower=True), second, lower=True)
     root = np.sqrt(weights)[:, None]
@@ -99,7 +108,13 @@ def midpoints(left: Array, right: Array) -> Array:
 
 
 def guide_action(
-    left: Array, right: Array, steering: float, *, spline: str = "cubic", smoothing: float = 1.0, gain: float = 1.0
+    left: Array,
+    right: Array,
+    steering: float,
+    *,
+    spline: str = "cubic",
+    smoothing: float = 1.0,
+    gain: float = 1.0,
 ) -> float:
     """Return the advice of appendix A.1 for the visible cones (car frame, nearest first), a fraction of 80 degrees."""
     points = midpoints(left, right)
@@ -198,7 +213,10 @@ class OneCar:
             self.visible.append([int(i) for i in rows[np.argsort(distance[rows])][:KEPT_CONES]])
 
     def cones(self) -> tuple[Array, Array]:
-        left, right = (to_car(self.pose, ring[indices]) for ring, indices in zip(self.rings, self.visible, strict=True))
+        left, right = (
+            to_car(self.pose, ring[indices])
+            for ring, indices in zip(self.rings, self.visible, strict=True)
+        )
         return left, right
 
     @property
@@ -214,7 +232,11 @@ class OneCar:
                 if entered and len(cones) < 2:
                     self.samples[side] = np.zeros((SAMPLES, 2))
             if len(cones) >= 2:
-                u, curve = fit_cubic(cones, self.smoothing) if self.spline == "cubic" else fit_parabola(cones)
+                u, curve = (
+                    fit_cubic(cones, self.smoothing)
+                    if self.spline == "cubic"
+                    else fit_parabola(cones)
+                )
                 self.samples[side] = curve(np.linspace(0, u[-1], SAMPLES))
             samples = self.samples[side]
             if samples is None:
@@ -259,7 +281,9 @@ class OneCar:
             now = set(self.visible[side])
             if lap_time:
                 self.rewarded[side] = set()
-            known = self.rewarded[side] if self.cone_bonus == "first_sighting" else self.before[side]
+            known = (
+                self.rewarded[side] if self.cone_bonus == "first_sighting" else self.before[side]
+            )
             cone_sides += bool(now - known)
             entered |= bool(now - self.before[side])
             self.rewarded[side] |= now
@@ -326,12 +350,16 @@ class RememberingGuide:
         distance = np.hypot(ahead, left)
         if not TARGET_REACHED < distance < self.sight:
             return 0.0 if self.oddities else steering
-        return self.gain * 2 / np.pi * np.arctan(np.rad2deg(np.arctan2(left, ahead)) / distance**1.8)
+        return (
+            self.gain * 2 / np.pi * np.arctan(np.rad2deg(np.arctan2(left, ahead)) / distance**1.8)
+        )
 
     def nearest(self, pose: Array) -> Array | None:
         earlier = self.poses[-3][:2] if len(self.poses) > 2 else None
         in_circle = (
-            earlier is not None and self.gate is not None and np.linalg.norm(earlier - self.gate) < TARGET_REACHED
+            earlier is not None
+            and self.gate is not None
+            and np.linalg.norm(earlier - self.gate) < TARGET_REACHED
         )
         best = None
         for i, target in enumerate(self.targets):
@@ -354,7 +382,9 @@ class RememberingGuide:
         left, right = (ring[now] for ring, now in zip(self.rings, visible, strict=True))
         if self.gate is None:
             self.gate = (left[0] + right[0]) / 2
-        middle = (left[:, None] + right)[np.linalg.norm(left[:, None] - right, axis=-1) < PAIR_DISTANCE] / 2
+        middle = (left[:, None] + right)[
+            np.linalg.norm(left[:, None] - right, axis=-1) < PAIR_DISTANCE
+        ] / 2
         middle = middle[np.argsort(np.linalg.norm(middle - pose[:2], axis=1), kind="stable")]
         # Coordinates are those of the frame at the start.
         middle = to_car(self.poses[0], middle)

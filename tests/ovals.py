@@ -29,4 +29,8 @@ def oval_track(name, clockwise=False, length=10.0, radius=6.0):
     """Return a track 3 m wide along an oval."""
     inner, outer = (oval_line(length, r, spacing=1.5) for r in (radius - 1.5, radius + 1.5))
     mirrored = np.array([1, -1])
-    return Track(name, left=outer * mirrored, right=inner * mirrored) if clockwise else Track(name, inner, outer)
+    return (
+        Track(name, left=outer * mirrored, right=inner * mirrored)
+        if clockwise
+        else Track(name, inner, outer)
+    )

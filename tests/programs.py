@@ -13,7 +13,14 @@ ROOT = Path(__file__).parents[1]
 
 TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
-TINY = [*LAP, "budget.frames=512", "budget.num_envs=8", "budget.steps=32", "evaluation.repeats=1", "logger=none"]
+TINY = [
+    *LAP,
+    "budget.frames=512",
+    "budget.num_envs=8",
+    "budget.steps=32",
+    "evaluation.repeats=1",
+    "logger=none",
+]
 
 
 def command(name, *arguments):
@@ -21,7 +28,9 @@ def command(name, *arguments):
 
 
 def environment(cwd):
-    return os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")])}
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(cwd), os.environ.get("PYTHONPATH", "")])
+    }
 
 
 def program(name, *arguments, cwd, code=0):
@@ -44,7 +53,11 @@ def called(name, *arguments, cwd=".", code=0):
     out, error, ended, given = io.StringIO(), io.StringIO(), 0, sys.argv
     sys.argv = [name, *arguments]
     try:
-        with contextlib.chdir(cwd), contextlib.redirect_stderr(error), contextlib.redirect_stdout(out):
+        with (
+            contextlib.chdir(cwd),
+            contextlib.redirect_stderr(error),
+            contextlib.redirect_stdout(out),
+        ):
             importlib.import_module(f"coil_rl.programs.{name}").main()
     except SystemExit as end:
         ended = end.code

@@ -17,11 +17,17 @@ def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
         for seed in range(seeds):
             rewards = {case: reward + gain + seed for case, reward in GUIDE.items()}
             rows = driven("guide", GUIDE) + driven(label, rewards, **others)
-            rows += driven(label, {case: reward - 50 for case, reward in rewards.items()}, "sampled") * sampled
+            rows += (
+                driven(label, {case: reward - 50 for case, reward in rewards.items()}, "sampled")
+                * sampled
+            )
             run = make_run(folder / f"{label}_{seed}", label, seed, rows)
             returns = [np.nan, *(300 + gain + seed + np.array([0.0, 40.0, 20.0]))]
             frames = range(1000, 5000, 1000)
-            points = [{"frames": n, "evaluation/return": value} for n, value in zip(frames, returns, strict=True)]
+            points = [
+                {"frames": n, "evaluation/return": value}
+                for n, value in zip(frames, returns, strict=True)
+            ]
             (run / "metrics.csv").unlink()
             if curve:
                 write_csv(points, run / "metrics.csv")

@@ -23,11 +23,17 @@ OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0,
 
 
 def driven(
-    driver: str, rewards: Mapping[str, float], actions: str = "deterministic", advice: str = "", **others: float
+    driver: str,
+    rewards: Mapping[str, float],
+    actions: str = "deterministic",
+    advice: str = "",
+    **others: float,
 ) -> list[Row]:
     """Return the rows of one driver: a row per case, and their mean."""
     row = {"driver": driver, "advice": advice, "actions": actions}
-    rows = [row | {"case": case, "reward": reward} | OTHERS | others for case, reward in rewards.items()]
+    rows = [
+        row | {"case": case, "reward": reward} | OTHERS | others for case, reward in rewards.items()
+    ]
     return [*rows, rows[0] | {"case": "mean", "reward": sum(rewards.values()) / len(rewards)}]
 
 
@@ -41,13 +47,20 @@ def make_run(
 ) -> Path:
     """Write a run; without rows it is not finished."""
     folder.mkdir(parents=True)
-    config: Row = {"seed": seed, "label": label, "method": {"name": "any", "needs_guide": needs_guide}}
+    config: Row = {
+        "seed": seed,
+        "label": label,
+        "method": {"name": "any", "needs_guide": needs_guide},
+    }
     config["evaluation"] = {"measures": MEASURES}
     (folder / "config.yaml").write_text(json.dumps(config))  # JSON is YAML
     (folder / "guide_return.json").write_text(json.dumps({"guide": guide}))
     frames = range(1000, 20_001, 1000)
     write_csv(
-        [{"frames": n, "evaluation/return": 400 * (1 - math.exp(-n / 5000)) + seed} for n in frames],
+        [
+            {"frames": n, "evaluation/return": 400 * (1 - math.exp(-n / 5000)) + seed}
+            for n in frames
+        ],
         folder / "metrics.csv",
     )
     if rows is not None:
@@ -72,7 +85,9 @@ def make_sweep(folder: Path) -> Path:
             ),
         ]
         make_run(folder / f"{seed}_coil", "coil", seed, guide + coil)
-        ppo = driven("ppo", {"a": 540.0 + seed, "b": 640.0 + seed}) + driven("ppo", {"a": 505.0, "b": 615.0}, "sampled")
+        ppo = driven("ppo", {"a": 540.0 + seed, "b": 640.0 + seed}) + driven(
+            "ppo", {"a": 505.0, "b": 615.0}, "sampled"
+        )
         make_run(folder / f"{seed + 3}_ppo", "ppo", seed, guide + ppo, needs_guide=False)
     make_run(folder / "6_coil", "coil", 3, None)
     make_run(folder / "7_ppo", "ppo", 3, None)

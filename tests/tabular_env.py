@@ -11,14 +11,19 @@ from coil_rl.envs.cone_track import SeededEnv
 class TabularEnv(SeededEnv):
     """B agents; `action` [B] and one-hot `observation` [B, S]; absorbing states without reward terminate.
 
-    `P` and `R` [S, A, S] are probabilities and rewards, `start` [S] the probabilities of the first state (uniform).
+    `P` and `R` [S, A, S] are probabilities and rewards, `start` [S] the probabilities of the first
+    state (uniform).
     """
 
     def __init__(self, P, R, num_envs=64, start=None, max_steps=100, seed=0):
         super().__init__(batch_size=torch.Size([num_envs]))
         self.P, self.R = torch.as_tensor(P).double(), torch.as_tensor(R).double()
         states, actions = self.P.shape[:2]
-        self.start = torch.full((states,), 1 / states).double() if start is None else torch.as_tensor(start).double()
+        self.start = (
+            torch.full((states,), 1 / states).double()
+            if start is None
+            else torch.as_tensor(start).double()
+        )
         stays = torch.diagonal(self.P, dim1=0, dim2=2).T == 1
         self.terminal = (stays & ((self.P * self.R).sum(2) == 0)).all(1)
         self.max_steps, self.generator = max_steps, torch.Generator()
@@ -29,7 +34,9 @@ class TabularEnv(SeededEnv):
         self.action_spec = Categorical(actions, batch, dtype=torch.int64)
         self.reward_spec = Unbounded((*batch, 1), dtype=torch.float32)
         ends = ("done", "terminated", "truncated")
-        self.done_spec = Composite({key: Binary(1, (*batch, 1), dtype=torch.bool) for key in ends}, shape=batch)
+        self.done_spec = Composite(
+            {key: Binary(1, (*batch, 1), dtype=torch.bool) for key in ends}, shape=batch
+        )
         self.set_seed(seed)
 
     def _draw(self, probabilities):
@@ -44,7 +51,10 @@ class TabularEnv(SeededEnv):
         state, steps = self._draw(self.start), torch.zeros(self.batch_size, dtype=torch.int64)
         if tensordict is not None and "_reset" in tensordict:
             mask = tensordict["_reset"].view(-1)
-            state, steps = torch.where(mask, state, self.state), torch.where(mask, steps, self.steps)
+            state, steps = (
+                torch.where(mask, state, self.state),
+                torch.where(mask, steps, self.steps),
+            )
         self.state, self.steps = state, steps
         return self._output()
 
@@ -54,4 +64,6 @@ class TabularEnv(SeededEnv):
         terminated = self.terminal[self.state].unsqueeze(-1)
         truncated = (self.steps >= self.max_steps).unsqueeze(-1) & ~terminated
         reward = self.R[before, action, self.state].float().unsqueeze(-1)
-        return self._output(reward=reward, terminated=terminated, truncated=truncated, done=terminated | truncated)
+        return self._output(
+            reward=reward, terminated=terminated, truncated=truncated, done=terminated | truncated
+        )

@@ -14,7 +14,12 @@ PACKAGES = ("coil_rl", "envs", "transforms")
 
 
 def walks():
-    text = (ROOT / "CONTRIBUTING.md").read_text().partition("## How the code runs")[2].partition("\n## ")[0]
+    text = (
+        (ROOT / "CONTRIBUTING.md")
+        .read_text()
+        .partition("## How the code runs")[2]
+        .partition("\n## ")[0]
+    )
     lists = text.split("One env step with advice")
     return [re.findall(r"^\d+\. `([^`]+)`", part, flags=re.MULTILINE) for part in lists]
 
@@ -25,9 +30,14 @@ def files_on_the_stack():
     return [file for file in inside if file.startswith(PACKAGES)]
 
 
-def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_the_advice(tmp_path, monkeypatch):
+def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_the_advice(
+    tmp_path, monkeypatch
+):
     training, step = walks()
-    assert all(len(walk) <= 10 and all((ROOT / file).is_file() for file in walk) for walk in (training, step))
+    assert all(
+        len(walk) <= 10 and all((ROOT / file).is_file() for file in walk)
+        for walk in (training, step)
+    )
     stacks = {}
     adam_step, advise = torch.optim.Adam.step, SplineGuide.forward
 
@@ -44,5 +54,9 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
     monkeypatch.setattr(torch.optim.Adam, "step", traced_step)
     monkeypatch.setattr(SplineGuide, "forward", traced_advice)
     called("train", "method=coil", *TINY, "budget.frames=256", f"hydra.run.dir={tmp_path / 'run'}")
-    assert {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"} <= set(stacks["optimiser"]) <= set(training)
+    assert (
+        {"coil_rl/programs/train.py", "coil_rl/learners/ppo.py"}
+        <= set(stacks["optimiser"])
+        <= set(training)
+    )
     assert {"transforms/guide_actions.py"} <= set(stacks["advice"]) <= set(step)

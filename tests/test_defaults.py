@@ -17,7 +17,10 @@ VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
     "env/driving_tasks.yaml": ["env.reward"],
     "env/simulated_robot.yaml": ["env.reward", "env.lidar", "env.car_length"],  # rounded length
-    "env/gym.yaml": ["env.options", "env.controllers"],  # None in the constructor: no options, no controllers
+    "env/gym.yaml": [
+        "env.options",
+        "env.controllers",
+    ],  # None in the constructor: no options, no controllers
     "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["car_length"],
     "guide/authors.yaml": ["oddities"],
@@ -50,7 +53,11 @@ def defaults(target: Any) -> dict[str, Any]:
     function = target.__init__ if inspect.isclass(target) else target
     parameters = inspect.signature(function).parameters.values()
     passes_on = inspect.isclass(target) and any(p.kind is p.VAR_KEYWORD for p in parameters)
-    inherited = defaults(target.__bases__[0]) if passes_on and target.__module__.startswith("coil_rl.") else {}
+    inherited = (
+        defaults(target.__bases__[0])
+        if passes_on and target.__module__.startswith("coil_rl.")
+        else {}
+    )
     return inherited | {p.name: p.default for p in parameters if p.default is not p.empty}
 
 

@@ -66,19 +66,31 @@ def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
         for path in source_files(folder)
         if (bad := forbidden_imports(path.read_text(encoding="utf-8"), package_of(path), folder))
     }
-    assert not wrong, f"{folder}/ may import only {sorted(ALLOWED[folder])}, the standard library and itself"
+    assert not wrong, (
+        f"{folder}/ may import only {sorted(ALLOWED[folder])}, the standard library and itself"
+    )
 
 
 def test_only_modules_of_that_name_import_gymnasium() -> None:
-    found = {path.stem: list(imported_modules(path.read_text(), package_of(path))) for path in source_files("envs")}
-    users = [stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)]
+    found = {
+        path.stem: list(imported_modules(path.read_text(), package_of(path)))
+        for path in source_files("envs")
+    }
+    users = [
+        stem for stem, names in found.items() if any(is_inside(name, "gymnasium") for name in names)
+    ]
     assert users == ["gym", "gymnasium_env", "gymnasium_spaces"]
-    assert not [stem for stem, names in found.items() if any(is_inside(name, "coil_rl.envs.gym") for name in names)]
+    assert not [
+        stem
+        for stem, names in found.items()
+        if any(is_inside(name, "coil_rl.envs.gym") for name in names)
+    ]
 
 
 @pytest.mark.parametrize("folder", ["coil_rl", "tests", *LINKED])
 def test_folders_are_not_imported_by_their_bare_names(folder: str) -> None:
-    # `import envs` would load a second copy of the package, with classes that are not the first one's.
+    # `import envs` would load a second copy of the package, with classes that are not the first
+    # one's.
     wrong = [
         f"{path.relative_to(ROOT)}: {module}"
         for path in source_files(folder)
@@ -89,10 +101,14 @@ def test_folders_are_not_imported_by_their_bare_names(folder: str) -> None:
 
 
 def test_package_list_matches_the_folders() -> None:
-    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"][
+        "setuptools"
+    ]
     files = [path for folder in ["coil_rl", *LINKED] for path in source_files(folder)]
     inits = [path for path in files if path.name == "__init__.py"]
-    folders = {".".join(package_of(path)): path.parent.relative_to(ROOT).as_posix() for path in inits}
+    folders = {
+        ".".join(package_of(path)): path.parent.relative_to(ROOT).as_posix() for path in inits
+    }
     assert sorted(setuptools["packages"]) == sorted(folders)
 
     def mapped(package: str) -> str:
@@ -108,4 +124,6 @@ def test_package_list_matches_the_folders() -> None:
 def test_every_folder_with_python_files_is_a_package() -> None:
     # A forgotten __init__.py works in the checkout and is missing from the wheel.
     folders = {path.parent for folder in ["coil_rl", *LINKED] for path in source_files(folder)}
-    assert [str(path.relative_to(ROOT)) for path in folders if not (path / "__init__.py").is_file()] == []
+    assert [
+        str(path.relative_to(ROOT)) for path in folders if not (path / "__init__.py").is_file()
+    ] == []

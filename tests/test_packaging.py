@@ -19,7 +19,9 @@ def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
     if pythonpath:
         env["PYTHONPATH"] = str(pythonpath)
-    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -55,23 +57,42 @@ def wheel(tree: Path) -> Path:
 @pytest.fixture(scope="module")
 def installed(wheel: Path) -> Path:
     target = wheel.parent / "installed"
-    pip = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--target", target]
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "-q",
+        "--no-index",
+        "--no-deps",
+        "--target",
+        target,
+    ]
     run(*pip, wheel, cwd=wheel.parent)
     return target
 
 
 def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
-    patterns = {"coil_rl": ["*.py", "*.json", "py.typed"], "envs": ["*.py", "*.json", "tracks/**/*.csv"]}
+    patterns = {
+        "coil_rl": ["*.py", "*.json", "py.typed"],
+        "envs": ["*.py", "*.json", "tracks/**/*.csv"],
+    }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"]}
     expected = {
-        (path.relative_to(tree) if folder == "coil_rl" else "coil_rl" / path.relative_to(tree)).as_posix()
+        (
+            path.relative_to(tree) if folder == "coil_rl" else "coil_rl" / path.relative_to(tree)
+        ).as_posix()
         for folder, globs in patterns.items()
         for glob in globs
         for path in (tree / folder).rglob(glob)
     }
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == expected
-    assert {"coil_rl/py.typed", "coil_rl/conf/a/b/planted.yaml", "coil_rl/envs/tracks/a/planted.csv"} <= names
+    assert {
+        "coil_rl/py.typed",
+        "coil_rl/conf/a/b/planted.yaml",
+        "coil_rl/envs/tracks/a/planted.csv",
+    } <= names
 
 
 def test_wheel_has_one_import_name(wheel: Path) -> None:
@@ -87,8 +108,17 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
         names = {name.partition("/")[2] for name in file.getnames()}
     folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "tests", "transforms"]
     paths = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
-    needed = {path.relative_to(tree).as_posix() for path in paths} - {f"coil_rl/{name}" for name in LINKS}
-    files = {"CONTRIBUTING.md", "LICENSE", "Makefile", "README.md", "constraints.txt", "pyproject.toml"}
+    needed = {path.relative_to(tree).as_posix() for path in paths} - {
+        f"coil_rl/{name}" for name in LINKS
+    }
+    files = {
+        "CONTRIBUTING.md",
+        "LICENSE",
+        "Makefile",
+        "README.md",
+        "constraints.txt",
+        "pyproject.toml",
+    }
     assert (needed | files | {"results/RESULTS.md"}) - names == set()
 
 
@@ -110,7 +140,9 @@ main()
     tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "hydra.run.dir=run"]
     out = run(sys.executable, "-c", program, *tiny, cwd=tmp_path, pythonpath=installed)
     lines = out.splitlines()[:5]
-    outside = [line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())]
+    outside = [
+        line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())
+    ]
     assert (len(lines), outside) == (5, [])
     assert all(Path(line).is_file() for line in lines)
     assert "test_3" in out, "the shipped tracks are missing in the wheel"

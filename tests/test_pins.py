@@ -15,7 +15,14 @@ from programs import LAP, called
 
 PINS = Path(__file__).parent / "pins"
 FILES = ("metrics.csv", "evaluation.csv")
-SMALL = [*LAP, "budget.frames=2048", "budget.num_envs=8", "budget.steps=64", "evaluation.repeats=1", "logger=none"]
+SMALL = [
+    *LAP,
+    "budget.frames=2048",
+    "budget.num_envs=8",
+    "budget.steps=64",
+    "evaluation.repeats=1",
+    "logger=none",
+]
 RUNS = {
     "ppo": ["method=ppo"],
     "coil": ["method=coil"],
@@ -30,7 +37,8 @@ RUNS = {
     ],
     "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],
 }
-TOLERANCE = 1e-4  # relative; on one machine the numbers are the same to the bit, on another they round differently
+# relative; on one machine the numbers are the same to the bit, on another they round differently
+TOLERANCE = 1e-4
 
 
 def run(name: str, folder: Path) -> Path:
@@ -45,7 +53,9 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def same(one: str, other: str) -> bool:
     try:
-        return one == other or math.isclose(float(one), float(other), rel_tol=TOLERANCE, abs_tol=1e-6)
+        return one == other or math.isclose(
+            float(one), float(other), rel_tol=TOLERANCE, abs_tol=1e-6
+        )
     except ValueError:
         return False
 

@@ -8,7 +8,9 @@ README = (ROOT / "README.md").read_text()
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["cone world", "own env", "gymnasium", "recording"])
+@pytest.mark.parametrize(
+    "example", EXAMPLES, ids=["cone world", "own env", "gymnasium", "recording"]
+)
 def test_examples_run_as_printed(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     found: dict = {}

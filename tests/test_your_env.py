@@ -16,7 +16,10 @@ BLOCKS = [(language, block) for language, block in ALL_BLOCKS if "vmas" not in b
 PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
 EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
 COMMANDS = [
-    shlex.split(line, comments=True) for language, block in BLOCKS if not language for line in block.splitlines()
+    shlex.split(line, comments=True)
+    for language, block in BLOCKS
+    if not language
+    for line in block.splitlines()
 ]
 TOY = {
     "coil-train": TINY,
@@ -36,9 +39,13 @@ def folder(tmp_path_factory):
         yield folder / "source"
 
 
-@pytest.mark.parametrize("block", EXCERPTS, ids=[block.splitlines()[0].strip() for block in EXCERPTS])
+@pytest.mark.parametrize(
+    "block", EXCERPTS, ids=[block.splitlines()[0].strip() for block in EXCERPTS]
+)
 def test_excerpt_is_a_part_of_the_package(block):
-    texts = [file.read_text() for file in SOURCE.rglob("*") if file.suffix in (".py", ".yaml", ".toml")]
+    texts = [
+        file.read_text() for file in SOURCE.rglob("*") if file.suffix in (".py", ".yaml", ".toml")
+    ]
     assert any(block in text for text in texts)
 
 
@@ -75,6 +82,10 @@ def test_commands_run_in_the_order_of_the_page(folder):
         toy = [] if any(argument.startswith("resume=") for argument in arguments) else TOY[name]
         called(name.removeprefix("coil-"), *arguments, *toy, cwd=folder)
     outputs = folder / "outputs"
-    assert {path.parent.relative_to(outputs).parts[0] for path in outputs.rglob("*.md")} >= {"room", "ppo", "sweep"}
+    assert {path.parent.relative_to(outputs).parts[0] for path in outputs.rglob("*.md")} >= {
+        "room",
+        "ppo",
+        "sweep",
+    }
     assert (outputs / "sweep" / "report.png").is_file()
     assert Path(outputs / "room" / "learning_curve.png").is_file()

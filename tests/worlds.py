@@ -33,7 +33,9 @@ def cones(*transforms, cars=6) -> TransformedEnv:
 
 def pendulum(*transforms) -> TransformedEnv:
     """Return one pendulum without a batch, torque in [-2, 2]; the guide damps it."""
-    damp = TensorDictModule(lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
+    damp = TensorDictModule(
+        lambda speed: -speed.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"]
+    )
     return TransformedEnv(PendulumEnv(), Compose(GuideActions({"damp": damp}), *transforms))
 
 
@@ -97,16 +99,24 @@ def continued(make):
 class Script(EnvBase):
     """Rows that show given numbers step by step, also after their episodes have ended.
 
-    `lengths` [*B] are numbers of steps; `reward` and the other entries are [T, *B, ...], those of the steps.
+    `lengths` [*B] are numbers of steps; `reward` and the other entries are [T, *B, ...], those of
+    the steps.
     """
 
     rate = 5.0
 
     def __init__(self, lengths, reward, **entries):
         super().__init__(batch_size=lengths.shape)
-        self.lengths, self.entries, self.time = lengths.unsqueeze(-1), entries | {"reward": reward}, 0
+        self.lengths, self.entries, self.time = (
+            lengths.unsqueeze(-1),
+            entries | {"reward": reward},
+            0,
+        )
         flag = Categorical(2, (*lengths.shape, 1), dtype=torch.bool)
-        shown = {name: Unbounded(values.shape[1:], dtype=values.dtype) for name, values in self.entries.items()}
+        shown = {
+            name: Unbounded(values.shape[1:], dtype=values.dtype)
+            for name, values in self.entries.items()
+        }
         self.full_reward_spec = Composite(reward=shown.pop("reward"), shape=self.batch_size)
         self.observation_spec = Composite(shown, shape=self.batch_size)
         self.action_spec = Bounded(-1, 1, (*self.batch_size, 1))
@@ -114,10 +124,14 @@ class Script(EnvBase):
 
     def _reset(self, tensordict=None, **_):
         self.time = 0
-        return TensorDict({**self.observation_spec.zero(), **self.full_done_spec.zero()}, self.batch_size)
+        return TensorDict(
+            {**self.observation_spec.zero(), **self.full_done_spec.zero()}, self.batch_size
+        )
 
     def _step(self, tensordict):
-        shown = {name: values[min(self.time, len(values) - 1)] for name, values in self.entries.items()}
+        shown = {
+            name: values[min(self.time, len(values) - 1)] for name, values in self.entries.items()
+        }
         self.time += 1
         ended = self.time >= self.lengths
         return TensorDict({**shown, "done": ended, "terminated": ended}, self.batch_size)

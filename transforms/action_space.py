@@ -9,7 +9,16 @@ import torch
 from tensordict import NestedKey, unravel_key
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, TensorSpec, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
 from torchrl.envs import Transform
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
@@ -23,9 +32,9 @@ def nested_key(key: Key) -> Key:
 class ActionSpace:
     """Actions of an env as vectors [*batch, *agents, A], by its action spec and number of batch dimensions.
 
-    A discrete action is one-hot, A is the number of choices. Several discrete actions (MultiCategorical, MultiOneHot,
-    Binary) are their one-hot vectors side by side. A single action without a dimension of its own, or one of whole
-    numbers that are no choices, is a `ValueError`.
+    A discrete action is one-hot, A is the number of choices. Several discrete actions
+    (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side. A single action
+    without a dimension of its own, or one of whole numbers that are no choices, is a `ValueError`.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
@@ -35,7 +44,9 @@ class ActionSpace:
         self.dtype = spec.dtype if self.continuous else torch.float32
         self.choices = choices_of(spec)
         if not self.choices and not (self.continuous and self.event):
-            raise ValueError(f"advice needs a vector of real numbers or choices, but the env's action is {spec}")
+            raise ValueError(
+                f"advice needs a vector of real numbers or choices, but the env's action is {spec}"
+            )
         self.size = sum(self.choices) or spec.shape[-1]
         self.one_hot = isinstance(spec, OneHot)
         # An index may have a dimension of its own.
@@ -43,7 +54,9 @@ class ActionSpace:
         own = not self.indexed or len(self.choices) > 1 or self.event[-1:] == (1,)
         self.agents = self.event[:-1] if own else self.event
         first = (0,) * batch_dims
-        self.bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
+        self.bounds = (
+            (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
+        )
 
     def vectors(self, action: Tensor) -> Tensor:
         """Convert env actions to vectors [*batch, *agents, A]."""
@@ -55,7 +68,8 @@ class ActionSpace:
     def advice(self, action: Tensor, batch: torch.Size) -> Tensor:
         """Convert the action of a guide to a vector within the bounds of the env's action.
 
-        It is [*batch, *agents, A], for choices also their indices; raises a `ValueError` for another shape.
+        It is [*batch, *agents, A], for choices also their indices; raises a `ValueError` for
+        another shape.
         """
         indices = self._indices(action, batch)
         vectors = action if indices is None else self._encoded(indices)
@@ -71,7 +85,9 @@ class ActionSpace:
             limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
             numbers = action if indices is None else indices
             if not ((numbers >= 0) & (numbers < limit)).all():
-                raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
+                raise ValueError(
+                    f"is neither an index below {max(self.choices)} nor a one-hot vector"
+                )
 
     def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
         """Return the choices of a guide as indices [*batch, *agents, n], None if they are vectors already."""
@@ -90,11 +106,16 @@ class ActionSpace:
         best = torch.stack([part.argmax(-1) for part in vectors.split(self.choices, -1)], -1)
         if self.one_hot:
             return self._encoded(best).to(self.spec.dtype)
-        return best.reshape((*vectors.shape[: vectors.ndim - 1 - len(self.agents)], *self.event)).to(self.spec.dtype)
+        return best.reshape(
+            (*vectors.shape[: vectors.ndim - 1 - len(self.agents)], *self.event)
+        ).to(self.spec.dtype)
 
     def _encoded(self, indices: Tensor) -> Tensor:
         """Return the one-hot vectors of indices [..., n] side by side."""
-        parts = [F.one_hot(index, n) for index, n in zip(indices.long().unbind(-1), self.choices, strict=True)]
+        parts = [
+            F.one_hot(index, n)
+            for index, n in zip(indices.long().unbind(-1), self.choices, strict=True)
+        ]
         return parts[0] if len(parts) == 1 else torch.cat(parts, -1)
 
     def clamp(self, vectors: Tensor) -> Tensor:
@@ -122,7 +143,9 @@ class ActionTransform(Transform):
         """Action space of the env; RuntimeError outside an env."""
         env = self.parent  # slow, TorchRL rebuilds the env
         if env is None:
-            raise RuntimeError(f"{type(self).__name__} needs the action spec of an env: use it in a TransformedEnv")
+            raise RuntimeError(
+                f"{type(self).__name__} needs the action spec of an env: use it in a TransformedEnv"
+            )
         return ActionSpace(env.full_action_spec[self.action_key], env.batch_dims)
 
 

@@ -24,14 +24,18 @@ class AdviceDropout(GuideTransform):
 
     written = ("advice_given",)
 
-    def __init__(self, probability: float = 0.5, in_evaluation: bool = True, seed: int = 0, **options: Any) -> None:
+    def __init__(
+        self, probability: float = 0.5, in_evaluation: bool = True, seed: int = 0, **options: Any
+    ) -> None:
         super().__init__(**options)
         if not 0 <= probability <= 1:
             raise ValueError(f"probability={probability} must be at least 0 and at most 1")
         self.probability, self.in_evaluation = probability, in_evaluation
         self.rng = SeededGenerator(seed)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         shape = (*self.parent.batch_size, 1)
         # A number for every row, so that later draws do not depend on which rows are reset.
         given = torch.rand(shape, generator=self.rng.generator) >= self.probability
@@ -44,7 +48,9 @@ class AdviceDropout(GuideTransform):
 
     def _write(self, tensordict: TensorDictBase, given: Tensor) -> TensorDictBase:
         advice = tensordict[self.advice_key]
-        advice = advice * given.reshape(*tensordict.batch_size, *[1] * (advice.ndim - tensordict.ndim)).to(advice.dtype)
+        advice = advice * given.reshape(
+            *tensordict.batch_size, *[1] * (advice.ndim - tensordict.ndim)
+        ).to(advice.dtype)
         return tensordict.set(self.advice_key, advice).set("advice_given", given)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:

@@ -1,10 +1,11 @@
 """Env actions combined from the actions of agent and guide.
 
-`action` remains the agent's own action, so its log-probability stays valid. The action that the env was given is
-`("next", "executed_action")` [*batch, *A], in the unit of the env's action. `ResidualAction`, `MixedAction` and
-`AdaptiveMixedAction` add the two actions. `Takeover`, `JumpStart` and `GradualResidual` let the guide act alone in some
-steps and write `agent_acts` [*batch, 1] with the observation; on-policy learners leave these steps out of the policy
-loss, learners with replay learn from the executed action where the agent could have chosen it.
+`action` remains the agent's own action, so its log-probability stays valid. The action that the env
+was given is `("next", "executed_action")` [*batch, *A], in the unit of the env's action.
+`ResidualAction`, `MixedAction` and `AdaptiveMixedAction` add the two actions. `Takeover`,
+`JumpStart` and `GradualResidual` let the guide act alone in some steps and write `agent_acts`
+[*batch, 1] with the observation; on-policy learners leave these steps out of the policy loss,
+learners with replay learn from the executed action where the agent could have chosen it.
 """
 
 from collections.abc import Callable
@@ -24,7 +25,8 @@ EXECUTED = "executed_action"
 class CombinedAction(GuideTransform):
     """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset.
 
-    The options of all subclasses are `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+    The options of all subclasses are `guide`, `action_key` and `advice_key`, as for
+    `GuideTransform`.
     """
 
     written: tuple[str, ...] = (EXECUTED,)
@@ -32,7 +34,9 @@ class CombinedAction(GuideTransform):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(**options)
-        self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))  # steps in training, over all rows
+        self.taken: Tensor = nn.Buffer(
+            torch.zeros((), dtype=torch.int64)
+        )  # steps in training, over all rows
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         executed = self._executed(tensordict)
@@ -46,13 +50,17 @@ class CombinedAction(GuideTransform):
         self.taken = self.taken + self.training * tensordict.numel()
         return next_tensordict.set(EXECUTED, tensordict[EXECUTED])
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return tensordict_reset.set(EXECUTED, self.action_space.spec.zero())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what it writes; raises a `ValueError` if discrete actions would have to be added."""
         if self.adds and not self.action_space.continuous:
-            problem = f"needs continuous actions, but this env has {self.action_space.size} discrete ones"
+            problem = (
+                f"needs continuous actions, but this env has {self.action_space.size} discrete ones"
+            )
             remedy = "use Takeover, which replaces the agent's action in some steps"
             raise ValueError(f"{type(self).__name__} {problem}; {remedy}")
         return super().transform_observation_spec(observation_spec).update(self._specs())
@@ -62,9 +70,13 @@ class CombinedAction(GuideTransform):
         spec = self.action_space.spec  # not its own spec, as 0 need not be an action
         return {EXECUTED: Unbounded(spec.shape, device=self.parent.device, dtype=spec.dtype)}
 
-    def _spec_of_rows(self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype) -> TensorSpec:
+    def _spec_of_rows(
+        self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
+    ) -> TensorSpec:
         """Return the spec of one number a row, [*batch, 1]."""
-        return kind(*bounds, shape=(*self.parent.batch_size, 1), device=self.parent.device, dtype=dtype)
+        return kind(
+            *bounds, shape=(*self.parent.batch_size, 1), device=self.parent.device, dtype=dtype
+        )
 
 
 class ResidualAction(CombinedAction):
@@ -100,24 +112,27 @@ class MixedAction(CombinedAction):
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
         weight = self.current(self.weight)
-        return self.action_space.clamp(weight * tensordict[self.action_key] + (1 - weight) * self.advice(tensordict))
+        return self.action_space.clamp(
+            weight * tensordict[self.action_key] + (1 - weight) * self.advice(tensordict)
+        )
 
 
 class AdaptiveMixedAction(CombinedAction):
     """Weighted mean in which the agent weighs more the surer its critics are: CHEQ (Cramer et al. 2024).
 
-    The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low` in the first step of
-    an episode, then a linear function of `("next", "uncertainty")` [*batch, 1], which the policy wrote in the step
-    before: `high` up to `certain`, and `low` from `uncertain` on, or if the policy writes none. Weights that are not in
-    order within [0, 1], or uncertainties not in order, are a `ValueError`.
+    The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low`
+    in the first step of an episode, then a linear function of `("next", "uncertainty")` [*batch,
+    1], which the policy wrote in the step before: `high` up to `certain`, and `low` from
+    `uncertain` on, or if the policy writes none. Weights that are not in order within [0, 1], or
+    uncertainties not in order, are a `ValueError`.
 
     Args:
         low: smallest weight of the agent.
         high: largest weight of the agent.
         certain: uncertainty up to which the weight is `high`.
         uncertain: uncertainty from which on the weight is `low`.
-        warm_up: number of steps at the start of the run, over all rows, in which the weight is drawn from `low` to
-            `warm_up_high` instead.
+        warm_up: number of steps at the start of the run, over all rows, in which the weight is
+            drawn from `low` to `warm_up_high` instead.
         warm_up_high: see `warm_up`.
         seed: of the draws.
     """
@@ -126,13 +141,22 @@ class AdaptiveMixedAction(CombinedAction):
     adds = True
 
     def __init__(
-        self, low: float = 0.2, high: float = 1.0, certain: float = 0.03, uncertain: float = 0.15,
-        warm_up: int = 10_000, warm_up_high: float = 0.3, seed: int = 0, **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        low: float = 0.2,
+        high: float = 1.0,
+        certain: float = 0.03,
+        uncertain: float = 0.15,
+        warm_up: int = 10_000,
+        warm_up_high: float = 0.3,
+        seed: int = 0,
+        **options: Any,
+    ) -> None:
         super().__init__(**options)
         if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
             weights = f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, from 0 to 1"
-            raise ValueError(f"{weights}, and certain={certain} at least 0 and less than uncertain={uncertain}")
+            raise ValueError(
+                f"{weights}, and certain={certain} at least 0 and less than uncertain={uncertain}"
+            )
         self.low, self.high, self.certain, self.uncertain = low, high, certain, uncertain
         self.warm_up, self.warm_up_high, self.rng = warm_up, warm_up_high, SeededGenerator(seed)
 
@@ -145,7 +169,11 @@ class AdaptiveMixedAction(CombinedAction):
         doubt = next_tensordict.pop("uncertainty", None)
         weight = torch.full_like(tensordict["agent_weight"], self.low)
         if doubt is not None:
-            share = ((doubt - self.certain) / (self.uncertain - self.certain)).clamp(0, 1).to(weight.dtype)
+            share = (
+                ((doubt - self.certain) / (self.uncertain - self.certain))
+                .clamp(0, 1)
+                .to(weight.dtype)
+            )
             weight = self.high - (self.high - self.low) * share
         if self.learns:
             draw = torch.rand(weight.shape, generator=self.rng.generator).to(weight)
@@ -153,7 +181,9 @@ class AdaptiveMixedAction(CombinedAction):
             weight = torch.where((self.taken < self.warm_up).to(weight.device), drawn, weight)
         return super()._step(tensordict, next_tensordict).set("agent_weight", weight)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         weight = self.advice(tensordict_reset).new_full((*tensordict_reset.batch_size, 1), self.low)
         return super()._reset(tensordict, tensordict_reset).set("agent_weight", weight)
 
@@ -194,10 +224,20 @@ class _ActionSwitch(CombinedAction):
         raise NotImplementedError
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return super()._step(tensordict, next_tensordict).set("agent_acts", self._agent_acts(next_tensordict))
+        return (
+            super()
+            ._step(tensordict, next_tensordict)
+            .set("agent_acts", self._agent_acts(next_tensordict))
+        )
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
-        return super()._reset(tensordict, tensordict_reset).set("agent_acts", self._agent_acts(tensordict_reset))
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return (
+            super()
+            ._reset(tensordict, tensordict_reset)
+            .set("agent_acts", self._agent_acts(tensordict_reset))
+        )
 
     def _specs(self) -> dict[str, TensorSpec]:
         return super()._specs() | {"agent_acts": self._spec_of_rows(Binary, 1, dtype=torch.bool)}
@@ -210,12 +250,14 @@ class Takeover(_ActionSwitch):
 
     Args:
         probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
-        frames: number of steps at the start of the run, over all rows, after which the agent always acts, as in RLPD
-            and WSRL; None: no limit.
+        frames: number of steps at the start of the run, over all rows, after which the agent always
+            acts, as in RLPD and WSRL; None: no limit.
         options: `seed` of the draws, and those of `CombinedAction`.
     """
 
-    def __init__(self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any) -> None:
+    def __init__(
+        self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any
+    ) -> None:
         super().__init__(**options)
         self.probability, self.frames = probability, frames
 
@@ -224,15 +266,17 @@ class Takeover(_ActionSwitch):
         if not self.learns:
             return torch.ones_like(draw, dtype=torch.bool)
         agent = draw >= self.current(self.probability)
-        return agent if self.frames is None else agent | (self.taken >= self.frames).to(agent.device)
+        return (
+            agent if self.frames is None else agent | (self.taken >= self.frames).to(agent.device)
+        )
 
 
 class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 
-    The env action is g with a probability that decreases over the run, else g + scale * a, clamped; in evaluation
-    always the latter. The scale is a number or a schedule over the run; the `probability` of g alone and the other
-    arguments are those of `Takeover`.
+    The env action is g with a probability that decreases over the run, else g + scale * a, clamped;
+    in evaluation always the latter. The scale is a number or a schedule over the run; the
+    `probability` of g alone and the other arguments are those of `Takeover`.
     """
 
     mdp_parameter = "scale"
@@ -250,10 +294,12 @@ class GradualResidual(Takeover):
 class JumpStart(_ActionSwitch):
     """Jump start: the guide acts in the first steps of each episode, then the agent (Uchendu et al. 2023).
 
-    In evaluation the agent always acts. `guide_steps` [*batch, 1] counts the remaining steps of the guide.
+    In evaluation the agent always acts. `guide_steps` [*batch, 1] counts the remaining steps of the
+    guide.
 
     Args:
-        horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a curriculum.
+        horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a
+            curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
         options: `seed` of the draws, and those of `CombinedAction`.
     """
@@ -267,11 +313,15 @@ class JumpStart(_ActionSwitch):
     def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
         return tensordict["guide_steps"] == 0
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         draw = self._draw()
         horizon = max(self.current(self.horizon), 0.0) if self.learns else 0.0
         # Rounded down, so that 0, 1 ... horizon are equally likely.
-        steps = (draw * (horizon + 1)).long() if self.random else torch.full_like(draw, horizon).long()
+        steps = (
+            (draw * (horizon + 1)).long() if self.random else torch.full_like(draw, horizon).long()
+        )
         return super()._reset(tensordict, tensordict_reset.set("guide_steps", steps))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

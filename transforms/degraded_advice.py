@@ -1,7 +1,8 @@
 """Degraded advice: controls for the claim that a guide helps.
 
-Each transform follows `GuideActions` and changes its entry in place, within the same bounds, so several can be chained.
-Biased, scaled, partial, delayed and noisy advice degrade a guide. Random, shuffled and removed advice are placebos.
+Each transform follows `GuideActions` and changes its entry in place, within the same bounds, so
+several can be chained. Biased, scaled, partial, delayed and noisy advice degrade a guide. Random,
+shuffled and removed advice are placebos.
 """
 
 import math
@@ -31,7 +32,9 @@ class DegradedAdvice(Transform):
 
     needs_past = False  # whether stored data of a single step are not enough
 
-    def __init__(self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0) -> None:
+    def __init__(
+        self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0
+    ) -> None:
         key, memory_key = nested_key(key), nested_key(memory_key)
         super().__init__(in_keys=[key], out_keys=[key, memory_key] if slots else [key])
         self.key, self.memory_key, self.slots = key, memory_key, slots
@@ -45,21 +48,34 @@ class DegradedAdvice(Transform):
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._write(next_tensordict, self.degrade(next_tensordict[self.key]))
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Degrade the advice in stored data; raises a `RuntimeError` if the transform needs previous steps."""
         if self.needs_past:
-            raise RuntimeError(f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv")
+            raise RuntimeError(
+                f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"
+            )
         return DegradedAdvice._call(self, tensordict)
 
     def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
         if not self._bounds_known and self.parent is not None:
-            spec, first = self.parent.full_observation_spec[self.key], (0,) * len(self.parent.batch_size)
-            self._bounds = (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
+            spec, first = (
+                self.parent.full_observation_spec[self.key],
+                (0,) * len(self.parent.batch_size),
+            )
+            self._bounds = (
+                (spec.space.low[first], spec.space.high[first])
+                if isinstance(spec, Bounded)
+                else None
+            )
             self._bounds_known = True  # `self.parent` is as slow as an env step
-        return tensordict.set(self.key, advice if self._bounds is None else advice.clamp(*self._bounds))
+        return tensordict.set(
+            self.key, advice if self._bounds is None else advice.clamp(*self._bounds)
+        )
 
     def _memory_spec(self, advice: TensorSpec) -> dict[NestedKey, TensorSpec]:
         *batch, guides, size = advice.shape
@@ -77,7 +93,9 @@ class DegradedAdvice(Transform):
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Add the memory, which is an input of resets."""
         if self.slots:
-            state = input_spec["full_state_spec"] or Composite(shape=input_spec.shape, device=input_spec.device)
+            state = input_spec["full_state_spec"] or Composite(
+                shape=input_spec.shape, device=input_spec.device
+            )
             memory = self._memory_spec(self.parent.full_observation_spec[self.key])
             input_spec["full_state_spec"] = state.update(memory)
         return input_spec
@@ -131,8 +149,9 @@ class _DrawnAdvice(DegradedAdvice):
     def _draw(self, sample: Callable[..., Tensor], advice: Tensor, after_reset: bool) -> Tensor:
         """Draw one random number for each number of the advice.
 
-        A step draws two and uses the first. A partial reset uses the second of the next step, without advancing the
-        generator: later draws then do not depend on when other rows are reset.
+        A step draws two and uses the first. A partial reset uses the second of the next step,
+        without advancing the generator: later draws then do not depend on when other rows are
+        reset.
         """
         state = self.rng.generator.get_state() if after_reset else None
         draws = sample(2, *advice.shape, generator=self.rng.generator)
@@ -144,7 +163,9 @@ class _DrawnAdvice(DegradedAdvice):
         """Return the degraded advice, [*batch, n_guides, A], in a step or after a partial reset."""
         raise NotImplementedError
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         after_reset = tensordict.get("_reset", None) is not None
         return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
 
@@ -166,7 +187,9 @@ class NoisyAdvice(_DrawnAdvice):
 class RandomAdvice(_DrawnAdvice):
     """Placebo: uniform random numbers from `low` to `high` in action units, drawn at every step, instead of advice."""
 
-    def __init__(self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action") -> None:
+    def __init__(
+        self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"
+    ) -> None:
         super().__init__(seed, key)
         if not -math.inf < low < high < math.inf:
             raise ValueError(f"low={low} must be less than high={high}, and both finite")
@@ -180,13 +203,17 @@ class RandomAdvice(_DrawnAdvice):
 class ShuffledAdvice(DegradedAdvice):
     """Placebo: the advice for another row of the batch; same distribution, no information.
 
-    At every step all rows are shifted by the same random number. In a partial reset, a new episode gets the previous
-    advice of another row. When the env builds its specs, a batch of one row is a `ValueError`. The seed is that of the
-    draws, and `memory_key` the entry for the original advice, [*batch, 1, n_guides, A].
+    At every step all rows are shifted by the same random number. In a partial reset, a new episode
+    gets the previous advice of another row. When the env builds its specs, a batch of one row is a
+    `ValueError`. The seed is that of the draws, and `memory_key` the entry for the original advice,
+    [*batch, 1, n_guides, A].
     """
 
     def __init__(
-        self, seed: int = 0, key: NestedKey = "guide_action", memory_key: NestedKey = "unshuffled_advice"
+        self,
+        seed: int = 0,
+        key: NestedKey = "guide_action",
+        memory_key: NestedKey = "unshuffled_advice",
     ) -> None:
         super().__init__(key, memory_key, slots=1)
         self.rng = SeededGenerator(seed)
@@ -195,17 +222,23 @@ class ShuffledAdvice(DegradedAdvice):
         """Return the advice for other rows."""
         rows = advice.flatten(0, -3) if advice.ndim > 2 else advice.unsqueeze(0)
         self._check_rows(len(rows))
-        return rows.roll(int(torch.randint(1, len(rows), (), generator=self.rng.generator)), 0).view_as(advice)
+        return rows.roll(
+            int(torch.randint(1, len(rows), (), generator=self.rng.generator)), 0
+        ).view_as(advice)
 
     def _check_rows(self, rows: int) -> None:
         if rows < 2:
-            raise ValueError("ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more")
+            raise ValueError(
+                "ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more"
+            )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
         next_tensordict.set(self.memory_key, next_tensordict[self.key].unsqueeze(-3))
         return super()._call(next_tensordict)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         mask, previous = tensordict.get("_reset", None), tensordict.get(self.memory_key, None)
         if mask is None or previous is None or mask.all():
             return self._call(tensordict_reset)
@@ -221,19 +254,25 @@ class ShuffledAdvice(DegradedAdvice):
 class DelayedAdvice(DegradedAdvice):
     """Advice of an earlier step, by a delay of `steps`, 0 for none; at first the first advice of the episode.
 
-    `memory_key` is the entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest first.
+    `memory_key` is the entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
+    first.
     """
 
     needs_past = True
 
     def __init__(
-        self, steps: int = 12, key: NestedKey = "guide_action", memory_key: NestedKey = "delayed_advice"
+        self,
+        steps: int = 12,
+        key: NestedKey = "guide_action",
+        memory_key: NestedKey = "delayed_advice",
     ) -> None:
         if steps < 0:
             raise ValueError(f"steps={steps} must be at least 0")
         super().__init__(key, memory_key, steps)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         if self.slots:
             first = tensordict_reset[self.key].unsqueeze(-3)
             tensordict_reset.set(self.memory_key, first.repeat_interleave(self.slots, -3))

@@ -17,16 +17,19 @@ from coil_rl.transforms.action_space import ActionSpace, ActionTransform
 class DiscreteActions(ActionTransform):
     """Discretise the action, and round the advice to the nearest choice.
 
-    The agent's action becomes the index of a choice, and the advice becomes one-hot. Place it last: the transforms
-    before it and the env work in action units, with the advice as given, not rounded.
+    The agent's action becomes the index of a choice, and the advice becomes one-hot. Place it last:
+    the transforms before it and the env work in action units, with the advice as given, not
+    rounded.
 
-    Fewer than two choices, and values that are not finite and increasing, are a `ValueError`; in an env also an action
-    of another kind, and values outside its bounds.
+    Fewer than two choices, and values that are not finite and increasing, are a `ValueError`; in an
+    env also an action of another kind, and values outside its bounds.
 
     Args:
-        choices: number of choices, equally spaced from bound to bound, or the values in action units.
+        choices: number of choices, equally spaced from bound to bound, or the values in action
+            units.
         action_key: entry of the action, one bounded number; becomes [*batch], int64.
-        advice_key: entry of the advice, if any, [*batch, n_guides, 1]; becomes [*batch, n_guides, n], 0 or 1.
+        advice_key: entry of the advice, if any, [*batch, n_guides, 1]; becomes [*batch, n_guides,
+            n], 0 or 1.
         number_key: entry for the advice in action units, [*batch, n_guides, 1].
 
     Example:
@@ -61,13 +64,21 @@ class DiscreteActions(ActionTransform):
         spec = self.action_space.spec
         size = spec.shape[self.parent.batch_dims :].numel()
         if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point or size != 1:
-            kind = f"{size} numbers" if spec.dtype.is_floating_point and size != 1 else type(spec).__name__
-            raise ValueError(f"DiscreteActions needs an action of one bounded number, but this env's action is {kind}")
+            kind = (
+                f"{size} numbers"
+                if spec.dtype.is_floating_point and size != 1
+                else type(spec).__name__
+            )
+            raise ValueError(
+                f"DiscreteActions needs an action of one bounded number, but this env's action is {kind}"
+            )
         low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
         if isinstance(self.choices, int):
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
         if self.choices[0] < low or self.choices[-1] > high:
-            raise ValueError(f"choices={list(self.choices)} must lie between the action's bounds {low} and {high}")
+            raise ValueError(
+                f"choices={list(self.choices)} must lie between the action's bounds {low} and {high}"
+            )
         return torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -82,14 +93,18 @@ class DiscreteActions(ActionTransform):
         choices = F.one_hot(nearest, len(self.values)).to(numbers.dtype)
         return next_tensordict.set(self.number_key, numbers).set(self.advice_key, choices)
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         return self._call(tensordict_reset)
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         numbers = tensordict.get(self.number_key, None)
         if numbers is not None:
             tensordict.set(self.advice_key, numbers)
-        return tensordict.set(self.action_key, self.values[tensordict[self.action_key]].unsqueeze(-1))
+        return tensordict.set(
+            self.action_key, self.values[tensordict[self.action_key]].unsqueeze(-1)
+        )
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action spec."""
@@ -102,8 +117,12 @@ class DiscreteActions(ActionTransform):
         if numbers is not None:
             space = ActionSpace(self._action_spec(), self.parent.batch_dims)
             observation_spec[self.number_key] = numbers
-            observation_spec[self.advice_key] = space.advice_spec(self.parent.batch_size, numbers.shape[-2])
+            observation_spec[self.advice_key] = space.advice_spec(
+                self.parent.batch_size, numbers.shape[-2]
+            )
         return observation_spec
 
     def _action_spec(self) -> Categorical:
-        return Categorical(len(self.values), self.parent.batch_size, device=self.values.device, dtype=torch.int64)
+        return Categorical(
+            len(self.values), self.parent.batch_size, device=self.values.device, dtype=torch.int64
+        )

@@ -18,33 +18,42 @@ Schedule = Callable[[float], float]
 class GuideTransform(ActionTransform):
     """Base class of transforms that use the advice observed by the agent; place them after `GuideActions`.
 
-    Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a schedule returns its
-    final value, and changes that serve learning only are off. In training, `set_progress` moves the schedules. `guide`
-    is the row of the advice, [*batch, n_guides, A]; the keys are the entries of action and advice.
+    Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a
+    schedule returns its final value, and changes that serve learning only are off. In training,
+    `set_progress` moves the schedules. `guide` is the row of the advice, [*batch, n_guides, A]; the
+    keys are the entries of action and advice.
     """
 
     written: tuple[str, ...] = ()  # entries that the transform adds
-    # Name of the parameter that changes rewards or transitions, empty if there is none. If it is a schedule,
-    # stored transitions become invalid during the run.
+    # Name of the parameter that changes rewards or transitions, empty if there is none. If it is a
+    # schedule, stored transitions become invalid during the run.
     mdp_parameter: str = ""
 
     def __init__(
-        self, guide: int = 0, action_key: NestedKey = "action", advice_key: NestedKey = "guide_action"
+        self,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
     ) -> None:
         if guide < 0:
             raise ValueError(f"guide={guide} must be at least 0: it is a row of the advice")
         super().__init__(in_keys=[], out_keys=list(self.written))
         self.guide = guide
-        self.progress: float | None = None  # completed fraction of the run, for schedules; see `set_progress`
+        self.progress: float | None = (
+            None  # completed fraction of the run, for schedules; see `set_progress`
+        )
         self._mode_is_set = False
         self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
 
     def train(self, mode: bool = True) -> GuideTransform:
         """Set the mode: training, or evaluation."""
         super().train(mode)
-        # TorchRL calls `eval` itself while it puts a transform into an env, and it is no part of the env until then.
+        # TorchRL calls `eval` itself while it puts a transform into an env, and it is no part of
+        # the env until then.
         whole = getattr(self.container, "transform", None)
-        self._mode_is_set = mode or (whole is not None and any(self is part for part in whole.modules()))
+        self._mode_is_set = mode or (
+            whole is not None and any(self is part for part in whole.modules())
+        )
         return self
 
     @property

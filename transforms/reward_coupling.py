@@ -15,13 +15,13 @@ NORMS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
 class RewardCoupling(GuideTransform):
     """Reward R - beta ||a - g||, where g is the advice that the agent observed before action a.
 
-    Writes the env's own reward as `task_reward` [*batch, 1] and ||a - g|| as `guide_distance` [*batch, 1]. In
-    evaluation the reward is the task reward.
+    Writes the env's own reward as `task_reward` [*batch, 1] and ||a - g|| as `guide_distance`
+    [*batch, 1]. In evaluation the reward is the task reward.
 
     Args:
         beta: weight of the distance, a number or a schedule over the run.
-        norm: of the distance; another is a `ValueError`. Discrete actions are one-hot: l1 is 0 or 2, l2 is 0 or the
-            root of 2.
+        norm: of the distance; another is a `ValueError`. Discrete actions are one-hot: l1 is 0 or
+            2, l2 is 0 or the root of 2.
         options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
 
     Example:
@@ -38,7 +38,9 @@ class RewardCoupling(GuideTransform):
     mdp_parameter = "beta"
     written = ("task_reward", "guide_distance")
 
-    def __init__(self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", **options: Any) -> None:
+    def __init__(
+        self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", **options: Any
+    ) -> None:
         if norm not in NORMS:
             raise ValueError(f"norm={norm!r} must be one of {', '.join(NORMS)}")
         super().__init__(**options)
@@ -51,14 +53,20 @@ class RewardCoupling(GuideTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict[self.reward_key]
-        difference = self.action_space.vectors(tensordict[self.action_key]) - self.advice(tensordict)
-        distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True).to(reward.dtype)
+        difference = self.action_space.vectors(tensordict[self.action_key]) - self.advice(
+            tensordict
+        )
+        distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True).to(
+            reward.dtype
+        )
         next_tensordict.set("task_reward", reward).set("guide_distance", distance)
         if self.learns:
             next_tensordict.set(self.reward_key, reward - self.current(self.beta) * distance)
         return next_tensordict
 
-    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> TensorDictBase:
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
         for key in self.out_keys:
             tensordict_reset.set(key, self.parent.full_reward_spec[self.reward_key].zero())
         return tensordict_reset
@@ -68,5 +76,7 @@ class RewardCoupling(GuideTransform):
         observation_spec = super().transform_observation_spec(observation_spec)
         reward = self.parent.full_reward_spec[self.reward_key]
         for key in self.out_keys:
-            observation_spec[key] = Unbounded(reward.shape, device=reward.device, dtype=reward.dtype)
+            observation_spec[key] = Unbounded(
+                reward.shape, device=reward.device, dtype=reward.dtype
+            )
         return observation_spec

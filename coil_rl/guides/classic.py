@@ -45,7 +45,9 @@ def energy_pump(observation: Tensor, power: float = 1.0) -> Tensor:
 def swing_up(observation: Tensor, gain: float = 5.0) -> Tensor:
     """Swing Pendulum-v1 up by its energy, and hold it there by linear feedback: [*batch, 3] to [*batch, 1]."""
     cos, sin, speed = observation.unbind(-1)
-    missing = 5 * (1 - cos) - speed.square() / 6  # J, to the energy at rest at the top: m g l / 2 = 5, inertia 1 / 3
+    missing = (
+        5 * (1 - cos) - speed.square() / 6
+    )  # J, to the energy at rest at the top: m g l / 2 = 5, inertia 1 / 3
     pump = gain * missing * torch.where(speed < 0, -1.0, 1.0)
     hold = -(10 * torch.atan2(sin, cos) + 2 * speed)
     return torch.where(cos > 0.9, hold, pump).clamp(-2, 2).unsqueeze(-1)
@@ -67,7 +69,11 @@ class ClassicGuide(TensorDictModule):
     def __init__(self, controller: str, options: Mapping[str, Any] | None = None) -> None:
         known = {each.__name__: each for each in (lander, energy_pump, swing_up, linear_feedback)}
         check_choice(tuple(known), controller=controller)
-        super().__init__(partial(known[controller], **(options or {})), in_keys=["observation"], out_keys=["action"])
+        super().__init__(
+            partial(known[controller], **(options or {})),
+            in_keys=["observation"],
+            out_keys=["action"],
+        )
 
 
 class Oscillator(TensorDictModuleBase):
@@ -95,7 +101,13 @@ class Oscillator(TensorDictModuleBase):
         kd: float = 0.5,
     ) -> None:
         super().__init__()
-        self.frequency, self.phases, self.amplitude, self.kp, self.kd = frequency, list(phases), amplitude, kp, kd
+        self.frequency, self.phases, self.amplitude, self.kp, self.kd = (
+            frequency,
+            list(phases),
+            amplitude,
+            kp,
+            kd,
+        )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write both torques, and the number of the next step."""
@@ -107,7 +119,9 @@ class Oscillator(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the number of the step as memory."""
-        return TensorDictPrimer({"swum_steps": Unbounded((1,), dtype=torch.int64)}, expand_specs=True)
+        return TensorDictPrimer(
+            {"swum_steps": Unbounded((1,), dtype=torch.int64)}, expand_specs=True
+        )
 
 
 class Walker:
@@ -126,7 +140,9 @@ class Walker:
 
     def act(self, observation: Any) -> Any:
         """Return the torques, [4], for an observation [24]."""
-        return self.machine.step_heuristic(observation.astype(float))  # in float64 the state is plain numbers
+        return self.machine.step_heuristic(
+            observation.astype(float)
+        )  # in float64 the state is plain numbers
 
     def state_dict(self) -> dict[str, float]:
         """Return the state of the machine."""
@@ -156,8 +172,9 @@ class LastAction(gymnasium.Wrapper[Any, Any, Any, Any]):
 class Bot:
     """Controller that solves BabyAI levels by the planner of MiniGrid, `BabyAIBot`; it knows the whole level.
 
-    Its env needs the wrapper `LastAction`. It plans again after actions of others. When one opens a box it can no
-    longer help, and in a few levels of Unlock it plans without end: from then on it advises `done`.
+    Its env needs the wrapper `LastAction`. It plans again after actions of others. When one opens a
+    box it can no longer help, and in a few levels of Unlock it plans without end: from then on it
+    advises `done`.
     """
 
     searches = 100  # in one step; usually there are at most 5

@@ -25,10 +25,11 @@ from coil_rl.transforms.action_space import nested_key
 class PerRow(TensorDictModuleBase):
     """Python controllers as a guide, one object for each row of the env, made when its row first acts.
 
-    `act(observation)` gets one NumPy array for each of `in_keys` and returns an action: numbers, an index or a one-hot
-    vector. `reset()`, if there is one, is called at the start of each episode; without it each episode gets a new
-    object. Objects with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
-    episodes begin when a run is resumed. They are called one after the other: a batched guide is many times faster.
+    `act(observation)` gets one NumPy array for each of `in_keys` and returns an action: numbers, an
+    index or a one-hot vector. `reset()`, if there is one, is called at the start of each episode;
+    without it each episode gets a new object. Objects with `state_dict()` and
+    `load_state_dict(state)` are part of a checkpoint; without these, new episodes begin when a run
+    is resumed. They are called one after the other: a batched guide is many times faster.
 
     Args:
         make: makes an object; called without arguments.
@@ -47,13 +48,17 @@ class PerRow(TensorDictModuleBase):
     """
 
     def __init__(
-        self, make: Callable[[], Any], in_keys: Sequence[NestedKey] = ("observation",), out_key: NestedKey = "action"
+        self,
+        make: Callable[[], Any],
+        in_keys: Sequence[NestedKey] = ("observation",),
+        out_key: NestedKey = "action",
     ) -> None:
         self.read = [nested_key(key) for key in in_keys]
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
         super().__init__()
         self.make, self.objects = make, dict[int, Any]()
-        self.continues = True  # whether the last restored state held those of the objects; else new episodes begin
+        # whether the last restored state held those of the objects; else new episodes begin
+        self.continues = True
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
@@ -65,7 +70,9 @@ class PerRow(TensorDictModuleBase):
             for row, start, observed in zip(rows, starts, observations, strict=True)
         ]
         action = torch.as_tensor(np.stack(actions), device=tensordict.device)
-        return tensordict.set(self.out_keys[0], action.reshape(*tensordict.batch_size, *action.shape[1:]))
+        return tensordict.set(
+            self.out_keys[0], action.reshape(*tensordict.batch_size, *action.shape[1:])
+        )
 
     def _object(self, row: int, start: bool) -> Any:
         if row not in self.objects or (start and not hasattr(self.objects[row], "reset")):
@@ -107,7 +114,8 @@ class PerRow(TensorDictModuleBase):
 class ControllerGuide(TensorDictModuleBase):
     """A controller that is named by `MODULE:NAME`. What is found there decides how it is used.
 
-    What cannot be imported, is nothing of the following, or takes other arguments, is a `ValueError`.
+    What cannot be imported, is nothing of the following, or takes other arguments, is a
+    `ValueError`.
 
     | it is | it becomes |
     | --- | --- |
@@ -123,7 +131,10 @@ class ControllerGuide(TensorDictModuleBase):
     """
 
     def __init__(
-        self, of: str, in_keys: Sequence[NestedKey] | None = None, options: Mapping[str, Any] | None = None
+        self,
+        of: str,
+        in_keys: Sequence[NestedKey] | None = None,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         thing, options = load(of), dict(options or {})
         keys = [nested_key(key) for key in in_keys or ["observation"]]
@@ -145,7 +156,9 @@ class ControllerGuide(TensorDictModuleBase):
             _check_call(act, f"{of}.act", ["self", *keys], {})
             guide = PerRow(partial(thing, **options), keys)
         else:
-            raise ValueError(f"of={of} is a class without act(observation); give it this method, or name a function")
+            raise ValueError(
+                f"of={of} is a class without act(observation); give it this method, or name a function"
+            )
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
         self.guide, self.pure = guide, getattr(thing, "pure", False)
@@ -167,8 +180,8 @@ class EntryGuide(TensorDictModule):
 class RecordedGuide(TensorDictModuleBase):
     """Actions of a recording, from the first step of every episode; the last one is held after the end.
 
-    The `file` is a CSV of numbers, [T, A] action units, one line for each step; a first line with names is left out. A
-    file that cannot be read, or without finite numbers, is a `ValueError`.
+    The `file` is a CSV of numbers, [T, A] action units, one line for each step; a first line with
+    names is left out. A file that cannot be read, or without finite numbers, is a `ValueError`.
     """
 
     in_keys, out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
@@ -185,7 +198,9 @@ class RecordedGuide(TensorDictModuleBase):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the number of the step as memory."""
-        return TensorDictPrimer({"recorded_step": Unbounded((1,), dtype=torch.int64)}, expand_specs=True)
+        return TensorDictPrimer(
+            {"recorded_step": Unbounded((1,), dtype=torch.int64)}, expand_specs=True
+        )
 
 
 def load(of: str) -> Any:
@@ -202,15 +217,21 @@ def load(of: str) -> Any:
             problem = f"of={of}: {module} needs {error.name}, which is missing; install it"
         raise ValueError(problem) from error
     except Exception as error:
-        raise ValueError(f"of={of}: {module} cannot be imported ({type(error).__name__}: {error})") from error
+        raise ValueError(
+            f"of={of}: {module} cannot be imported ({type(error).__name__}: {error})"
+        ) from error
     for name in names.split("."):
         if not hasattr(thing, name):
-            raise ValueError(f"of={of}: {module} has no {names}{did_you_mean(name, vars(thing)) or '; name another'}")
+            raise ValueError(
+                f"of={of}: {module} has no {names}{did_you_mean(name, vars(thing)) or '; name another'}"
+            )
         thing = getattr(thing, name)
     return thing
 
 
-def _check_call(function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]) -> None:
+def _check_call(
+    function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]
+) -> None:
     try:
         signature = inspect.signature(function)
     except ValueError:  # some functions written in C have none
@@ -218,9 +239,17 @@ def _check_call(function: Callable[..., Any], title: str, entries: Sequence[Any]
     try:
         signature.bind(*entries, **options)
     except TypeError as error:
-        given = ", ".join([*(str(entry) for entry in entries if entry != "self"), *(f"{key}=" for key in options)])
-        close = [did_you_mean(key, signature.parameters) for key in options if key not in signature.parameters]
-        raise ValueError(f"{title} takes {signature}, but is called with ({given}): {error}{''.join(close)}") from error
+        given = ", ".join(
+            [*(str(entry) for entry in entries if entry != "self"), *(f"{key}=" for key in options)]
+        )
+        close = [
+            did_you_mean(key, signature.parameters)
+            for key in options
+            if key not in signature.parameters
+        ]
+        raise ValueError(
+            f"{title} takes {signature}, but is called with ({given}): {error}{''.join(close)}"
+        ) from error
 
 
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
@@ -233,7 +262,9 @@ def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
             del rows[0]
         actions = np.array(rows, dtype=np.float32)
     except (OSError, ValueError) as error:
-        raise ValueError(f"file={os.fspath(file)} cannot be read as numbers with commas ({error})") from error
+        raise ValueError(
+            f"file={os.fspath(file)} cannot be read as numbers with commas ({error})"
+        ) from error
     if not actions.size or not np.isfinite(actions).all():
         raise ValueError(f"file={os.fspath(file)} must hold at least one line of finite numbers")
     return torch.from_numpy(actions)

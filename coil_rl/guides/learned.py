@@ -29,19 +29,25 @@ class LearnedGuide(TensorDictModuleBase):
 
     Raises:
         UserError: if the folder holds no finished run, or one that is its own guide.
-        ValueError: if the run has no policy (method=guide), one whose advice depends on earlier steps, or one with a
-            memory behind transforms.
+        ValueError: if the run has no policy (method=guide), one whose advice depends on earlier
+            steps, or one with a memory behind transforms.
     """
 
-    def __init__(self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu") -> None:
+    def __init__(
+        self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu"
+    ) -> None:
         super().__init__()
         folder = Path(os.path.expanduser(run))
         config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
-            raise ValueError(f"{folder} trained no agent: its method is {config.method.name}; name its guide instead")
+            raise ValueError(
+                f"{folder} trained no agent: its method is {config.method.name}; name its guide instead"
+            )
         with _guarded(folder):
             # The transforms need the specs of an env; some need at least two rows.
-            env = TransformedEnv(build_bare_env(config, {"num_envs": 2}), Compose(*build_transforms(config)))
+            env = TransformedEnv(
+                build_bare_env(config, {"num_envs": 2}), Compose(*build_transforms(config))
+            )
             self.policy, self.transforms = load_policy(folder, config, env, which), None
         memory = memory_keys(self.policy)
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
@@ -52,11 +58,18 @@ class LearnedGuide(TensorDictModuleBase):
                     "network=mlp, or with method=ppo action=continuous"
                 )
             self.transforms = env.transform
-            past = [type(part).__name__ for part in env.transform.modules() if getattr(part, "needs_past", False)]
+            past = [
+                type(part).__name__
+                for part in env.transform.modules()
+                if getattr(part, "needs_past", False)
+            ]
             if past:
-                raise ValueError(f"{folder} has {', '.join(past)}, which needs earlier steps; its policy is no guide")
+                raise ValueError(
+                    f"{folder} has {', '.join(past)}, which needs earlier steps; its policy is no guide"
+                )
             self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
-        # Transforms hold a weak reference to their env; the tuple keeps it from becoming a submodule.
+        # Transforms hold a weak reference to their env; the tuple keeps it from becoming a
+        # submodule.
         self._env = (env,)
         self.requires_grad_(False)
         self.eval()
@@ -82,7 +95,9 @@ def _guarded(folder: Path) -> Iterator[None]:
     if place in _loading:
         raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
     if len(_loading) == LONGEST_CHAIN:
-        raise UserError(f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a shorter one")
+        raise UserError(
+            f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a shorter one"
+        )
     _loading.append(place)
     try:
         yield

@@ -14,10 +14,10 @@ from coil_rl.guides.spline import TARGET_REACHED, SplineGuide, first_point
 class RacingLineGuide(SplineGuide):
     """Pure pursuit of the farthest target of `SplineGuide` that the car reaches on a clear arc.
 
-    The arc has `turn` times the curvature of the arc from the car to the target: with more than 1 the car turns in
-    early and cuts the corner; it plans again at every step and straightens on the way. An arc is clear if all cones
-    nearer than the target are on their own side of it and at least `margin` away. Without a clear arc the target is the
-    nearest one.
+    The arc has `turn` times the curvature of the arc from the car to the target: with more than 1
+    the car turns in early and cuts the corner; it plans again at every step and straightens on the
+    way. An arc is clear if all cones nearer than the target are on their own side of it and at
+    least `margin` away. Without a clear arc the target is the nearest one.
 
     Args:
         margin: minimum distance between arc and cones, m; less than `car_length`.
@@ -43,10 +43,14 @@ class RacingLineGuide(SplineGuide):
     ) -> None:
         # Equation 103 is replaced: naming its options here rejects them in `options`.
         super().__init__(gain=1.0, sharpness=1.8, max_steering=max_steering, **options)
-        check_range(0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length)
+        check_range(
+            0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length
+        )
         check_range(0, 90, above=True, max_steering=max_steering)
         if not 0 <= margin < car_length:  # the smallest turning radius
-            raise ValueError(f"margin={margin} must be at least 0 and less than car_length={car_length}")
+            raise ValueError(
+                f"margin={margin} must be at least 0 and less than car_length={car_length}"
+            )
         self.margin, self.turn, self.lookahead = margin, turn, lookahead
         self.spacing, self.car_length = spacing, car_length
 
@@ -55,27 +59,39 @@ class RacingLineGuide(SplineGuide):
         plan = self.plan(cones, cone_count)
         excluded, square = plan.excluded, plan.squared_distance.clamp(min=TARGET_REACHED**2)
         full = math.radians(self.max_steering)
-        sine = (plan.targets[1] / square * (2 * self.turn * self.car_length)).clamp(-math.sin(full), math.sin(full))
-        unclear = torch.maximum(excluded, self._blocked(sine / self.car_length, square.sqrt(), cones, cone_count))
+        sine = (plan.targets[1] / square * (2 * self.turn * self.car_length)).clamp(
+            -math.sin(full), math.sin(full)
+        )
+        unclear = torch.maximum(
+            excluded, self._blocked(sine / self.car_length, square.sqrt(), cones, cone_count)
+        )
         none_clear = unclear.amin(0)
         # The farthest of the clear targets, else the nearest target.
         order = torch.lerp(square.reciprocal(), square, none_clear)
-        best = first_point(sine.unsqueeze(0), order, torch.lerp(unclear, excluded, none_clear)).squeeze(0)
+        best = first_point(
+            sine.unsqueeze(0), order, torch.lerp(unclear, excluded, none_clear)
+        ).squeeze(0)
         advice = best.asin() / full
         return torch.where(excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def _blocked(self, curvature: Tensor, distance: Tensor, cones: Tensor, count: Tensor) -> Tensor:
         """Return 1 for arcs too close to a cone or with a target beyond the lookahead, else 0: [T, B].
 
-        Curvatures [T, B] are in 1/m, positive to the left; distances [T, B] m are those of the targets.
+        Curvatures [T, B] are in 1/m, positive to the left; distances [T, B] m are those of the
+        targets.
         """
         x, y = cones[:, :, : slots_in_use(count, cones.shape[2])].permute(3, 2, 1, 0)
         slot = torch.arange(len(x), dtype=x.dtype, device=x.device).view(-1, 1, 1)
         side = torch.tensor([[1.0], [-1.0]], dtype=x.dtype, device=x.device)
         square = torch.addcmul(x * x, y, y)
-        # "At least `margin` away on its own side of a circle through the car" is linear in the curvature.
+        # "At least `margin` away on its own side of a circle through the car" is linear in the
+        # curvature.
         limit = torch.where(count.t() > slot, (y * side - self.margin) * 2, math.inf)
         slope = (square - self.margin**2) * side
         curvature, reach = curvature.unsqueeze(1).unsqueeze(1), (distance + self.margin).square()
-        blocked = torch.gt(curvature * slope, limit).logical_and_(square <= reach.unsqueeze(1).unsqueeze(1))
-        return blocked.flatten(1, 2).any(1).logical_or_(distance > self.lookahead).to(distance.dtype)
+        blocked = torch.gt(curvature * slope, limit).logical_and_(
+            square <= reach.unsqueeze(1).unsqueeze(1)
+        )
+        return (
+            blocked.flatten(1, 2).any(1).logical_or_(distance > self.lookahead).to(distance.dtype)
+        )

@@ -35,7 +35,10 @@ class ConstantGuide(TensorDictModuleBase):
     pure = True
 
     def __init__(
-        self, value: float | Sequence[float], in_key: NestedKey = "observation", out_key: NestedKey = "action"
+        self,
+        value: float | Sequence[float],
+        in_key: NestedKey = "observation",
+        out_key: NestedKey = "action",
     ) -> None:
         self.in_keys, self.out_keys = [in_key], [out_key]
         super().__init__()
@@ -50,7 +53,9 @@ class ConstantGuide(TensorDictModuleBase):
 class ZeroGuide(ConstantGuide):
     """Guide with the action 0, [*batch, size]; keys as for `ConstantGuide`."""
 
-    def __init__(self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action") -> None:
+    def __init__(
+        self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
+    ) -> None:
         check_range(1, size=size)
         super().__init__([0.0] * size, in_key, out_key)
 
@@ -100,4 +105,6 @@ class FollowAdvice(TensorDictModuleBase):
         """Write the action."""
         advice = tensordict[self.in_keys[0]]
         guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
-        return tensordict.set(self.out_keys[0], self.action_space.actions(advice.gather(-2, guide).squeeze(-2)))
+        return tensordict.set(
+            self.out_keys[0], self.action_space.actions(advice.gather(-2, guide).squeeze(-2))
+        )

@@ -106,12 +106,18 @@ class SplineGuide(TensorDictModuleBase):
         """Return the path and its targets; arguments as for `steer`."""
         points, count = self._midpoints(cones, cone_count)
         path = self.fit(points, count)
-        steps = (path.polyline_length / constant(self.spacing, points)).round_().clamp_(1, self.targets - 1)
+        steps = (
+            (path.polyline_length / constant(self.spacing, points))
+            .round_()
+            .clamp_(1, self.targets - 1)
+        )
         slots = slots_in_use(steps, self.targets - 1) + 1
         x, y = targets = path.along((constant(range(slots), points[0]) / steps).clamp_(max=1))
         square = torch.addcmul(x * x, y, y)
         # Negative for an excluded target; a single midpoint is not a path.
-        margin = torch.minimum(square - constant(TARGET_REACHED**2, square), field_of_view_margin(x, square))
+        margin = torch.minimum(
+            square - constant(TARGET_REACHED**2, square), field_of_view_margin(x, square)
+        )
         margin = torch.minimum(margin, count - constant(2, count))
         return PathPlan(points, count, path, targets, square, margin.lt_(constant(0, margin)))
 

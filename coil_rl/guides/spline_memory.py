@@ -23,20 +23,22 @@ NOWHERE = 1e4  # m, coordinates of empty slots
 class SplineMemoryGuide(SplineGuide):
     """Pursuit of remembered targets: the safety policy of the paper as in the authors' program (appendix A.1).
 
-    When a cone that was never seen comes into view, and two of each side are in view, the guide places targets on the
-    least-squares parabola through the midpoints of left-right pairs, at least 1 m from each other. It steers for the
-    nearest visible target that has not been passed. All positions are in the frame of the car at the start of the
-    episode, and the car's own follows from `motion`. There is room for 192 targets and 128 cones a side; further ones
-    are not remembered.
+    When a cone that was never seen comes into view, and two of each side are in view, the guide
+    places targets on the least-squares parabola through the midpoints of left-right pairs, at least
+    1 m from each other. It steers for the nearest visible target that has not been passed. All
+    positions are in the frame of the car at the start of the episode, and the car's own follows
+    from `motion`. There is room for 192 targets and 128 cones a side; further ones are not
+    remembered.
 
-    Reads `cones`, `cone_count`, `steering`, `motion` and `is_init`, writes `action`. Its memory is entries named
-    `path_...`.
+    Reads `cones`, `cone_count`, `steering`, `motion` and `is_init`, writes `action`. Its memory is
+    entries named `path_...`.
 
     Args:
-        oddities: whether to act as the authors' program: the target is the one chosen in the step before, and without
-            one the steering is 0; passed targets count again only in a circle around the first midpoint; midpoints that
-            share a coordinate with a nearer one are dropped; the first observation is ignored. By default the target is
-            chosen now, the steering is kept without one, and passed targets count again out of sight.
+        oddities: whether to act as the authors' program: the target is the one chosen in the step
+            before, and without one the steering is 0; passed targets count again only in a circle
+            around the first midpoint; midpoints that share a coordinate with a nearer one are
+            dropped; the first observation is ignored. By default the target is chosen now, the
+            steering is kept without one, and passed targets count again out of sight.
         sight: m, range in which a target is visible.
         gain, sharpness, max_steering: as for `SplineGuide`.
 
@@ -66,10 +68,15 @@ class SplineMemoryGuide(SplineGuide):
             "path_targets": ((2, TARGETS), NOWHERE, torch.float32),
             "path_target_count": ((1,), 0, torch.int64),
             "path_passed": ((TARGETS,), False, torch.bool),
-            # Ever seen: coordinate, side, cone. Half precision is enough to tell cones, and resets cost less.
+            # Ever seen: coordinate, side, cone. Half precision is enough to tell cones, and resets
+            # cost less.
             "path_cones": ((2, 2, CONES), NOWHERE, torch.float16),
             "path_cone_count": ((2,), 0, torch.int64),
-            "path_in_view": ((2, self.cones, 2), NOWHERE, torch.float32),  # at the last step: coordinate, cone, side
+            "path_in_view": (
+                (2, self.cones, 2),
+                NOWHERE,
+                torch.float32,
+            ),  # at the last step: coordinate, cone, side
         }
         if oddities:
             self.memory["path_chosen"] = ((2,), NOWHERE, torch.float32)
@@ -83,19 +90,25 @@ class SplineMemoryGuide(SplineGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the memory."""
-        specs = {key: Unbounded(shape, dtype=dtype) for key, (shape, _, dtype) in self.memory.items()}
+        specs = {
+            key: Unbounded(shape, dtype=dtype) for key, (shape, _, dtype) in self.memory.items()
+        }
         first = {key: value for key, (_, value, _) in self.memory.items()}
         return TensorDictPrimer(specs, default_value=first, expand_specs=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the advice and the memory for the next step."""
         count, dtype = tensordict["cone_count"], tensordict["steering"].dtype
-        cones, steering, motion = (tensordict[key].float() for key in ("cones", "steering", "motion"))
+        cones, steering, motion = (
+            tensordict[key].float() for key in ("cones", "steering", "motion")
+        )
         memory = {key: tensordict[key] for key in self.memory}
         if self.oddities:
             count = count.masked_fill(tensordict["is_init"], 0)
         old = memory["path_pose"].t()
-        pose = torch.cat([Frame(old).to_world(motion[:, :2].t()), (old[2] + motion[:, 2]).unsqueeze(0)])
+        pose = torch.cat(
+            [Frame(old).to_world(motion[:, :2].t()), (old[2] + motion[:, 2]).unsqueeze(0)]
+        )
         frame = Frame(pose)
         memory["path_pose"] = pose.t()
         target = self._nearest_unpassed(memory, frame, old[:2])
@@ -137,7 +150,9 @@ class SplineMemoryGuide(SplineGuide):
         target = targets.gather(2, index).squeeze(-1)
         return torch.where(nearest.values.isinf(), constant(NOWHERE, target), target.t())
 
-    def _discover(self, memory: dict[str, Tensor], frame: Frame, cones: Tensor, count: Tensor) -> None:
+    def _discover(
+        self, memory: dict[str, Tensor], frame: Frame, cones: Tensor, count: Tensor
+    ) -> None:
         """Remember the cones in view, and place targets in the rows where one was never seen before."""
         slots = slots_in_use(count, self.cones)
         real = count.t() > constant(range(slots), count.t().unsqueeze(0))
@@ -150,9 +165,19 @@ class SplineMemoryGuide(SplineGuide):
         rows = rows_in_use(appeared.flatten(0, 1).any(0))
         if not len(rows):
             return
-        world, appeared, local, count = world[..., rows], appeared[..., rows], local[..., rows], count[rows]
-        seen, seen_count = memory["path_cones"][rows].permute(1, 3, 2, 0), memory["path_cone_count"][rows].t()
-        new = appeared & ~_near(world, seen[:, : slots_in_use(seen_count, CONES)].to(world), SAME_CONE)
+        world, appeared, local, count = (
+            world[..., rows],
+            appeared[..., rows],
+            local[..., rows],
+            count[rows],
+        )
+        seen, seen_count = (
+            memory["path_cones"][rows].permute(1, 3, 2, 0),
+            memory["path_cone_count"][rows].t(),
+        )
+        new = appeared & ~_near(
+            world, seen[:, : slots_in_use(seen_count, CONES)].to(world), SAME_CONE
+        )
         seen, total = append(seen, seen_count, world.to(seen), new)
         plans = (total > seen_count).any(0) & (count > 1).all(-1)
         memory["path_cones"] = memory["path_cones"].index_copy(0, rows, seen.permute(3, 0, 2, 1))
@@ -161,32 +186,51 @@ class SplineMemoryGuide(SplineGuide):
             gate = memory["path_gate"][rows].t()
             gate = torch.where(plans & (gate[0] == NOWHERE), world[:, 0].mean(1), gate)
             memory["path_gate"] = memory["path_gate"].index_copy(0, rows, gate.t())
-        self._place_targets(memory, Frame(memory["path_pose"][rows].t()), rows, plans, cones[rows], count, total[0])
+        self._place_targets(
+            memory, Frame(memory["path_pose"][rows].t()), rows, plans, cones[rows], count, total[0]
+        )
 
     def _place_targets(
-        self, memory: dict[str, Tensor], frame: Frame, rows: Tensor, plans: Tensor, cones: Tensor, count: Tensor,
+        self,
+        memory: dict[str, Tensor],
+        frame: Frame,
+        rows: Tensor,
+        plans: Tensor,
+        cones: Tensor,
+        count: Tensor,
         left: Tensor,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Place targets on the path through the cones in view where `plans`; `left` is the number of left cones."""
         midpoints, total = self._midpoints(cones, count)
         points, total = frame.to_world(midpoints), total.to(torch.int64)
         if self.oddities:
             real = total > constant(range(points.shape[1]), points[0])
             shared = ((points.unsqueeze(1) - points.unsqueeze(2)).abs() < SAME_COORDINATE).any(0)
-            points, total = append(torch.zeros_like(points), torch.zeros_like(total), points, first_come(real, shared))
+            points, total = append(
+                torch.zeros_like(points), torch.zeros_like(total), points, first_come(real, shared)
+            )
         first, middle, last = self.fit(points, total).equidistant(3).unsqueeze(2).unbind(1)
-        spacing = constant(tuple(0.5 / max(k, 1) ** 0.4 for k in range(CONES + 1)), points[0, 0])[left]
+        spacing = constant(tuple(0.5 / max(k, 1) ** 0.4 for k in range(CONES + 1)), points[0, 0])[
+            left
+        ]
         u = constant(range(CANDIDATES), points[0]) * spacing
         # The parabola through three of its points, which goes on behind the last one.
         candidates = first + u * (last - first + (u - 1) * 2 * (first - 2 * middle + last))
-        targets, target_count = memory["path_targets"][rows].permute(1, 2, 0), memory["path_target_count"][rows].t()[0]
+        targets, target_count = (
+            memory["path_targets"][rows].permute(1, 2, 0),
+            memory["path_target_count"][rows].t()[0],
+        )
         free = ~_near(candidates, targets[:, : slots_in_use(target_count, TARGETS)], self.spacing)
         eligible = free & (u < 1.01) & (plans & (total > 1))
         apart = (candidates.unsqueeze(1) - candidates.unsqueeze(2)).square().sum(0)
         placed = first_come(eligible, apart < self.spacing**2)
         targets, target_count = append(targets, target_count, candidates, placed)
-        memory["path_targets"] = memory["path_targets"].index_copy(0, rows, targets.permute(2, 0, 1))
-        memory["path_target_count"] = memory["path_target_count"].index_copy(0, rows, target_count.unsqueeze(-1))
+        memory["path_targets"] = memory["path_targets"].index_copy(
+            0, rows, targets.permute(2, 0, 1)
+        )
+        memory["path_target_count"] = memory["path_target_count"].index_copy(
+            0, rows, target_count.unsqueeze(-1)
+        )
 
 
 def _near(points: Tensor, others: Tensor, distance: float) -> Tensor:

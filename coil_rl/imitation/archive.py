@@ -1,7 +1,8 @@
 """Fitted regressors of scikit-learn as bytes: read without running code, and checked before the first prediction.
 
-skops constructs trusted types only. That is not enough: the compiled code of scikit-learn follows the indices in trees
-and support vector machines without a check, so that forged ones read foreign memory or never end.
+skops constructs trusted types only. That is not enough: the compiled code of scikit-learn follows
+the indices in trees and support vector machines without a check, so that forged ones read foreign
+memory or never end.
 """
 
 import types
@@ -29,7 +30,12 @@ from sklearn.tree._tree import Tree
 from coil_rl.errors import UserError
 from coil_rl.train.trust import ESTIMATORS, PARTS
 
-CLASSES = {*(name.rpartition(".")[2] for name in ESTIMATORS), "FunctionTransformer", "LabelBinarizer", "_BinMapper"}
+CLASSES = {
+    *(name.rpartition(".")[2] for name in ESTIMATORS),
+    "FunctionTransformer",
+    "LabelBinarizer",
+    "_BinMapper",
+}
 FORESTS = (RandomForestRegressor, ExtraTreesRegressor, GradientBoostingRegressor)
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, partial)
 
@@ -53,7 +59,9 @@ def load(content: bytes) -> BaseEstimator:
         raise
     except Exception as error:
         reason = str(error) if type(error) is ValueError else type(error).__name__
-        raise UserError(f"the state is not a regressor of scikit-learn ({reason:.200}); train again") from error
+        raise UserError(
+            f"the state is not a regressor of scikit-learn ({reason:.200}); train again"
+        ) from error
     return model
 
 
@@ -61,18 +69,24 @@ def _types(content: bytes) -> list[str]:
     """Return the types that skops does not trust by default, all of which must be known here."""
     found: list[str] = skops.io.get_untrusted_types(data=content)
     if unknown := sorted(set(found) - PARTS):
-        raise UserError(f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor")
+        raise UserError(
+            f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor"
+        )
     return found
 
 
 def _check(model: BaseEstimator) -> None:
     for part in _parts(model):
         if isinstance(part, FUNCTIONS):
-            raise UserError(f"a regressor with the function {part!r:.100} could run code; use another regressor")
+            raise UserError(
+                f"a regressor with the function {part!r:.100} could run code; use another regressor"
+            )
         if isinstance(part, BaseEstimator):
             name = type(part).__name__
             if name not in CLASSES:
-                raise UserError(f"a regressor with a {name} cannot be checked; use another regressor")
+                raise UserError(
+                    f"a regressor with a {name} cannot be checked; use another regressor"
+                )
             _check_estimator(part, vars(part))
 
 
@@ -99,40 +113,67 @@ def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
     """Check what compiled code reads at a prediction; raises a `ValueError`. Parts that are not fitted pass."""
     inputs = state.get("n_features_in_")
     if isinstance(part, DecisionTreeRegressor) and "tree_" in state:
-        _require(isinstance(part.tree_, Tree) and part.tree_.n_features == inputs, "a tree has other features")
+        _require(
+            isinstance(part.tree_, Tree) and part.tree_.n_features == inputs,
+            "a tree has other features",
+        )
         tree, leaf = part.tree_, part.tree_.children_left == -1
         _check_nodes(tree.children_left, tree.children_right, leaf, tree.feature, tree.n_features)
         _check_numbers(tree.value, tree.threshold)
     elif isinstance(part, FORESTS) and "estimators_" in state:
         trees = np.ravel(part.estimators_)
         _require(len(trees) > 0, "a forest has no trees")
-        known = all(isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree) for tree in trees)
+        known = all(
+            isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree) for tree in trees
+        )
         alike = known and all(vars(tree).get("n_features_in_") == inputs for tree in trees)
         _require(alike, "the trees of a forest differ")
         boosted = isinstance(part, GradientBoostingRegressor)
-        _require(not boosted or np.shape(part.estimators_) == (len(trees), 1), "boosted trees have a wrong shape")
+        _require(
+            not boosted or np.shape(part.estimators_) == (len(trees), 1),
+            "boosted trees have a wrong shape",
+        )
     elif isinstance(part, HistGradientBoostingRegressor) and "_predictors" in state:
-        categorical = state.get("_preprocessor") is not None or np.any(part._bin_mapper.is_categorical_)
+        categorical = state.get("_preprocessor") is not None or np.any(
+            part._bin_mapper.is_categorical_
+        )
         _require(not categorical and not state.get("_in_fit"), "categories cannot be checked")
         for predictor in chain.from_iterable(part._predictors):
             _require(isinstance(predictor, TreePredictor), "boosted trees have a wrong type")
             nodes = predictor.nodes
             _require(not nodes["is_categorical"].any(), "categories cannot be checked")
-            _check_nodes(nodes["left"], nodes["right"], nodes["is_leaf"] != 0, nodes["feature_idx"], inputs)
+            _check_nodes(
+                nodes["left"], nodes["right"], nodes["is_leaf"] != 0, nodes["feature_idx"], inputs
+            )
             _check_numbers(nodes["value"], nodes["num_threshold"])
     elif isinstance(part, (SVR, NuSVR)) and "support_vectors_" in state:
         count = len(part.support_vectors_)
-        shapes = {"support_vectors_": (count, inputs), "support_": (count,), "_dual_coef_": (1, count),
-                  "_intercept_": (1,), "_n_support": (2,), "_probA": (0,), "_probB": (0,)}  # fmt: skip
+        shapes = {
+            "support_vectors_": (count, inputs),
+            "support_": (count,),
+            "_dual_coef_": (1, count),
+            "_intercept_": (1,),
+            "_n_support": (2,),
+            "_probA": (0,),
+            "_probB": (0,),
+        }
         fits = all(np.shape(state[name]) == shape for name, shape in shapes.items())
-        known = part.kernel in ("linear", "poly", "rbf", "sigmoid") and not part._sparse and "_impl" not in state
+        known = (
+            part.kernel in ("linear", "poly", "rbf", "sigmoid")
+            and not part._sparse
+            and "_impl" not in state
+        )
         _require(count > 0 and fits and known, "a support vector machine has wrong shapes")
         _check_numbers(part._dual_coef_, part.support_vectors_)
     elif isinstance(part, (KNeighborsRegressor, RadiusNeighborsRegressor)) and "_fit_X" in state:
-        part.fit(part._fit_X, part._y)  # finds the neighbours by a tree of its own, made from the points
+        part.fit(
+            part._fit_X, part._y
+        )  # finds the neighbours by a tree of its own, made from the points
 
 
-def _check_nodes(left: Any, right: Any, leaf: NDArray[np.bool_], feature: Any, features: Any) -> None:
+def _check_nodes(
+    left: Any, right: Any, leaf: NDArray[np.bool_], feature: Any, features: Any
+) -> None:
     """Check that nodes form one tree in which children come after their parents, as scikit-learn stores it."""
     inner = np.flatnonzero(~leaf)
     children = np.concatenate([left[inner], right[inner]]).astype(np.int64)
@@ -140,7 +181,9 @@ def _check_nodes(left: Any, right: Any, leaf: NDArray[np.bool_], feature: Any, f
     reached = np.array_equal(np.sort(children), np.arange(1, len(leaf)))
     _require(len(leaf) > 0 and ordered and reached, "the nodes of a tree do not form a tree")
     used = feature[inner]
-    _require(((used >= 0) & (used < features)).all(), "a tree splits by a feature that does not exist")
+    _require(
+        ((used >= 0) & (used < features)).all(), "a tree splits by a feature that does not exist"
+    )
 
 
 def _check_numbers(values: NDArray[np.floating], others: NDArray[np.floating]) -> None:

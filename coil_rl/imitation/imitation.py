@@ -1,8 +1,9 @@
 """Imitation of a guide: offline (OIL, paper algorithm 6) and by data-set aggregation (DAgger, algorithm 7).
 
-The guide's action in every state of a batch is added to a data set, and a regressor is fitted to the whole data set.
-One batch in which the guide acted gives behavioural cloning, offline imitation learning. Several batches in which the
-guide acts less and less give DAgger: later batches hold the states that the policy itself reaches.
+The guide's action in every state of a batch is added to a data set, and a regressor is fitted to
+the whole data set. One batch in which the guide acted gives behavioural cloning, offline imitation
+learning. Several batches in which the guide acts less and less give DAgger: later batches hold the
+states that the policy itself reaches.
 """
 
 import os
@@ -28,8 +29,8 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 class Imitation:
     """The imitation learner.
 
-    An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`. A data set that is
-    missing, damaged or of another env is a `UserError`.
+    An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`.
+    A data set that is missing, damaged or of another env is a `UserError`.
 
     Args:
         env: the env, for its specs.
@@ -37,14 +38,15 @@ class Imitation:
         regressor: specification of the regressor.
         advice_key: entry with the advice in a state, [*batch, n_guides, A].
         guide: index of the guide in the advice.
-        group_key: entry with the track of a sample, for the validation on unseen tracks. None, or an entry that the env
-            does not have, skips that validation.
+        group_key: entry with the track of a sample, for the validation on unseen tracks. None, or
+            an entry that the env does not have, skips that validation.
         validate: whether to validate in each update, which takes several more fits.
         dataset: file of a data set to start from, `dataset.pt` of another run.
         seed: of the random split of the validation.
 
     Attributes:
-        policy: writes the prediction of the regressor, clamped to the bounds of the action; 0 before the first update.
+        policy: writes the prediction of the regressor, clamped to the bounds of the action; 0
+            before the first update.
         keys: entries that a batch must have.
         dataset: [N] with the observed entries, `action` (of the guide) and the track.
 
@@ -81,10 +83,14 @@ class Imitation:
         available = list(spec.keys(True, True))
         if advice_key not in available:
             names = ", ".join(key for key in available if isinstance(key, str))
-            raise KeyError(f"the env has no entry {advice_key}; it has {names}; put GuideActions around it")
+            raise KeyError(
+                f"the env has no entry {advice_key}; it has {names}; put GuideActions around it"
+            )
         guides, size = spec[advice_key].shape[batch_dims:]
         if not 0 <= guide < guides:
-            raise ValueError(f"guide={guide} must be at least 0 and less than {guides}, the number of guides")
+            raise ValueError(
+                f"guide={guide} must be at least 0 and less than {guides}, the number of guides"
+            )
         check_range(0, 2**32 - 1, seed=seed)
         self.concat = ConcatObservations(env, in_keys)
         self.regressor = regressor.fresh(self.concat.width, size).to(env.device)
@@ -93,23 +99,35 @@ class Imitation:
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
         group: NestedKey | None = nested_key(group_key)
         self.group_key = group if group in available else None
-        self.keys: list[NestedKey] = [*in_keys, advice_key, *([] if self.group_key is None else [self.group_key])]
+        self.keys: list[NestedKey] = [
+            *in_keys,
+            advice_key,
+            *([] if self.group_key is None else [self.group_key]),
+        ]
         self.validate, self.seed, self.device = validate, seed, env.device
-        self.dataset: TensorDictBase | None = None if dataset is None else self._load(Path(dataset), env)
+        self.dataset: TensorDictBase | None = (
+            None if dataset is None else self._load(Path(dataset), env)
+        )
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
 
         Returns:
-            The number of `samples`; `target_variance`, the mean squared error of predicting the mean; `mse_ahead` and
-            `r2_ahead`, on this batch before the fit; `mse_training` and `r2_training`, on the data set after the fit;
-            with `validate`, the metrics (and errors) of `cross_validate`.
+            The number of `samples`; `target_variance`, the mean squared error of predicting the
+            mean; `mse_ahead` and `r2_ahead`, on this batch before the fit; `mse_training` and
+            `r2_training`, on the data set after the fit; with `validate`, the metrics (and errors)
+            of `cross_validate`.
         """
         pairs = self._pairs(batch)
-        dataset: TensorDictBase = pairs if self.dataset is None else torch.cat([self.dataset, pairs])
+        dataset: TensorDictBase = (
+            pairs if self.dataset is None else torch.cat([self.dataset, pairs])
+        )
         self.dataset = dataset
         x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]
-        metrics = {"samples": float(len(y)), "target_variance": float(y.var(0, correction=0).mean())}
+        metrics = {
+            "samples": float(len(y)),
+            "target_variance": float(y.var(0, correction=0).mean()),
+        }
         with torch.no_grad():
             predicted = self.regressor(self.concat(*(pairs[key] for key in self.in_keys)))
             metrics |= scores([predicted], [pairs["action"]], "ahead")
@@ -127,7 +145,9 @@ class Imitation:
 
     def _pairs(self, batch: TensorDictBase) -> TensorDictBase:
         rows = batch.select(*self.keys).reshape(-1)
-        pairs = rows.select(*(key for key in self.keys if key != self.advice_key or key in self.in_keys))
+        pairs = rows.select(
+            *(key for key in self.keys if key != self.advice_key or key in self.in_keys)
+        )
         return pairs.set("action", rows[self.advice_key][:, self.guide])
 
     def _load(self, file: Path, env: EnvBase) -> TensorDictBase:
@@ -141,7 +161,9 @@ class Imitation:
             shape = dataset[key].shape[1:] if key in dataset.keys(True, True) else None
             if shape != expected[key].shape[1:]:
                 fault = f"{key} is {'missing' if shape is None else list(shape)}"
-                remedy = f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
+                remedy = (
+                    f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
+                )
                 raise UserError(f"{file} is a data set of another env: {fault}, {remedy}")
         return dataset.select(*keys).to(env.device)
 
@@ -153,7 +175,9 @@ class Imitation:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
-        self.dataset = None if state["dataset"] is None else _from_dict(state["dataset"]).to(self.device)
+        self.dataset = (
+            None if state["dataset"] is None else _from_dict(state["dataset"]).to(self.device)
+        )
 
 
 def _from_dict(entries: dict[str, Any]) -> TensorDictBase:
@@ -163,7 +187,9 @@ def _from_dict(entries: dict[str, Any]) -> TensorDictBase:
 class _Action(nn.Module):
     """Prediction of a regressor for the observed entries, as an action of the env."""
 
-    def __init__(self, concat: ConcatObservations, regressor: Regressor, space: ActionSpace) -> None:
+    def __init__(
+        self, concat: ConcatObservations, regressor: Regressor, space: ActionSpace
+    ) -> None:
         super().__init__()
         self.concat, self.regressor, self.space = concat, regressor, space
 

@@ -81,13 +81,20 @@ class NetworkRegressor(Regressor):
     def fresh(self, inputs: int, outputs: int) -> NetworkRegressor:
         """Return an unfitted regressor, which predicts 0."""
         fresh = NetworkRegressor(
-            self.hidden, epochs=self.epochs, minibatch=self.minibatch, learning_rate=self.learning_rate, seed=self.seed
+            self.hidden,
+            epochs=self.epochs,
+            minibatch=self.minibatch,
+            learning_rate=self.learning_rate,
+            seed=self.seed,
         )
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             fresh.layers = Mlp(self.hidden).layers(inputs, outputs, gain=1.0)
         fresh.x_mean, fresh.x_scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
-        fresh.y_mean, fresh.y_scale = nn.Buffer(torch.zeros(outputs)), nn.Buffer(torch.zeros(outputs))
+        fresh.y_mean, fresh.y_scale = (
+            nn.Buffer(torch.zeros(outputs)),
+            nn.Buffer(torch.zeros(outputs)),
+        )
         return fresh
 
     @torch.enable_grad()
@@ -118,8 +125,8 @@ class NetworkRegressor(Regressor):
 class SklearnRegressor(Regressor):
     """A regressor of scikit-learn, which may be a pipeline or a search.
 
-    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to 0. Any other
-    `estimator`, of which only the parameters are used, is a `ValueError`.
+    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to
+    0. Any other `estimator`, of which only the parameters are used, is a `ValueError`.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression
@@ -133,8 +140,12 @@ class SklearnRegressor(Regressor):
     def __init__(self, estimator: BaseEstimator) -> None:
         super().__init__()
         if not isinstance(estimator, BaseEstimator) or not is_regressor(estimator):
-            raise ValueError(f"estimator={estimator!r} is not a regressor of scikit-learn, such as LinearRegression()")
-        self.estimator = _with_parameter(clone(estimator), "random_state", lambda value: 0 if value is None else value)
+            raise ValueError(
+                f"estimator={estimator!r} is not a regressor of scikit-learn, such as LinearRegression()"
+            )
+        self.estimator = _with_parameter(
+            clone(estimator), "random_state", lambda value: 0 if value is None else value
+        )
         self.inputs, self.outputs = 0, 1
         self.model: BaseEstimator | None = None
         self._archive: Tensor | None = torch.empty(0, dtype=torch.uint8)
@@ -161,7 +172,9 @@ class SklearnRegressor(Regressor):
         if self.model is None:
             return x.new_zeros(*x.shape[:-1], self.outputs)
         y = _predict(self.model, x.detach().reshape(-1, x.shape[-1]).cpu().numpy())
-        return torch.from_numpy(np.asarray(y, np.float32)).to(x).reshape(*x.shape[:-1], self.outputs)
+        return (
+            torch.from_numpy(np.asarray(y, np.float32)).to(x).reshape(*x.shape[:-1], self.outputs)
+        )
 
     def get_extra_state(self) -> Tensor:
         """Return the fitted regressor as bytes, [n] uint8; empty before the first fit."""
@@ -175,15 +188,21 @@ class SklearnRegressor(Regressor):
         model = archive.load(content.numpy().tobytes()) if len(content) else None
         inputs = getattr(model, "n_features_in_", self.inputs)
         if inputs != self.inputs:
-            raise UserError(f"the state holds a regressor of {inputs} inputs, but there are {self.inputs} here")
+            raise UserError(
+                f"the state holds a regressor of {inputs} inputs, but there are {self.inputs} here"
+            )
         if model is not None:
             try:
                 prediction = _predict(model, np.zeros((1, self.inputs), np.float32))
                 usable = np.size(prediction) == self.outputs and np.isfinite(prediction).all()
             except Exception as error:
-                raise UserError(f"the state holds a regressor that cannot predict ({type(error).__name__})") from error
+                raise UserError(
+                    f"the state holds a regressor that cannot predict ({type(error).__name__})"
+                ) from error
             if not usable:
-                raise UserError(f"the state is a regressor that does not predict {self.outputs} numbers; train again")
+                raise UserError(
+                    f"the state is a regressor that does not predict {self.outputs} numbers; train again"
+                )
         self.model, self._archive = model, content
 
 
@@ -191,11 +210,17 @@ def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floatin
     """Predict y for x [N, inputs]; for forests without scikit-learn's checks, which dominate for small batches."""
     forest = type(model) in (RandomForestRegressor, ExtraTreesRegressor)
     if forest and x.shape[1] == model.n_features_in_ and np.isfinite(x).all():
-        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in model.estimators_) / len(model.estimators_)
+        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in model.estimators_) / len(
+            model.estimators_
+        )
     return model.predict(x)
 
 
-def _with_parameter(estimator: BaseEstimator, name: str, change: Callable[[object], object]) -> BaseEstimator:
+def _with_parameter(
+    estimator: BaseEstimator, name: str, change: Callable[[object], object]
+) -> BaseEstimator:
     """Change a parameter of an estimator and of the estimators inside it."""
-    values = {key: value for key, value in estimator.get_params().items() if key.split("__")[-1] == name}
+    values = {
+        key: value for key, value in estimator.get_params().items() if key.split("__")[-1] == name
+    }
     return estimator.set_params(**{key: change(value) for key, value in values.items()})

@@ -25,11 +25,12 @@ def cross_validate(
 ) -> dict[str, float]:
     """Return the errors of fresh regressors on a random fifth of the samples and on left-out tracks.
 
-    They are `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`: see `scores`.
+    They are `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`:
+    see `scores`.
 
-    The paper tests on random samples. Consecutive states are nearly equal, so most of these have a near copy among the
-    training samples. The error on left-out tracks is an estimate of the error on a new track. Too few samples, or only
-    one track, are a `UserError`.
+    The paper tests on random samples. Consecutive states are nearly equal, so most of these have a
+    near copy among the training samples. The error on left-out tracks is an estimate of the error
+    on a new track. Too few samples, or only one track, are a `UserError`.
 
     Args:
         regressor: its `fresh` copies are fitted.
@@ -42,11 +43,15 @@ def cross_validate(
         remedy = f"use at least {MIN_SAMPLES}, or learner.validate=false"
         raise UserError(f"{len(x)} samples are too few to validate; {remedy}")
     rows = np.arange(len(x))
-    splits: dict[str, list[Split]] = {"random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]}
+    splits: dict[str, list[Split]] = {
+        "random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]
+    }
     if groups is not None:
         splits["by_track"] = group_splits(groups)
     metrics: dict[str, float] = {}
-    with tqdm(total=sum(map(len, splits.values())), unit="fit", desc="validate", leave=False) as bar:
+    with tqdm(
+        total=sum(map(len, splits.values())), unit="fit", desc="validate", leave=False
+    ) as bar:
         for name, folds in splits.items():
             predictions, targets = [], []
             for fold in folds:
@@ -69,15 +74,20 @@ def group_splits(groups: Tensor) -> list[Split]:
     labels = groups.cpu().numpy()
     count = len(np.unique(labels))
     if count < 2:
-        raise UserError("all samples are from one track, so no track can be left out; set learner.group_key=null")
+        raise UserError(
+            "all samples are from one track, so no track can be left out; set learner.group_key=null"
+        )
     return list(GroupKFold(min(count, MAX_FOLDS)).split(labels, groups=labels))
 
 
 def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) -> dict[str, float]:
     """Return `mse_NAME` and `r2_NAME` of the split NAME: mean squared error and R^2, means over the A outputs.
 
-    Predictions and targets are [N, A] for each fold. Where targets are constant, R^2 is 1 for correct predictions and
-    else 0.
+    Predictions and targets are [N, A] for each fold. Where targets are constant, R^2 is 1 for
+    correct predictions and else 0.
     """
     numbers = (torch.cat(list(targets)).cpu().numpy(), torch.cat(list(predictions)).cpu().numpy())
-    return {f"mse_{name}": float(mean_squared_error(*numbers)), f"r2_{name}": float(r2_score(*numbers))}
+    return {
+        f"mse_{name}": float(mean_squared_error(*numbers)),
+        f"r2_{name}": float(r2_score(*numbers)),
+    }

@@ -1,7 +1,7 @@
 """Advantage actor-critic (paper equation 76; Mnih et al. 2016), in its synchronous form.
 
-The probability of an action changes with its advantage over the critic's value of the state. Each batch is used for
-one pass only, because the gradient holds for the policy that collected the batch:
+The probability of an action changes with its advantage over the critic's value of the state. Each
+batch is used for one pass only, because the gradient holds for the policy that collected the batch:
 
     loss = -mean(log pi(a | s) A(s, a))
 """
@@ -22,8 +22,8 @@ class A2C(PPO):
 
     Args:
         env, in_keys, learning_rate, options: as for `PPO`.
-        standardise: whether to standardise the advantages of a minibatch. The coefficients of other losses then do not
-            depend on the scale of the reward.
+        standardise: whether to standardise the advantages of a minibatch. The coefficients of other
+            losses then do not depend on the scale of the reward.
     """
 
     def __init__(

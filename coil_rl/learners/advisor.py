@@ -1,11 +1,13 @@
 """ADVISOR (Weihs et al. 2021): PPO where imitation of the guide cannot work, imitation where it can.
 
-An auxiliary policy pi_aux with the agent's observation learns by imitation only. Where it cannot predict the guide's
-action g, the guide knows something that the agent does not see, and the agent learns from reward. For each step
+An auxiliary policy pi_aux with the agent's observation learns by imitation only. Where it cannot
+predict the guide's action g, the guide knows something that the agent does not see, and the agent
+learns from reward. For each step
 
     loss = w * (-log pi(g | s)) + (1 - w) * loss of PPO,  w = exp(-alpha D),
 
-with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest distance of g from the mode of pi_aux.
+with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest distance of g from the
+mode of pi_aux.
 """
 
 from collections.abc import Sequence
@@ -39,9 +41,14 @@ class Advisor(PPO):
     parts = (*PPO.parts, "imitator")
 
     def __init__(
-        self, env: EnvBase, in_keys: Sequence[NestedKey] = ("observation",), *,
-        alpha: float = 8.0, guide: int = 0, **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        *,
+        alpha: float = 8.0,
+        guide: int = 0,
+        **options: Any,
+    ) -> None:
         check_range(0, alpha=alpha)
         self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
         super().__init__(env, in_keys, **options)
@@ -64,7 +71,10 @@ class Advisor(PPO):
         losses = super().losses(minibatch)
         predicted = self.imitation.each(self.imitator, minibatch)
         weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()
-        log_ratio = self.head.get_dist(minibatch).log_prob(minibatch["action"]) - minibatch["action_log_prob"]
+        log_ratio = (
+            self.head.get_dist(minibatch).log_prob(minibatch["action"])
+            - minibatch["action_log_prob"]
+        )
         advantage = standardise(minibatch["advantage"]).squeeze(-1)
         clipped = log_ratio.clamp(*self.loss._clip_bounds)
         gain = torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage)

@@ -1,19 +1,21 @@
 """Anchored COIL: a policy that starts as its guide, and lets go of it with a brake.
 
-COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored policy adds the
-advice g to what its network f gives, before squashing:
+COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored
+policy adds the advice g to what its network f gives, before squashing:
 
     mean = w atanh(clip(g, -0.97, 0.97)) + f(s, g)
 
-The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete actions w kappa is added
-to the logit of the advised action. Residual policies start the same way (Silver et al. 2018; Johannink et al. 2019),
-but here f is unbounded, and w falls: a policy that keeps w = 1 never loses the guide's habits. A guide that is always
-wrong is of use too: with w = -1 the first policy does the opposite, and |w| falls.
+The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete
+actions w kappa is added to the logit of the advised action. Residual policies start the same way
+(Silver et al. 2018; Johannink et al. 2019), but here f is unbounded, and w falls: a policy that
+keeps w = 1 never loses the guide's habits. A guide that is always wrong is of use too: with w = -1
+the first policy does the opposite, and |w| falls.
 
-Falling too far breaks the policy, and any update may, so there is a brake. At a few looks over the run the policy acts
-deterministically in fixed cases of the training, with today's weight and with one that is lower by a margin. If today's
-has become worse, the policy goes back to that of the best look. Else the weight falls, if the lower one fails in no
-further case: by a step, which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
+Falling too far breaks the policy, and any update may, so there is a brake. At a few looks over the
+run the policy acts deterministically in fixed cases of the training, with today's weight and with
+one that is lower by a margin. If today's has become worse, the policy goes back to that of the best
+look. Else the weight falls, if the lower one fails in no further case: by a step, which is shorter
+than the margin, if it loses next to nothing; by the margin if it gains much.
 """
 
 import math
@@ -37,12 +39,16 @@ FIRST = 0.9  # probability of the advised one of several actions at weight 1
 class AnchoredHead(nn.Module):
     """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
 
-    `head` gives the mean and the standard deviation, or the logits. `pull` turns advice [*batch, n_guides, A] into
-    means or logits [*batch, n_guides, *event].
+    `head` gives the mean and the standard deviation, or the logits. `pull` turns advice [*batch,
+    n_guides, A] into means or logits [*batch, n_guides, *event].
     """
 
     def __init__(
-        self, head: nn.Module, pull: Callable[[Tensor], Tensor], guides: int, device: torch.device | None = None
+        self,
+        head: nn.Module,
+        pull: Callable[[Tensor], Tensor],
+        guides: int,
+        device: torch.device | None = None,
     ) -> None:
         super().__init__()
         self.head, self.pull = head, pull
@@ -60,8 +66,8 @@ class AnchoredHead(nn.Module):
 class AnchoredValues(AnchoredHead):
     """Values of actions with a bonus for the advised one: the weight times the range of the values of the state.
 
-    So the advised action is taken unless its value is worse than the best one by more than this. With weight 1 it is
-    taken always.
+    So the advised action is taken unless its value is worse than the best one by more than this.
+    With weight 1 it is taken always.
     """
 
     def __init__(self, guides: int, device: torch.device | None = None) -> None:
@@ -92,7 +98,9 @@ def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
     places = valid.flatten().nonzero().squeeze(-1)
 
     def pull(advice: Tensor) -> Tensor:
-        padded = torch.zeros(*advice.shape[:-1], valid.numel(), dtype=gain.dtype, device=advice.device)
+        padded = torch.zeros(
+            *advice.shape[:-1], valid.numel(), dtype=gain.dtype, device=advice.device
+        )
         return padded.index_copy(-1, places, advice.to(gain.dtype)) * gain
 
     return pull
@@ -114,28 +122,43 @@ class Look:
 class Anchor(Stateful):
     """Start of a policy at the action of a guide, and the brake by which it lets go of it.
 
-    Before training the guides, their opposites (weight -1), the first policy without a guide and random actions are
-    compared in the same cases. The anchor holds if the best guide or opposite is better than the last two by more than
-    a standard error of the difference; otherwise the weight is 0, and training is COIL. A value out of range is a
-    `ValueError`.
+    Before training the guides, their opposites (weight -1), the first policy without a guide and
+    random actions are compared in the same cases. The anchor holds if the best guide or opposite is
+    better than the last two by more than a standard error of the difference; otherwise the weight
+    is 0, and training is COIL. A value out of range is a `ValueError`.
 
     Attributes:
         head: of the policy, see `AnchoredHead`.
-        unit: of rewards in updates of PPO and the like: the largest mean return, without its sign, before training;
-            1 without an anchor. A critic starts near 0, and would follow returns of hundreds for most of the run.
+        unit: of rewards in updates of PPO and the like: the largest mean return, without its sign,
+            before training; 1 without an anchor. A critic starts near 0, and would follow returns
+            of hundreds for most of the run.
     """
 
-    parts: ClassVar[tuple[str, ...]] = ("holds", "guide", "sign", "unit", "guide_failures", "allowed", "best", "kept")
+    parts: ClassVar[tuple[str, ...]] = (
+        "holds",
+        "guide",
+        "sign",
+        "unit",
+        "guide_failures",
+        "allowed",
+        "best",
+        "kept",
+    )
 
     looks: int = 32  # number of looks over the run, besides the one before training
-    cases: int | None = None  # C, number of cases of a look; None: 96 where failures, often rare, are counted, else 24
+    cases: int | None = (
+        # C, number of cases of a look; None: 96 where failures, often rare, are counted, else 24
+        None
+    )
     step: float = 0.05  # by which the weight falls at a look
     margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
-    # Share of the guide's return that may be lost for a step; at least half a standard error of that return may be.
-    # Three times as much below the best look, and two standard errors of the difference, the policy goes back to that.
+    # Share of the guide's return that may be lost for a step; at least half a standard error of
+    # that return may be. Three times as much below the best look, and two standard errors of the
+    # difference, the policy goes back to that.
     tolerance: float = 0.01
     warmup: float = 0.05  # share of the run, from its start, in which only the critic learns
-    # Standard deviation of a policy that has one of its own, as that of PPO; with DQN probability of a random action.
+    # Standard deviation of a policy that has one of its own, as that of PPO; with DQN probability
+    # of a random action.
     noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5)
     advice_key: NestedKey = "guide_action"  # entry with the advice, [*batch, n_guides, A]
 
@@ -178,20 +201,27 @@ class Anchor(Stateful):
     def set_noise(self, progress: float) -> dict[str, float]:
         """Set the standard deviation of an anchored policy that has one of its own.
 
-        The metrics are `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard deviation.
+        The metrics are `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the
+        standard deviation.
         """
         scale: Tensor | None = getattr(self.head.head, "log_scale", None)
         if scale is not None and self.holds:
             scale.fill_(math.log(self.noise_at(progress)))
-        return {"anchor": self.sign * self.weight} | ({} if scale is None else {"noise": float(scale.exp().mean())})
+        return {"anchor": self.sign * self.weight} | (
+            {} if scale is None else {"noise": float(scale.exp().mean())}
+        )
 
     def due(self, update: int, updates: int) -> bool:
         """Return whether the brake is to test the policy after an update; `updates` is the number of all updates."""
-        return self.holds and update in {round(updates * look / self.looks) for look in range(1, self.looks + 1)} - {0}
+        return self.holds and update in {
+            round(updates * look / self.looks) for look in range(1, self.looks + 1)
+        } - {0}
 
     def tried(self) -> list[Tensor]:
         """Return the two weights to test, [n_guides] each: the present one, and one that is lower by the margin."""
-        return [self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))]
+        return [
+            self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))
+        ]
 
     def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
         """Choose the best guide, or the opposite of one, as the anchor of the policy, or none.
@@ -210,12 +240,15 @@ class Anchor(Stateful):
         if self.holds:
             self._keep(policy, look.returns[best])
             self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
-        self.allowed = max(self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2)
+        self.allowed = max(
+            self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2
+        )
 
     def decide(self, look: Look, policy: nn.Module) -> bool:
         """Lower the weight of the guide or keep it, after drives with the two weights of `tried`.
 
-        If the policy has become worse, it goes back to that of the best look instead; return whether it did.
+        If the policy has become worse, it goes back to that of the best look instead; return
+        whether it did.
         """
         now, lower, best = look.score(0), look.score(1), float(self.best.mean())
         chance = 2 * float(standard_error(self.best - look.returns[0]))
@@ -231,7 +264,10 @@ class Anchor(Stateful):
         return False
 
     def _keep(self, policy: nn.Module, returns: Tensor) -> None:
-        self.best, self.kept = returns, {name: value.clone() for name, value in policy.state_dict().items()}
+        self.best, self.kept = (
+            returns,
+            {name: value.clone() for name, value in policy.state_dict().items()},
+        )
 
 
 def standard_error(values: Tensor) -> Tensor:

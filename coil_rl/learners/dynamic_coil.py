@@ -1,8 +1,9 @@
 """Dynamic COIL (paper section 3.3): an agent that observes advice, and guides that learn through the agent.
 
-Guides and agent form one differentiable network: the agent observes the actions of the guides. In an agent phase the
-guides are frozen, which is COIL. In a guide phase the agent is frozen and one guide learns through it, with the same
-PPO loss and a smaller learning rate. The learning rate shrinks from each phase to the next of its kind.
+Guides and agent form one differentiable network: the agent observes the actions of the guides. In
+an agent phase the guides are frozen, which is COIL. In a guide phase the agent is frozen and one
+guide learns through it, with the same PPO loss and a smaller learning rate. The learning rate
+shrinks from each phase to the next of its kind.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -63,7 +64,9 @@ class AtConvergence:
     frames: int | None = None  # maximum length of the phase; None: unlimited
 
     def __post_init__(self) -> None:
-        check_range(1, evaluations=self.evaluations, frames=1 if self.frames is None else self.frames)
+        check_range(
+            1, evaluations=self.evaluations, frames=1 if self.frames is None else self.frames
+        )
         check_range(0, improvement=self.improvement)
 
     def __call__(self, frames: int, rewards: Sequence[float]) -> bool:
@@ -82,10 +85,11 @@ class PhaseSchedule:
 
     guides: int  # n, number of guides
     _: KW_ONLY
-    # "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the agent only; "guide":
-    # one guide after the other, never the agent.
+    # "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the
+    # agent only; "guide": one guide after the other, never the agent.
     order: Literal["alternate", "joint", "agent", "guide"] = "alternate"
-    # Of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at random.
+    # Of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at
+    # random.
     choice: Literal["sequential", "stochastic"] = "sequential"
     agent_phase: StopRule = AfterFrames(131_072)  # of phases in which the agent learns
     guide_phase: StopRule = AfterFrames(65_536)  # of the other phases
@@ -114,13 +118,17 @@ class PhaseSchedule:
 
     def _next(self) -> Phase:
         if self.order in ("agent", "joint"):
-            return Phase(True, tuple(range(self.guides)) if self.order == "joint" else (), self.number)
+            return Phase(
+                True, tuple(range(self.guides)) if self.order == "joint" else (), self.number
+            )
         earlier = self.number if self.order == "guide" else self.number // 2
         if self.order == "alternate" and self.number % 2 == 0:
             return Phase(True, (), earlier)
         if self.choice == "sequential":
             return Phase(False, (earlier % self.guides,), earlier)
-        return Phase(False, (int(torch.randint(self.guides, (), generator=self.generator)),), earlier)
+        return Phase(
+            False, (int(torch.randint(self.guides, (), generator=self.generator)),), earlier
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule."""
@@ -129,7 +137,11 @@ class PhaseSchedule:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-        self.number, self.frames, self.rewards = state["number"], state["frames"], list(state["rewards"])
+        self.number, self.frames, self.rewards = (
+            state["number"],
+            state["frames"],
+            list(state["rewards"]),
+        )
         self.phase = Phase(*state["phase"])
         self.generator.set_state(state["generator"])
 
@@ -137,7 +149,8 @@ class PhaseSchedule:
 class DynamicCoil(PPO):
     """The learner of Dynamic COIL: PPO with guides in front of the agent, and a phase schedule.
 
-    A value out of range, a guide without parameters, or guides that share parameters are a `ValueError`.
+    A value out of range, a guide without parameters, or guides that share parameters are a
+    `ValueError`.
 
     Args:
         env, ppo: as for `PPO`; actions must be continuous.
@@ -168,15 +181,22 @@ class DynamicCoil(PPO):
         check_range(0, 1, above=True, shrink=shrink)
         check_choice(("both", "agent", "guide"), critic_phases=critic_phases)
         if not env.action_spec.dtype.is_floating_point:
-            raise ValueError("Dynamic COIL needs continuous actions, but this env has discrete ones")
+            raise ValueError(
+                "Dynamic COIL needs continuous actions, but this env has discrete ones"
+            )
         self.guide_learning_rate = schedule(guide_learning_rate)
         check_range(0, guide_learning_rate=self.guide_learning_rate(0))
         self.advice = Guides(guides, trainable=True)
         parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
         if len({id(parameter) for parameter in parameters}) < len(parameters):
-            raise ValueError("two guides share parameters, so one of them cannot be frozen while the other learns")
+            raise ValueError(
+                "two guides share parameters, so one of them cannot be frozen while the other learns"
+            )
         self.guides: dict[str, TensorDictModuleBase] = dict(guides)
-        self.initial = [{name: p.detach().clone() for name, p in guide.named_parameters()} for guide in guides.values()]
+        self.initial = [
+            {name: p.detach().clone() for name, p in guide.named_parameters()}
+            for guide in guides.values()
+        ]
         self.phases = phases(len(guides))
         self.shrink, self.critic_phases = shrink, critic_phases
         super().__init__(env, in_keys, **ppo)
@@ -187,7 +207,9 @@ class DynamicCoil(PPO):
         """Return the guides followed by the agent, and the critic."""
         shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
         agent_keys = [*in_keys, *self.advice.out_keys]
-        agent = networks.actor(env, agent_keys, network, shapes=shapes, normaliser=self.normaliser, **options)
+        agent = networks.actor(
+            env, agent_keys, network, shapes=shapes, normaliser=self.normaliser, **options
+        )
         self.agent_parameters = list(agent.parameters())
         policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
         return policy, networks.critic(env, in_keys, network, self.normaliser)
@@ -217,9 +239,10 @@ class DynamicCoil(PPO):
         """Learn from a batch of rollouts; arguments as for `PPO.update`.
 
         Returns:
-            The metrics of `PPO`; the number of the `phase`; the index of the `guide` that learns, -1 if none does and n
-            if all do; `guides_changed`, whether a phase has ended in which a guide learned; `guide_learning_rate`; and
-            for each guide `moved_NAME`, the mean absolute difference of its action to that of the initial guide.
+            The metrics of `PPO`; the number of the `phase`; the index of the `guide` that learns,
+            -1 if none does and n if all do; `guides_changed`, whether a phase has ended in which a
+            guide learned; `guide_learning_rate`; and for each guide `moved_NAME`, the mean absolute
+            difference of its action to that of the initial guide.
         """
         number, phase, rates = self.phases.number, self.phases.phase, self.learning_rates(progress)
         metrics = super().update(batch, progress)

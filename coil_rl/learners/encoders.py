@@ -14,12 +14,19 @@ from torchrl.modules import MLP, ConvNet
 
 from coil_rl.envs.limits import check_choice, check_range
 
-ACTIVATIONS: Mapping[str, type[nn.Module]] = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
+ACTIVATIONS: Mapping[str, type[nn.Module]] = {
+    "tanh": nn.Tanh,
+    "relu": nn.ReLU,
+    "elu": nn.ELU,
+    "silu": nn.SiLU,
+}
 Shapes = Mapping[NestedKey, torch.Size]
 STATE = "policy_state"  # what an env carries for a network with a memory
 
 
-def entry_specs(env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None) -> list[TensorSpec]:
+def entry_specs(
+    env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None
+) -> list[TensorSpec]:
     """Return the specs of entries of an env; those in `shapes`, which the env does not write, are numbers.
 
     An entry that it does not have is a `KeyError`.
@@ -28,11 +35,16 @@ def entry_specs(env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | Non
     available = [*spec.keys(True, True), *extra]
     missing = [key for key in in_keys if key not in available]
     if missing:
-        names = [", ".join(key if isinstance(key, str) else "/".join(key) for key in keys)
-                 for keys in (missing, available)]  # fmt: skip
+        names = [
+            ", ".join(key if isinstance(key, str) else "/".join(key) for key in keys)
+            for keys in (missing, available)
+        ]
         raise KeyError(f"the env has no entry {names[0]} to observe; it has {names[1]}")
     shape = env.batch_size
-    return [Unbounded((*shape, *extra[key]), device=env.device) if key in extra else spec[key] for key in in_keys]
+    return [
+        Unbounded((*shape, *extra[key]), device=env.device) if key in extra else spec[key]
+        for key in in_keys
+    ]
 
 
 class ReadEntry(nn.Module):
@@ -47,8 +59,14 @@ class ReadEntry(nn.Module):
         self.dtype = torch.get_default_dtype()
         self.choices: list[int] = []
         if isinstance(spec, MultiCategorical):
-            self.choices = spec.nvec.reshape(-1, self.shape[-1])[0].tolist() * self.shape[:-1].numel()
-        elif isinstance(spec, Categorical) and not isinstance(spec, Binary) and spec.dtype != torch.bool:
+            self.choices = (
+                spec.nvec.reshape(-1, self.shape[-1])[0].tolist() * self.shape[:-1].numel()
+            )
+        elif (
+            isinstance(spec, Categorical)
+            and not isinstance(spec, Binary)
+            and spec.dtype != torch.bool
+        ):
             self.choices = [spec.n] * self.shape.numel()
         self.width = sum(self.choices) or self.shape.numel()
 
@@ -72,10 +90,13 @@ class ReadImage(ReadEntry):
         super().__init__(spec, batch_dims)
         self.channels_last = self.shape[2] < min(self.shape[:2])
         self.layers = ConvNet(
-            self.shape[2 if self.channels_last else 0], num_cells=list(network.channels),
-            kernel_sizes=list(network.kernels), strides=list(network.strides),
-            activation_class=ACTIVATIONS[network.activation], device=spec.device,
-        )  # fmt: skip
+            self.shape[2 if self.channels_last else 0],
+            num_cells=list(network.channels),
+            kernel_sizes=list(network.kernels),
+            strides=list(network.strides),
+            activation_class=ACTIVATIONS[network.activation],
+            device=spec.device,
+        )
         self.width = self(torch.zeros(self.shape, device=spec.device)).numel()
 
     def forward(self, entry: Tensor) -> Tensor:
@@ -92,11 +113,16 @@ class ConcatObservations(nn.Module):
     Args:
         env, in_keys: as for `entry_specs`.
         shapes: shapes of entries that the env does not write, without the batch dimensions.
-        network: a `Cnn` reads entries of three dimensions; otherwise they are flattened like others.
+        network: a `Cnn` reads entries of three dimensions; otherwise they are flattened like
+            others.
     """
 
     def __init__(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None, network: "Mlp | None" = None
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        shapes: Shapes | None = None,
+        network: "Mlp | None" = None,
     ) -> None:
         super().__init__()
         images = network if isinstance(network, Cnn) else None
@@ -108,14 +134,18 @@ class ConcatObservations(nn.Module):
                     entry = ReadImage(spec, dims, images)
                 except RuntimeError as error:
                     layers = f"kernels={list(images.kernels)} with strides={list(images.strides)}"
-                    problem = f"the image {key} of shape {list(entry.shape)} is too small for {layers}"
+                    problem = (
+                        f"the image {key} of shape {list(entry.shape)} is too small for {layers}"
+                    )
                     raise ValueError(f"{problem}; take smaller or fewer ones") from error
             entries.append(entry)
         self.entries = nn.ModuleList(entries)
         self.width = sum(entry.width for entry in entries)
         if images and not any(isinstance(entry, ReadImage) for entry in entries):
             needed = f"an image among {', '.join(map(str, in_keys))}, an entry of three dimensions"
-            raise ValueError(f"a convolutional network needs {needed}, but there is none; use network=mlp")
+            raise ValueError(
+                f"a convolutional network needs {needed}, but there is none; use network=mlp"
+            )
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Concatenate inputs [*batch, ...] to [*batch, width]."""
@@ -132,7 +162,9 @@ class Mlp:
 
     hidden: Sequence[int] = (64, 64)  # widths of the hidden layers
     activation: str = "tanh"  # or relu, elu, silu
-    layer_norm: bool = field(default=False, kw_only=True)  # of the numbers of a hidden layer, before its activation
+    layer_norm: bool = field(
+        default=False, kw_only=True
+    )  # of the numbers of a hidden layer, before its activation
 
     def __post_init__(self) -> None:
         check_choice(tuple(ACTIVATIONS), activation=self.activation)
@@ -140,13 +172,25 @@ class Mlp:
         for width in self.hidden:
             check_range(1, 4096, hidden=width)
 
-    def layers(self, inputs: int, outputs: int, gain: float, device: torch.device | None = None) -> MLP:
+    def layers(
+        self, inputs: int, outputs: int, gain: float, device: torch.device | None = None
+    ) -> MLP:
         """Return the layers after it; `gain` scales the initial weights of the last one."""
         activation = ACTIVATIONS[self.activation]
         norm: dict[str, Any] = {}
         if self.layer_norm:
-            norm = {"norm_class": nn.LayerNorm, "norm_kwargs": [{"normalized_shape": width} for width in self.hidden]}
-        layers = MLP(inputs, outputs, num_cells=list(self.hidden), activation_class=activation, device=device, **norm)
+            norm = {
+                "norm_class": nn.LayerNorm,
+                "norm_kwargs": [{"normalized_shape": width} for width in self.hidden],
+            }
+        layers = MLP(
+            inputs,
+            outputs,
+            num_cells=list(self.hidden),
+            activation_class=activation,
+            device=device,
+            **norm,
+        )
         if activation is nn.Tanh:
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
             for layer in linear:
@@ -163,8 +207,8 @@ class Mlp:
 class Cnn(Mlp):
     """A network that reads images by convolutions, and other entries beside what these give.
 
-    The lists for the convolutions must be as long as each other. When it is built, an entry must be an image, and none
-    may be too small; else it raises a `ValueError`.
+    The lists for the convolutions must be as long as each other. When it is built, an entry must be
+    an image, and none may be too small; else it raises a `ValueError`.
     """
 
     hidden: Sequence[int] = (512,)  # widths of the hidden layers after the convolutions
@@ -177,7 +221,9 @@ class Cnn(Mlp):
         super().__post_init__()
         lengths = {name: len(getattr(self, name)) for name in ("channels", "kernels", "strides")}
         if len(set(lengths.values())) > 1 or not self.channels:
-            raise ValueError(f"channels, kernels and strides must have one number for each convolution, not {lengths}")
+            raise ValueError(
+                f"channels, kernels and strides must have one number for each convolution, not {lengths}"
+            )
         for name in lengths:
             for number in getattr(self, name):
                 check_range(1, 4096, **{name: number})
@@ -187,9 +233,10 @@ class Cnn(Mlp):
 class Gru(Mlp):
     """A network with a memory: a gated recurrent unit (GRU), and hidden layers that read its state.
 
-    The GRU reads concatenated entries. Its state is zero at the start of an episode, and the data of the env carry it
-    from step to step as `policy_state`; `env_transforms` makes an env do so. Critics have no memory of their own: their
-    hidden layers read the entries and the state that the policy had before the step.
+    The GRU reads concatenated entries. Its state is zero at the start of an episode, and the data
+    of the env carry it from step to step as `policy_state`; `env_transforms` makes an env do so.
+    Critics have no memory of their own: their hidden layers read the entries and the state that the
+    policy had before the step.
 
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
@@ -215,7 +262,10 @@ class Gru(Mlp):
 
     def env_transforms(self) -> list[Transform]:
         """Return transforms by which an env marks the starts of episodes and carries the state, as TorchRL expects."""
-        return [InitTracker(), TensorDictPrimer({STATE: Unbounded((1, self.state))}, expand_specs=True)]
+        return [
+            InitTracker(),
+            TensorDictPrimer({STATE: Unbounded((1, self.state))}, expand_specs=True),
+        ]
 
 
 def without_memory(network: Mlp, learner: str) -> Mlp:

@@ -30,13 +30,15 @@ class GradientStep(Stateful):
     losses: Callable[[TensorDictBase], TensorDictBase]  # returns scalars by name for a minibatch
     groups: Sequence[Sequence[nn.Parameter]]  # parameters, grouped by learning rate
     modules: Sequence[nn.Module]  # hold the tensors that the losses read, besides the parameters
-    rates: Callable[[float], Sequence[float]]  # learning rates of the groups by the progress of the run
+    rates: Callable[
+        [float], Sequence[float]
+    ]  # learning rates of the groups by the progress of the run
     _: KW_ONLY
     eps: float  # of Adam
     max_grad_norm: float  # gradients are scaled down to this norm, over all parameters together
     after: Callable[[], Any] | None = None  # what follows each step
-    # Whether to compile the step, which changes the last digits; "auto": after the first update with any, if the run
-    # will have 2,000 steps or more.
+    # Whether to compile the step, which changes the last digits; "auto": after the first update
+    # with any, if the run will have 2,000 steps or more.
     compile: bool | Literal["auto"] = "auto"
     compilable: bool = True  # whether it can be compiled
 
@@ -44,10 +46,14 @@ class GradientStep(Stateful):
         check_choice(("true", "false", "auto"), compile=str(self.compile).lower())
         self.required = self.compile is True
         if self.required and not self.compilable:
-            raise ValueError("compile=true: this learner's update depends on data in its shapes; take compile=auto")
+            raise ValueError(
+                "compile=true: this learner's update depends on data in its shapes; take compile=auto"
+            )
         self.compile = self.compile if self.compilable else False
         self.parameters = [parameter for group in self.groups for parameter in group]
-        self.adam = torch.optim.Adam([{"params": group} for group in self.groups], eps=self.eps, fused=True)
+        self.adam = torch.optim.Adam(
+            [{"params": group} for group in self.groups], eps=self.eps, fused=True
+        )
         self.compiled = Compiled(self._on_tensors)
         self.steps, self.begun = 0, 0.0  # progress of the run at the first step
         self.names: list[str] = []  # of the losses
@@ -107,7 +113,9 @@ class GradientStep(Stateful):
     def means(self, reports: Sequence[Tensor]) -> dict[str, float]:
         """Return the means of what the calls returned, by name."""
         columns = torch.stack(list(reports), -1).unbind(0)
-        return {name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)}
+        return {
+            name: float(column.mean()) for name, column in zip(self.names, columns, strict=True)
+        }
 
     def _state(self) -> list[Tensor]:
         state = self.adam.state
@@ -115,19 +123,33 @@ class GradientStep(Stateful):
             if parameter not in state:  # as Adam does at the first step
                 moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
                 state[parameter] = {"step": torch.zeros((), device=parameter.device), **moments}
-        tensors = [*self.parameters, *(value for parameter in self.parameters for value in state[parameter].values())]
-        tensors += [tensor for module in self.modules for tensor in (*module.parameters(), *module.buffers())]
+        tensors = [
+            *self.parameters,
+            *(value for parameter in self.parameters for value in state[parameter].values()),
+        ]
+        tensors += [
+            tensor
+            for module in self.modules
+            for tensor in (*module.parameters(), *module.buffers())
+        ]
         return list({id(tensor): tensor for tensor in tensors}.values())
 
     def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
         """Take a step on the entries of a minibatch, for compilation; `tensors` end with those of `_state`."""
         minibatch = TensorDict(dict(zip(self.keys, tensors, strict=False)), len(tensors[0]))
-        for module in self.modules:  # TorchRL's losses keep detached parameters, which would be constants here
+        for module in (
+            self.modules
+        ):  # TorchRL's losses keep detached parameters, which would be constants here
             module.__dict__.get("_cache", {}).clear()
-        weights, rates = numbers[: len(self.weighted)].unbind(0), numbers[len(self.weighted) :].unbind(0)
+        weights, rates = (
+            numbers[: len(self.weighted)].unbind(0),
+            numbers[len(self.weighted) :].unbind(0),
+        )
         losses = self.losses(minibatch)
         self.names = list(losses.keys())
-        total = sum(weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True))
+        total = sum(
+            weight * losses[name] for name, weight in zip(self.weighted, weights, strict=True)
+        )
         with self._traceable(rates):
             gradients = torch.autograd.grad(total, self.parameters, allow_unused=True)
             for parameter, gradient in zip(self.parameters, gradients, strict=True):

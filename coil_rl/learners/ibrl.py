@@ -1,12 +1,14 @@
 """SAC that chooses between the guide's action and its own: IBRL (Hu et al. 2024), with the variants of PEX and EXPO.
 
-The guide proposes g and the policy b. The executed one has the larger value, the minimum of the target critics, and the
-critics learn from the same choice in the next state, without an entropy reward:
+The guide proposes g and the policy b. The executed one has the larger value, the minimum of the
+target critics, and the critics learn from the same choice in the next state, without an entropy
+reward:
 
     a = argmax over {g, b} of min Q'(s, .),  y = r + gamma * max over {g', b'} of min Q'(s', .)
 
-So the guide's actions help from the first step on, and are dropped where the policy's are better. PEX (Zhang et al.
-2023) draws a proposal instead. EXPO (Dong et al. 2025) adds a third one: g with an edit by a second policy.
+So the guide's actions help from the first step on, and are dropped where the policy's are better.
+PEX (Zhang et al. 2023) draws a proposal instead. EXPO (Dong et al. 2025) adds a third one: g with
+an edit by a second policy.
 """
 
 from collections.abc import Sequence
@@ -33,15 +35,16 @@ ADVICE = "guide_action"
 class IBRL(SAC):
     """The IBRL learner; the env writes `guide_action` (else a `KeyError`), which the networks need not observe.
 
-    What `SAC` refuses, an option that it does not take, and `edit` for an action without bounds are a `ValueError`.
+    What `SAC` refuses, an option that it does not take, and `edit` for an action without bounds are
+    a `ValueError`.
 
     Args:
         env: the env, with continuous actions and advice.
         in_keys: entries that policy and critics observe.
-        sharpness: a proposal is drawn with probabilities softmax(sharpness * min Q'), and y has its mean value, as in
-            PEX; None: the better one. In evaluation it is always the better one.
-        edit: largest change of the guide's action by the third proposal, as a fraction of half the range of the
-            action, as in EXPO; 0: there is none.
+        sharpness: a proposal is drawn with probabilities softmax(sharpness * min Q'), and y has its
+            mean value, as in PEX; None: the better one. In evaluation it is always the better one.
+        edit: largest change of the guide's action by the third proposal, as a fraction of half the
+            range of the action, as in EXPO; 0: there is none.
         guide: row of the advice.
         options: as for `SAC`, without `target_critics` and `uncertainty`.
     """
@@ -49,25 +52,39 @@ class IBRL(SAC):
     reported = (*SAC.reported, "guide_share")
 
     def __init__(
-        self, env: EnvBase, in_keys: Sequence[NestedKey] = ("observation",), *,
-        sharpness: float | None = None, edit: float = 0.0, guide: int = 0, **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey] = ("observation",),
+        *,
+        sharpness: float | None = None,
+        edit: float = 0.0,
+        guide: int = 0,
+        **options: Any,
+    ) -> None:
         check_range(0, sharpness=sharpness or 0, edit=edit)
         if options.get("target_critics") is not None or options.get("uncertainty"):
             raise ValueError("IBRL compares all critics; leave target_critics and uncertainty out")
         if ADVICE not in env.observation_spec:
-            raise KeyError(f"IBRL chooses between actions, but the env has no {ADVICE}; put GuideActions before it")
+            raise KeyError(
+                f"IBRL chooses between actions, but the env has no {ADVICE}; put GuideActions before it"
+            )
         self.choice = partial(Proposals, guide=guide, sharpness=sharpness, edit=edit)
         super().__init__(env, in_keys, **options)
-        self.policy = TensorDictSequential(*([self.normaliser] if self.normaliser else []), self.loss.proposals)
+        self.policy = TensorDictSequential(
+            *([self.normaliser] if self.normaliser else []), self.loss.proposals
+        )
         self.also_store(ADVICE)
 
-    def build_loss(self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **arguments: Any) -> SACLoss:
+    def build_loss(
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **arguments: Any
+    ) -> SACLoss:
         """Return the loss, with the second policy if there is one."""
         space, editor = ActionSpace(env.action_spec, len(env.batch_size)), None
         if self.choice.keywords["edit"]:
             if space.bounds is None or not torch.stack(space.bounds).isfinite().all():
-                raise ValueError("edit is a fraction of the range of the action, but it has no bounds; take edit=0")
+                raise ValueError(
+                    "edit is a fraction of the range of the action, but it has no bounds; take edit=0"
+                )
             editor = self.build_actor(env, [*in_keys, ADVICE], network)
         return ProposalLoss(partial(self.choice, space=space, editor=editor), **arguments)
 
@@ -80,9 +97,16 @@ class Proposals(Critics):
     """The choice between the actions of the guide, the policy `actor` and perhaps `editor`; it writes `action`."""
 
     def __init__(
-        self, actor: ProbabilisticTensorDictSequential, loss: SACLoss, *, space: ActionSpace,
-        editor: ProbabilisticTensorDictSequential | None, guide: int, sharpness: float | None, edit: float,
-    ) -> None:  # fmt: skip
+        self,
+        actor: ProbabilisticTensorDictSequential,
+        loss: SACLoss,
+        *,
+        space: ActionSpace,
+        editor: ProbabilisticTensorDictSequential | None,
+        guide: int,
+        sharpness: float | None,
+        edit: float,
+    ) -> None:
         super().__init__(loss, loss.target_qvalue_network_params)
         self.in_keys, self.out_keys = list(dict.fromkeys([*actor.in_keys, ADVICE])), ["action"]
         self.actor, self.editor, self.space = actor, editor, space
@@ -94,11 +118,16 @@ class Proposals(Critics):
         chosen = values.argmax(0)
         if self.sharpness is not None and exploration_type() == ExplorationType.RANDOM:
             chosen = Categorical(self.shares(values).movedim(0, -1)).sample()
-        return tensordict.set("action", proposals.gather(0, expand_as_right(chosen[None], proposals[:1]))[0])
+        return tensordict.set(
+            "action", proposals.gather(0, expand_as_right(chosen[None], proposals[:1]))[0]
+        )
 
     def rate(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the proposals, the guide's first, [P, *B, A], and their values [P, *B]."""
-        proposals = [tensordict[ADVICE][..., self.guide, :], self.actor(tensordict.copy())["action"]]
+        proposals = [
+            tensordict[ADVICE][..., self.guide, :],
+            self.actor(tensordict.copy())["action"],
+        ]
         if self.editor is not None:
             proposals.append(self.edited(tensordict, self.editor(tensordict.copy())["action"]))
         actions = torch.stack(proposals)
@@ -108,7 +137,9 @@ class Proposals(Critics):
     def edited(self, tensordict: TensorDictBase, change: Tensor) -> Tensor:
         """Return the guide's action with a change, which is an action of the second policy."""
         low, high = self.space.bounds  # type: ignore[misc]
-        return self.space.clamp(tensordict[ADVICE][..., self.guide, :] + self.edit * (change - (low + high) / 2))
+        return self.space.clamp(
+            tensordict[ADVICE][..., self.guide, :] + self.edit * (change - (low + high) / 2)
+        )
 
     def shares(self, values: Tensor) -> Tensor:
         """Return the probability of each proposal from their values, [P, *B]."""
@@ -125,7 +156,10 @@ class ProposalLoss(SACLoss):
 
     def __init__(self, choice: partial[Proposals], **arguments: Any) -> None:
         super().__init__(**arguments)
-        self.make_proposals, self.editor = partial(choice, arguments["actor_network"]), choice.keywords["editor"]
+        self.make_proposals, self.editor = (
+            partial(choice, arguments["actor_network"]),
+            choice.keywords["editor"],
+        )
 
     @cached_property  # no submodule, because the loss holds the weights
     def proposals(self) -> Proposals:
@@ -138,7 +172,9 @@ class ProposalLoss(SACLoss):
             _, values = self.proposals.rate(data["next"])
             shares = self.proposals.shares(values)
             self.guide_share = shares[0].mean()
-            data["next", self.value_estimator.tensor_keys.value] = (shares * values).sum(0).unsqueeze(-1)
+            data["next", self.value_estimator.tensor_keys.value] = (
+                (shares * values).sum(0).unsqueeze(-1)
+            )
             target: Tensor = self.value_estimator.value_estimate(data).squeeze(-1)
         return target
 
@@ -150,6 +186,11 @@ class ProposalLoss(SACLoss):
             change = distribution.rsample()
             data = tensordict.select(*self.qvalue_network.in_keys, strict=False)
             data.set("action", self.proposals.edited(tensordict, change))
-            rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)["state_action_value"]
-            loss = loss + (self._alpha * distribution.log_prob(change) - rated.amin(0).squeeze(-1)).mean()
+            rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)[
+                "state_action_value"
+            ]
+            loss = (
+                loss
+                + (self._alpha * distribution.log_prob(change) - rated.amin(0).squeeze(-1)).mean()
+            )
         return loss, values

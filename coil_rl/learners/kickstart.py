@@ -32,8 +32,9 @@ class KickstartLoss:
     name: ClassVar[str] = "guide"
 
     coefficient: float | Schedule = Linear(1.0, 0.0, until=0.5)  # of the loss
-    # "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) || pi), which also trains the
-    # standard deviation of the policy. For bounded actions both normal distributions are squashed.
+    # "likelihood", behavioural cloning: -log pi(g | s); or "divergence": KL(N(g, scale) || pi),
+    # which also trains the standard deviation of the policy. For bounded actions both normal
+    # distributions are squashed.
     kind: Literal["likelihood", "divergence"] = "likelihood"
     scale: float = 0.2  # standard deviation of the guide for the divergence, before squashing
     guide: int = 0  # index of the guide in the advice
@@ -50,7 +51,9 @@ class KickstartLoss:
         """Entries that it reads, besides those that the policy observes."""
         return [self.advice_key]
 
-    def __call__(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
+    def __call__(
+        self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
+    ) -> Tensor:
         """Return the loss of a minibatch [N], a scalar."""
         return self.each(policy, minibatch).mean()
 
@@ -60,7 +63,9 @@ class KickstartLoss:
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(distribution, Categorical):
             return -(advice * distribution.logits).sum(-1)
-        if isinstance(distribution, Choices):  # the advice is one-hot for each choice, one beside the other
+        if isinstance(
+            distribution, Choices
+        ):  # the advice is one-hot for each choice, one beside the other
             logits = distribution.base_dist.logits
             return -(advice * logits[:, logits[0].isfinite()]).sum(-1)
         bounded = isinstance(distribution, TanhNormal)
@@ -71,18 +76,22 @@ class KickstartLoss:
             advice = middle + half * unit
         if self.kind == "likelihood":
             return -distribution.log_prob(advice)
-        # The divergence between squashed distributions is that of the normal distributions before squashing.
+        # The divergence between squashed distributions is that of the normal distributions before
+        # squashing.
         mean, base = (unit.atanh(), distribution) if bounded else (advice, distribution.base_dist)
-        return kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1)
+        return (
+            kl_divergence(Normal(mean, self.scale), Normal(base.loc, base.scale)).flatten(1).sum(-1)
+        )
 
 
 @dataclass(eq=False)
 class FilteredKickstartLoss(KickstartLoss):
     """As `KickstartLoss`, weighted by the critics' opinion of g, for learners with action values, such as SAC.
 
-    The weight of a state is 1 where the critics' mean value of g is larger than that of the policy's action, else 0
-    (Q-filter, Nair et al. 2018); or `soft`, the probability of this by the spread of the critics (SPReD, 2025):
-    Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)). Other arguments are those of `KickstartLoss`.
+    The weight of a state is 1 where the critics' mean value of g is larger than that of the
+    policy's action, else 0 (Q-filter, Nair et al. 2018); or `soft`, the probability of this by the
+    spread of the critics (SPReD, 2025): Phi((mean Q_g - mean Q_pi) / sqrt(var Q_g + var Q_pi)).
+    Other arguments are those of `KickstartLoss`.
     """
 
     soft: bool = field(default=False, kw_only=True)
@@ -91,7 +100,9 @@ class FilteredKickstartLoss(KickstartLoss):
     def keys(self) -> list[NestedKey]:
         """Entries that it reads; raises a `ValueError` for a learner without action values."""
         if self.critics is None:
-            raise ValueError("FilteredKickstartLoss compares values of actions; take learner=sac, or KickstartLoss")
+            raise ValueError(
+                "FilteredKickstartLoss compares values of actions; take learner=sac, or KickstartLoss"
+            )
         return super().keys
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:

@@ -1,7 +1,8 @@
 """Running normalisation of observations to mean 0 and standard deviation 1.
 
-It is a part of the policy and not a transform of the env: the statistics are in the policy's own state, so whoever
-loads the policy has them, guides see the observations as they are, and an evaluation never changes them.
+It is a part of the policy and not a transform of the env: the statistics are in the policy's own
+state, so whoever loads the policy has them, guides see the observations as they are, and an
+evaluation never changes them.
 """
 
 from collections.abc import Sequence
@@ -22,8 +23,9 @@ LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
 class Normaliser(TensorDictModuleBase):
     """Entries of an env minus their mean, divided by their standard deviation, over everything that `learn` has seen.
 
-    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the entries. Advice, which
-    shares the unit of the action, and entries of other than floating point numbers are a `ValueError`.
+    The results are written as `("normalised", KEY)`. Before the first `learn` they equal the
+    entries. Advice, which shares the unit of the action, and entries of other than floating point
+    numbers are a `ValueError`.
     """
 
     def __init__(self, env: EnvBase, keys: Sequence[NestedKey]) -> None:
@@ -34,7 +36,9 @@ class Normaliser(TensorDictModuleBase):
         self.moments = nn.ModuleList()
         for key, spec in zip(keys, entry_specs(env, keys), strict=True):
             if key in advice:
-                raise ValueError(f"normalise: {key} is advice, in the unit of the action; leave it out")
+                raise ValueError(
+                    f"normalise: {key} is advice, in the unit of the action; leave it out"
+                )
             if not spec.dtype.is_floating_point:
                 raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
             self.moments.append(Moments(spec.shape[len(env.batch_size) :], spec.device))
@@ -78,33 +82,48 @@ class Moments(nn.Module):
         mean, variance = rows.mean(0), rows.var(0, correction=0)
         self.count += len(rows)
         share, change = len(rows) / self.count, mean - self.mean
-        spread = self.variance * (1 - share) + variance * share + change.square() * share * (1 - share)
+        spread = (
+            self.variance * (1 - share) + variance * share + change.square() * share * (1 - share)
+        )
         self.mean += change * share
         self.variance.copy_(spread)
 
 
 def advice_keys(env: EnvBase) -> set[NestedKey]:
     """Return the entries of an env that hold advice."""
-    return {key for module in env.modules() if isinstance(module, GuideActions) for key in module.out_keys}
+    return {
+        key
+        for module in env.modules()
+        if isinstance(module, GuideActions)
+        for key in module.out_keys
+    }
 
 
-def normaliser(env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Sequence[NestedKey]) -> Normaliser | None:
+def normaliser(
+    env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Sequence[NestedKey]
+) -> Normaliser | None:
     """Return the normaliser of a learner, None without entries.
 
-    `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not advice, choices or
-    images.
+    `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not
+    advice, choices or images.
     """
     if not isinstance(normalise, bool):
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
             observed = ", ".join(map(str, in_keys))
-            raise ValueError(f"normalise: {', '.join(unread)} is not observed; observed are {observed}")
+            raise ValueError(
+                f"normalise: {', '.join(unread)} is not observed; observed are {observed}"
+            )
     else:
         advice, batch_dims = advice_keys(env), len(env.batch_size)
         chosen = [
             key
             for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True)
-            if normalise and key not in advice and spec.dtype.is_floating_point and len(spec.shape) - batch_dims < 3
-            and not hasattr(spec, "nvec") and getattr(spec, "domain", "continuous") == "continuous"
-        ]  # fmt: skip
+            if normalise
+            and key not in advice
+            and spec.dtype.is_floating_point
+            and len(spec.shape) - batch_dims < 3
+            and not hasattr(spec, "nvec")
+            and getattr(spec, "domain", "continuous") == "continuous"
+        ]
     return Normaliser(env, chosen) if chosen else None

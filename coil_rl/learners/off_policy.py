@@ -23,21 +23,22 @@ from coil_rl.transforms.guide_transform import GuideTransform
 class OffPolicy(Stateful):
     """Replay buffer, optimiser, target networks and update.
 
-    A step is stored with the observations before and after it, advice included, because a guide with memory or
-    randomness cannot be evaluated again. Where a guide acted in place of the agent, the action that was executed is
-    stored, or 0 if the agent's action is a residual. Such steps are left out if no action of the agent has the same
-    effect: its actions are choices, or combined in several ways. An action that is added to the guide's is stored as
-    the agent's own, since the sum is a part of the env.
+    A step is stored with the observations before and after it, advice included, because a guide
+    with memory or randomness cannot be evaluated again. Where a guide acted in place of the agent,
+    the action that was executed is stored, or 0 if the agent's action is a residual. Such steps are
+    left out if no action of the agent has the same effect: its actions are choices, or combined in
+    several ways. An action that is added to the guide's is stored as the agent's own, since the sum
+    is a part of the env.
 
-    A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of (`minimised`) and
-    the values to report (`reported`). A value out of range is a `ValueError`, and so is an env in which the effect or
-    the reward of an action changes over the run.
+    A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of
+    (`minimised`) and the values to report (`reported`). A value out of range is a `ValueError`, and
+    so is an env in which the effect or the reward of an action changes over the run.
 
     Args:
         env: the env, for its device and transforms.
         in_keys: entries that are observed.
-        normalise: whether to normalise what is observed, or the entries to normalise, see `Normaliser`. Steps are
-            stored as they are.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`. Steps are stored as they are.
         tau: step of the target networks towards the networks after each minibatch, as a fraction.
         ratio: how often a step is sampled, on average over the run.
         learning_rate: of Adam, a number or a schedule.
@@ -46,8 +47,9 @@ class OffPolicy(Stateful):
         capacity: maximum number of stored steps; the newest replace the oldest.
         batch_size: N, steps in a minibatch.
         starts: number of stored steps before learning starts.
-        prior: share of each minibatch that is sampled from the steps of guides, which are then stored apart: the
-            symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all steps are sampled alike.
+        prior: share of each minibatch that is sampled from the steps of guides, which are then
+            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
+            steps are sampled alike.
         compile: whether to compile the update, see `GradientStep`.
         anchor: makes the policy start as its guide.
         seed: of the samples.
@@ -58,7 +60,14 @@ class OffPolicy(Stateful):
 
     kind: ClassVar[str] = "agent"  # as for `PPO`
     compilable: ClassVar[bool] = True
-    parts: ClassVar[tuple[str, ...]] = ("loss", "gradient", "generator", "pending_updates", "normaliser", "anchor")
+    parts: ClassVar[tuple[str, ...]] = (
+        "loss",
+        "gradient",
+        "generator",
+        "pending_updates",
+        "normaliser",
+        "anchor",
+    )
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
 
@@ -92,33 +101,55 @@ class OffPolicy(Stateful):
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")
         check_range(0, LARGEST_SEED, seed=seed)
         for transform in env.modules():
-            if isinstance(transform, GuideTransform) and callable(getattr(transform, transform.mdp_parameter, None)):
-                problem = f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run"
+            if isinstance(transform, GuideTransform) and callable(
+                getattr(transform, transform.mdp_parameter, None)
+            ):
+                problem = (
+                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run"
+                )
                 effect = "so stored steps would no longer show the effect of an action"
                 remedy = "make it a number, or use a learner without replay, such as PPO"
                 raise ValueError(f"{problem}, {effect}; {remedy}")
         if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
             needed, has = "one entry action and one entry reward", ", ".join(map(str, keys))
             remedy = "rename them by TorchRL's RenameTransform, or use PPO"
-            raise ValueError(f"{type(self).__name__} needs {needed}, but this env has {has}; {remedy}")
+            raise ValueError(
+                f"{type(self).__name__} needs {needed}, but this env has {has}; {remedy}"
+            )
         self.normaliser = normaliser(env, in_keys, normalise)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
-            needed = "steps in which a guide acts in place of the agent, as with the transform Takeover"
-            raise ValueError(f"prior={prior} needs {needed}, by an action that the agent could choose; or take prior=0")
+            needed = (
+                "steps in which a guide acts in place of the agent, as with the transform Takeover"
+            )
+            raise ValueError(
+                f"prior={prior} needs {needed}, by an action that the agent could choose; or take prior=0"
+            )
         after = (*in_keys, "reward", "done", "terminated")
-        self.stored_keys: list[NestedKey] = [*in_keys, "action", *(unravel_key(("next", key)) for key in after)]
+        self.stored_keys: list[NestedKey] = [
+            *in_keys,
+            "action",
+            *(unravel_key(("next", key)) for key in after),
+        ]
         self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else [*self.stored_keys]
         self.keys += [("next", EXECUTED)] if self.of_guide == "executed" else []
-        self.capacity, self.batch_size, self.ratio, self.starts = capacity, batch_size, ratio, starts
+        self.capacity, self.batch_size, self.ratio, self.starts = (
+            capacity,
+            batch_size,
+            ratio,
+            starts,
+        )
         self.pending_updates = 0.0
         self.device = env.device or torch.device("cpu")
         self.generator = torch.Generator(self.device).manual_seed(seed)
-        # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw other samples.
+        # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw
+        # other samples.
         self.buffer, self.guide_buffer = (
-            ReplayBuffer(storage=LazyTensorStorage(capacity, device=self.device), generator=self.generator)
+            ReplayBuffer(
+                storage=LazyTensorStorage(capacity, device=self.device), generator=self.generator
+            )
             for _ in range(2)
         )
         self.prior = round(prior * batch_size)
@@ -126,7 +157,12 @@ class OffPolicy(Stateful):
     def also_store(self, *keys: NestedKey) -> None:
         """Store further entries of the env, before and after each step."""
         for known in (self.stored_keys, self.keys):
-            known += [each for key in keys for each in (key, unravel_key(("next", key))) if each not in known]
+            known += [
+                each
+                for key in keys
+                for each in (key, unravel_key(("next", key)))
+                if each not in known
+            ]
 
     def set_loss(self, loss: LossModule) -> None:
         """Set TorchRL's loss, and make its target networks and the optimiser."""
@@ -134,9 +170,16 @@ class OffPolicy(Stateful):
         self.loss.make_value_estimator(gamma=self.gamma)
         self.target = SoftUpdate(self.loss, tau=self.tau)
         self.gradient = GradientStep(
-            self.losses, [list(loss.parameters())], [loss], lambda progress: [self.learning_rate(progress)], eps=1e-8,
-            max_grad_norm=self.max_grad_norm, after=self.target.step, compile=self.compile, compilable=self.compilable,
-        )  # fmt: skip
+            self.losses,
+            [list(loss.parameters())],
+            [loss],
+            lambda progress: [self.learning_rate(progress)],
+            eps=1e-8,
+            max_grad_norm=self.max_grad_norm,
+            after=self.target.step,
+            compile=self.compile,
+            compilable=self.compilable,
+        )
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.
@@ -146,8 +189,9 @@ class OffPolicy(Stateful):
             progress: of the run, in [0, 1], for the schedules.
 
         Returns:
-            Means over the minibatches of the `reported` values, 0 before learning starts; the number of `minibatches`;
-            the number of stored steps (`kept`); the learning rate; and the values of `describe`.
+            Means over the minibatches of the `reported` values, 0 before learning starts; the
+            number of `minibatches`; the number of stored steps (`kept`); the learning rate; and the
+            values of `describe`.
         """
         self.store(batch)
         self.gradient.begin(progress)
@@ -180,7 +224,9 @@ class OffPolicy(Stateful):
                 # Where the agent acts it is its own action.
                 steps["action"] = batch["next", EXECUTED].reshape(steps["action"].shape)
             else:
-                steps["action"] = torch.where(expand_as_right(agent, steps["action"]), steps["action"], 0)
+                steps["action"] = torch.where(
+                    expand_as_right(agent, steps["action"]), steps["action"], 0
+                )
             if self.prior:
                 steps, guide = steps[agent], steps[~agent]
         for buffer, new in ((self.buffer, steps), (self.guide_buffer, guide)):
@@ -200,7 +246,9 @@ class OffPolicy(Stateful):
         prior = prior if len(self.guide_buffer) else 0
         sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
         # All at once: a call of the buffer takes as long as a step.
-        parts = [buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size]
+        parts = [
+            buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size
+        ]
         minibatches: TensorDictBase = torch.cat(parts, 1)
         if self.normaliser is not None:
             minibatches["next"] = self.normaliser(minibatches["next"])
@@ -222,7 +270,10 @@ class OffPolicy(Stateful):
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""
         buffers = [
-            {"steps": buffer[:].clone().to_dict() if len(buffer) else {}, "writer": buffer.writer.state_dict()}
+            {
+                "steps": buffer[:].clone().to_dict() if len(buffer) else {},
+                "writer": buffer.writer.state_dict(),
+            }
             for buffer in (self.buffer, self.guide_buffer)
         ]
         return super().state_dict() | {"buffers": buffers}
@@ -233,7 +284,9 @@ class OffPolicy(Stateful):
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if stored["steps"]:
-                steps = TensorDict.from_dict(stored["steps"], batch_size=stored["steps"]["action"].shape[:1])
+                steps = TensorDict.from_dict(
+                    stored["steps"], batch_size=stored["steps"]["action"].shape[:1]
+                )
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
 
@@ -241,7 +294,9 @@ class OffPolicy(Stateful):
 def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:
     """Return which action of the agent had the same effect as that of a guide which acted in its place."""
     combined = [transform for transform in env.modules() if isinstance(transform, CombinedAction)]
-    if "agent_acts" not in env.observation_spec or (len(combined) > 1 and any(each.adds for each in combined)):
+    if "agent_acts" not in env.observation_spec or (
+        len(combined) > 1 and any(each.adds for each in combined)
+    ):
         return "nothing"
     executed, own = env.observation_spec.get(EXECUTED, None), env.action_spec
     if executed is None or (executed.shape, executed.dtype) != (own.shape, own.dtype):

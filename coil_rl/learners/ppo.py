@@ -1,7 +1,8 @@
 """Proximal policy optimisation with clipped probability ratios (paper equation 92; Schulman et al. 2017).
 
-A critic turns a batch of rollouts into advantages A (generalised advantage estimation). The policy then takes several
-passes over the batch in minibatches. Clipping the probability ratio keeps it near the policy that collected the batch:
+A critic turns a batch of rollouts into advantages A (generalised advantage estimation). The policy
+then takes several passes over the batch in minibatches. Clipping the probability ratio keeps it
+near the policy that collected the batch:
 
     loss = -mean(min(r A, clip(r, 1 - clip, 1 + clip) A)),  r = pi(a | s) / pi_old(a | s)
 """
@@ -36,25 +37,30 @@ from coil_rl.transforms.action_space import nested_key
 class PPO(Stateful):
     """The PPO learner, and the base class of the other on-policy learners.
 
-    COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps (`agent_acts` is false),
-    the policy learns from the agent's steps only, and the critic from all. Subclasses override `build_loss`, `losses`,
-    `build_networks`, `parameter_groups` and `learning_rates`.
+    COIL is PPO with `guide_action` among `in_keys`. Where a guide acts in some of the steps
+    (`agent_acts` is false), the policy learns from the agent's steps only, and the critic from all.
+    Subclasses override `build_loss`, `losses`, `build_networks`, `parameter_groups` and
+    `learning_rates`.
 
-    A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch, [N, T]. It remembers
-    anew from the state that was stored in the first step of each row; then their steps are a minibatch as any other.
+    A policy with a memory (`network` is a `Gru`) learns from minibatches of whole rows of a batch,
+    [N, T]. It remembers anew from the state that was stored in the first step of each row; then
+    their steps are a minibatch as any other.
 
-    A value out of range, or an action that no policy can choose, is a `ValueError`; an entry that the env does not have
-    a `KeyError`.
+    A value out of range, or an action that no policy can choose, is a `ValueError`; an entry that
+    the env does not have a `KeyError`.
 
     Args:
         env: the env, for its specs.
         in_keys: entries that policy and critic observe.
         hidden: widths of the hidden layers of both networks, without `network`.
         network: architecture of both networks; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see `Normaliser`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`.
         action_scale: initial standard deviation of the policy.
-        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0 everywhere.
-        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds are clipped.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
+            everywhere.
+        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
+            are clipped.
         learning_rate: of Adam, a number or a schedule.
         gamma: discount.
         gae_lambda: lambda of generalised advantage estimation.
@@ -83,8 +89,8 @@ class PPO(Stateful):
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())
     """
 
-    # What the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a guide's actions) or
-    # "guides" (guides besides an agent).
+    # What the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from a
+    # guide's actions) or "guides" (guides besides an agent).
     kind: ClassVar[str] = "agent"
     with_memory: ClassVar[bool] = True  # whether the learner can train a network with a memory
     compilable: ClassVar[bool] = True  # whether the update can be compiled
@@ -118,7 +124,9 @@ class PPO(Stateful):
         self.learning_rate, self.entropy = schedule(learning_rate), schedule(entropy)
         check_range(0, action_gain=action_gain, learning_rate=self.learning_rate(0))
         check_range(0, critic=critic, entropy=self.entropy(0))
-        check_range(0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm)
+        check_range(
+            0, above=True, action_scale=action_scale, clip=clip, max_grad_norm=max_grad_norm
+        )
         check_range(1, epochs=epochs, minibatches=minibatches)
         check_range(0, LARGEST_SEED, seed=seed)
         self.epochs, self.minibatches = epochs, minibatches
@@ -129,24 +137,45 @@ class PPO(Stateful):
             without_memory(network, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
         self.policy, self.critic = self.build_networks(
-            env, in_keys, network, scale=action_scale, gain=action_gain, squash=squash, anchor=anchor
+            env,
+            in_keys,
+            network,
+            scale=action_scale,
+            gain=action_gain,
+            squash=squash,
+            anchor=anchor,
         )
         self.memory, self.head = networks.split_memory(self.policy)
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss = self.build_loss(
-            clip, entropy_bonus=self.entropy(0) > 0, entropy_coeff=self.entropy(0), critic_coeff=critic,
-            loss_critic_type="l2", functional=False,
-        )  # fmt: skip
+            clip,
+            entropy_bonus=self.entropy(0) > 0,
+            entropy_coeff=self.entropy(0),
+            critic_coeff=critic,
+            loss_critic_type="l2",
+            functional=False,
+        )
         self.guide_may_act = "agent_acts" in env.observation_spec
         self.gradient = GradientStep(
-            self.all_losses, self.parameter_groups(), [self.policy, self.critic, self.loss], self.learning_rates,
-            eps=1e-5, max_grad_norm=max_grad_norm, compile=compile,
+            self.all_losses,
+            self.parameter_groups(),
+            [self.policy, self.critic, self.loss],
+            self.learning_rates,
+            eps=1e-5,
+            max_grad_norm=max_grad_norm,
+            compile=compile,
             compilable=self.compilable and self.memory is None and not self.guide_may_act,
-        )  # fmt: skip
+        )
         self.generator = torch.Generator().manual_seed(seed)
-        self.sample_key = networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
+        self.sample_key = (
+            networks.UNCLIPPED if networks.UNCLIPPED in self.policy.out_keys else env.action_key
+        )
         self.reward_key = unravel_key(("next", env.reward_key))
-        read = [*dict.fromkeys([*in_keys, *self.policy.in_keys]), self.sample_key, "action_log_prob"]
+        read = [
+            *dict.fromkeys([*in_keys, *self.policy.in_keys]),
+            self.sample_key,
+            "action_log_prob",
+        ]
         read += [key for auxiliary_loss in self.auxiliary for key in auxiliary_loss.keys]
         read += ["agent_acts"] if self.guide_may_act else []
         valued = dict.fromkeys([*in_keys, *self.critic.in_keys])
@@ -163,7 +192,9 @@ class PPO(Stateful):
 
     def build_loss(self, clip: float, **options: Any) -> LossModule:
         """Return TorchRL's loss of policy and critic; `options` are those of any such loss."""
-        return ClippedLoss(self.head, self.critic, clip_epsilon=clip, normalize_advantage=True, **options)
+        return ClippedLoss(
+            self.head, self.critic, clip_epsilon=clip, normalize_advantage=True, **options
+        )
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates, grouped by learning rate."""
@@ -177,16 +208,20 @@ class PPO(Stateful):
         """Learn from a batch of rollouts.
 
         Args:
-            batch: [B, T] with `keys`. A truncated episode is bootstrapped from the value of its last state.
+            batch: [B, T] with `keys`. A truncated episode is bootstrapped from the value of its
+                last state.
             progress: of the run, in [0, 1], for the schedules.
 
         Returns:
-            Means over the minibatches of the losses and of the other values that TorchRL's loss reports, and the
-            learning rate.
+            Means over the minibatches of the losses and of the other values that TorchRL's loss
+            reports, and the learning rate.
         """
         rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
         reports = [self.gradient(minibatch, weights) for minibatch in self.draw_minibatches(rows)]
-        known = {"learning_rate": self.learning_rate(progress), "compiled": float(self.gradient.compile is True)}
+        known = {
+            "learning_rate": self.learning_rate(progress),
+            "compiled": float(self.gradient.compile is True),
+        }
         return self.gradient.means(reports) | known | self.finish(batch, progress)
 
     def all_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
@@ -202,7 +237,9 @@ class PPO(Stateful):
         weights = {"loss_objective": learns, "loss_critic": 1.0}
         if getattr(self.loss, "entropy_bonus", False):
             weights["loss_entropy"] = learns
-        return weights | {f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary}
+        return weights | {
+            f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary
+        }
 
     def policy_waits(self, progress: float) -> bool:
         """Return whether only the critic learns."""
@@ -211,8 +248,8 @@ class PPO(Stateful):
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Learn the statistics of the observations, and set the noise of an anchored policy, after an update.
 
-        The policy has collected the batch with the earlier statistics, and must learn from it with the same ones.
-        Returns the metrics of the anchor, if there is one.
+        The policy has collected the batch with the earlier statistics, and must learn from it with
+        the same ones. Returns the metrics of the anchor, if there is one.
         """
         if self.normaliser is not None:
             self.normaliser.learn(batch)
@@ -242,7 +279,9 @@ class PPO(Stateful):
             needed = "with a memory each needs all steps of an env"
             raise UserError(f"{problem}, but {needed}; take fewer minibatches or more envs")
         if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
-            raise ValueError(f"minibatches={self.minibatches} leaves less than 2 of {rows.numel()} frames to each")
+            raise ValueError(
+                f"minibatches={self.minibatches} leaves less than 2 of {rows.numel()} frames to each"
+            )
         for _ in range(self.epochs):
             order = torch.randperm(len(rows), generator=self.generator)[: size * self.minibatches]
             yield from map(self.remember, rows[order.to(rows.device)].split(size))
@@ -277,7 +316,8 @@ class PPO(Stateful):
 class ClippedLoss(ClipPPOLoss):
     """TorchRL's loss of the clipped objective, with the same numbers, in less time.
 
-    It leaves out the searches for options that are not used here, which take longer than small networks do.
+    It leaves out the searches for options that are not used here, which take longer than small
+    networks do.
     """
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -306,7 +346,10 @@ class ClippedLoss(ClipPPOLoss):
         }
         if self.entropy_bonus:
             entropy = self._get_entropy(distribution, advantage.shape[:-1])
-            losses |= {"entropy": entropy.detach().mean(), "loss_entropy": self._weighted_loss_entropy(entropy).mean()}
+            losses |= {
+                "entropy": entropy.detach().mean(),
+                "loss_entropy": self._weighted_loss_entropy(entropy).mean(),
+            }
         losses |= {
             "loss_critic": (self.critic_coeff * error).mean(),
             "explained_variance": 1.0 - unexplained / variance,
@@ -320,8 +363,9 @@ class ClippedLoss(ClipPPOLoss):
 class Advantages:
     """Generalised advantage estimation (Schulman et al. 2016) with one critic evaluation per state.
 
-    The state after a step is the state before the next step, unless the episode ended. So the critic evaluates each
-    state once, and in addition the last states of the batch and those of truncated episodes.
+    The state after a step is the state before the next step, unless the episode ended. So the
+    critic evaluates each state once, and in addition the last states of the batch and those of
+    truncated episodes.
     """
 
     def __init__(self, critic: TensorDictModuleBase, gamma: float, gae_lambda: float) -> None:

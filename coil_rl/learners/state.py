@@ -9,7 +9,8 @@ import torch
 class Stateful:
     """Base class of objects whose saved state is that of the attributes named in `parts`.
 
-    Each is a generator, an object with a state of its own, a plain value, or None, which has an empty state.
+    Each is a generator, an object with a state of its own, a plain value, or None, which has an
+    empty state.
     """
 
     parts: ClassVar[tuple[str, ...]]

@@ -1,9 +1,10 @@
 """Trust region policy optimisation (paper equations 89 and 90; Schulman et al. 2015).
 
-Each batch gives one step along the natural gradient: the direction in which the objective grows most for a given KL
-divergence of the policy. To second order the divergence is x F x / 2 with the Fisher matrix F, so the step is F^-1 g,
-scaled to the bound. F is never formed: conjugate gradients need its product with a vector only, a second derivative of
-the divergence. A line search then makes sure that the objective improved and that the bound holds.
+Each batch gives one step along the natural gradient: the direction in which the objective grows
+most for a given KL divergence of the policy. To second order the divergence is x F x / 2 with the
+Fisher matrix F, so the step is F^-1 g, scaled to the bound. F is never formed: conjugate gradients
+need its product with a vector only, a second derivative of the divergence. A line search then makes
+sure that the objective improved and that the bound holds.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +54,9 @@ class TRPO(PPO):
         check_range(0, 1, above=True, shrink=shrink)
         check_range(0, damping=damping, backtracks=backtracks)
         check_range(1, iterations=iterations)
-        super().__init__(env, in_keys, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options)  # no clipped loss
+        super().__init__(
+            env, in_keys, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options
+        )  # no clipped loss
         self.max_kl, self.damping, self.iterations = max_kl, damping, iterations
         self.backtracks, self.shrink = backtracks, shrink
 
@@ -65,8 +68,9 @@ class TRPO(PPO):
         """Learn from a batch of rollouts; arguments as for `PPO.update`.
 
         Returns:
-            The losses of the policy after its step; `kl`, the divergence of the step; `step`, its length as a fraction
-            of the longest one within the bound, 0 if none was taken; the critic's mean loss and its learning rate.
+            The losses of the policy after its step; `kl`, the divergence of the step; `step`, its
+            length as a fraction of the longest one within the bound, 0 if none was taken; the
+            critic's mean loss and its learning rate.
         """
         rows = self.prepare(batch, progress)
         report = self.improve(rows, progress)
@@ -76,16 +80,26 @@ class TRPO(PPO):
             error = F.mse_loss(value, minibatch["value_target"])
             self.gradient.minimise(error)
             errors.append(error.detach())
-        means = {"loss_critic": float(torch.stack(errors).mean()), "learning_rate": self.learning_rate(progress)}
-        return {name: float(value) for name, value in report.items()} | means | self.finish(batch, progress)
+        means = {
+            "loss_critic": float(torch.stack(errors).mean()),
+            "learning_rate": self.learning_rate(progress),
+        }
+        return (
+            {name: float(value) for name, value in report.items()}
+            | means
+            | self.finish(batch, progress)
+        )
 
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.
 
-        Of the rows [N] with `minibatch_keys` those in which a guide acted count for auxiliary losses only.
+        Of the rows [N] with `minibatch_keys` those in which a guide acted count for auxiliary
+        losses only.
         """
         agent_rows = rows[rows["agent_acts"].squeeze(-1)] if self.guide_may_act else rows
-        if self.policy_waits(progress) or len(agent_rows) < 2:  # one advantage cannot be standardised
+        if (
+            self.policy_waits(progress) or len(agent_rows) < 2
+        ):  # one advantage cannot be standardised
             names = ("objective", *(auxiliary.name for auxiliary in self.auxiliary))
             return {f"loss_{name}": 0.0 for name in names} | {"kl": 0.0, "step": 0.0}
         weights = list(self.policy.parameters())
@@ -137,10 +151,13 @@ def unsquashed(distribution: Any) -> Distribution:
     return Independent(Normal(normal.loc, normal.scale), len(distribution.event_shape))
 
 
-def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, iterations: int) -> Tensor:
+def conjugate_gradients(
+    product: Callable[[Tensor], Tensor], target: Tensor, iterations: int
+) -> Tensor:
     """Solve A x = b for a positive definite A, given its `product` with a vector, without waiting for the device.
 
-    For b = `target` [n], n iterations suffice in exact arithmetic. Iterations after convergence change nothing.
+    For b = `target` [n], n iterations suffice in exact arithmetic. Iterations after convergence
+    change nothing.
     """
     solution, residual, direction = torch.zeros_like(target), target.clone(), target.clone()
     square = first_square = residual @ residual
@@ -156,4 +173,6 @@ def conjugate_gradients(product: Callable[[Tensor], Tensor], target: Tensor, ite
 
 def derivative(value: Tensor, weights: Sequence[Tensor], differentiable: bool = False) -> Tensor:
     """Return the derivative of a scalar with respect to all weights, as one vector; the graph is kept."""
-    return parameters_to_vector(torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable))
+    return parameters_to_vector(
+        torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable)
+    )

@@ -1,7 +1,8 @@
 """Measures of how much an agent uses the advice of each guide, and policies with changed advice.
 
-Agreement alone cannot separate use of advice from coincidence: an agent and a guide may choose the same action because
-both observe the same cones. `intervention` and `gradient` therefore change the advice. All actions are deterministic.
+Agreement alone cannot separate use of advice from coincidence: an agent and a guide may choose the
+same action because both observe the same cones. `intervention` and `gradient` therefore change the
+advice. All actions are deterministic.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -10,7 +11,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase, TensorDictSequential
+from tensordict.nn import (
+    ProbabilisticTensorDictSequential,
+    TensorDictModuleBase,
+    TensorDictSequential,
+)
 from torch import Tensor
 from torchrl.envs import ExplorationType, set_exploration_type
 
@@ -31,7 +36,12 @@ def drawn(measures: Mapping[str, NDArray[np.float64]]) -> Iterator[tuple[str, st
     """Yield each measure that has a picture and a number, with title, axis label and file name of its picture."""
     for measure, (title, label) in PICTURES.items():
         if not np.isnan(measures[measure]).all():
-            yield measure, title, label, f"listening{'' if measure == 'intervention' else f'_{measure}'}.png"
+            yield (
+                measure,
+                title,
+                label,
+                f"listening{'' if measure == 'intervention' else f'_{measure}'}.png",
+            )
 
 
 @torch.no_grad()
@@ -46,10 +56,11 @@ def intervention(
 ) -> Tensor:
     """Return the mean change of the action when one guide's advice is replaced by its advice in another state.
 
-    Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a likely advice without
-    information on this state; the advice of other guides stays. Donors come from all states, not from other cars at
-    the same time, because deterministic cars on one track are in the same state at the same time. The change is
-    [N, n_guides] in action units; 0 if the advice has no influence.
+    Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a
+    likely advice without information on this state; the advice of other guides stays. Donors come
+    from all states, not from other cars at the same time, because deterministic cars on one track
+    are in the same state at the same time. The change is [N, n_guides] in action units; 0 if the
+    advice has no influence.
 
     Args:
         act: the agent.
@@ -60,7 +71,9 @@ def intervention(
     advice = states[ADVICE]
     action, change = _act(act, states, advice), torch.zeros_like(advice[..., 0])
     for _ in range(donors):
-        other = advice[torch.randint(len(advice), (len(advice),), generator=generator).to(advice.device)]
+        other = advice[
+            torch.randint(len(advice), (len(advice),), generator=generator).to(advice.device)
+        ]
         for guide in range(advice.shape[-2]):
             replaced = advice.clone()
             replaced[:, guide] = other[:, guide]
@@ -91,24 +104,34 @@ def _act(act: Act, states: TensorDictBase, advice: Tensor) -> Tensor:
         return act(states.copy().set(ADVICE, advice))
 
 
-def split_policy(policy: TensorDictModuleBase) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
+def split_policy(
+    policy: TensorDictModuleBase,
+) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
     """Split a policy into its first module if that writes `guide_action`, else None, and modules that read it.
 
     A policy that does not read advice is a `ValueError`.
     """
     advising, acting = None, policy
     if isinstance(policy, TensorDictSequential) and ADVICE in policy.module[0].out_keys:
-        sequential = ProbabilisticTensorDictSequential if hasattr(policy, "get_dist") else TensorDictSequential
+        sequential = (
+            ProbabilisticTensorDictSequential
+            if hasattr(policy, "get_dist")
+            else TensorDictSequential
+        )
         advising, acting = policy.module[0], sequential(*policy.module[1:])
     if ADVICE not in acting.in_keys:
-        raise ValueError(f"the policy does not read {ADVICE}; it reads {', '.join(map(str, acting.in_keys))}")
+        raise ValueError(
+            f"the policy does not read {ADVICE}; it reads {', '.join(map(str, acting.in_keys))}"
+        )
     return advising, acting
 
 
 class InterceptedPolicy(TensorDictModuleBase):
     """A policy whose input, with `guide_action` [B, n_guides, A], is changed between the advice and the action."""
 
-    def __init__(self, policy: TensorDictModuleBase, change: Callable[[TensorDictBase], TensorDictBase]) -> None:
+    def __init__(
+        self, policy: TensorDictModuleBase, change: Callable[[TensorDictBase], TensorDictBase]
+    ) -> None:
         self.in_keys, self.out_keys = policy.in_keys, policy.out_keys
         super().__init__()
         self.advising, self.acting = split_policy(policy)

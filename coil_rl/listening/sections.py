@@ -33,10 +33,14 @@ POINTS = 100  # of a curve, at most
 def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHING) -> Array:
     """Return the line half-way between the boundaries, smoothed over single cones: [P, 2] m, closed, from the start.
 
-    The points are about `spacing` m apart. `smoothing` is the standard deviation s of a Gaussian filter in m; a turn of
-    radius R becomes s^2 / 2R smaller.
+    The points are about `spacing` m apart. `smoothing` is the standard deviation s of a Gaussian
+    filter in m; a turn of radius R becomes s^2 / 2R smaller.
     """
-    return np.asarray(gaussian_filter1d(resample(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"))
+    return np.asarray(
+        gaussian_filter1d(
+            resample(track.middle(), spacing), smoothing / spacing, axis=0, mode="wrap"
+        )
+    )
 
 
 def curvature(line: Array) -> Array:
@@ -49,8 +53,9 @@ def curvature(line: Array) -> Array:
 def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> NDArray[np.int64]:
     """Return the section of each point of a closed line [P, 2] m: indices in SECTIONS, [P].
 
-    A turn is curved more than a circle of `turn_radius` m. An entry is the last `approach` m before a turn, an exit the
-    first ones after it; between two turns that are close the exit of the first ends half-way.
+    A turn is curved more than a circle of `turn_radius` m. An entry is the last `approach` m before
+    a turn, an exit the first ones after it; between two turns that are close the exit of the first
+    ends half-way.
     """
     bend = curvature(line)
     turning = np.flatnonzero(np.abs(bend) * turn_radius > 1)
@@ -59,7 +64,10 @@ def classify(line: Array, turn_radius: float = 10.0, approach: float = 4.0) -> N
         index, count = np.arange(len(line)), len(line)
         step = np.linalg.norm(np.roll(line, -1, axis=0) - line, axis=1).mean()
         to_next = np.append(turning, turning[0] + count)[np.searchsorted(turning, index)] - index
-        since_last = index - np.append(turning[-1] - count, turning)[np.searchsorted(turning, index, side="right")]
+        since_last = (
+            index
+            - np.append(turning[-1] - count, turning)[np.searchsorted(turning, index, side="right")]
+        )
         section[(since_last < to_next) & (since_last * step <= approach)] = EXIT
         section[(to_next <= since_last) & (to_next * step <= approach)] = ENTRY
         section[turning] = np.where(bend[turning] > 0, LEFT, RIGHT)
@@ -70,7 +78,9 @@ class WholeEpisode:
     """Base class of divisions of an episode into sections. The whole episode is one section, drawn by step."""
 
     names: ClassVar[tuple[str, ...]] = ()  # of the sections
-    record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that `draw` needs, by name
+    record: ClassVar[
+        Mapping[str, NestedKey]
+    ] = {}  # entries of every step that `draw` needs, by name
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
         """Return where each row of a state [B] is, besides the number of the step: entries [B, ...] by name."""
@@ -85,7 +95,10 @@ class WholeEpisode:
         size = max(1, -(-int(data.step.max() + 1) // POINTS))
         rows = data.means(**{"from": data.step // size * size})
         strokes = style.strong_strokes(data.guides)
-        handles = [Line2D([], [], color=s.colour, ls=s.linestyle, label=guide) for guide, s in strokes.items()]
+        handles = [
+            Line2D([], [], color=s.colour, ls=s.linestyle, label=guide)
+            for guide, s in strokes.items()
+        ]
         for measure, title, label, name in drawn(data.measures):
             with style.picture(folder / name, title, handles, 3.6) as figure:
                 axes = figure.add_subplot(xlabel="step of the episode", ylabel=label)
@@ -101,7 +114,8 @@ class WholeEpisode:
 class TrackSections(WholeEpisode):
     """Lookup of the section of a track in which a car is, by the nearest point of the middle line.
 
-    The env writes `info` with the index of the `track` and the `pose` of each car, as `ConeTrackEnv` does.
+    The env writes `info` with the index of the `track` and the `pose` of each car, as
+    `ConeTrackEnv` does.
     """
 
     names: ClassVar[tuple[str, ...]] = SECTIONS
@@ -110,7 +124,9 @@ class TrackSections(WholeEpisode):
     _: KW_ONLY
     turn_radius: float = 10.0  # as for `classify`, m, as the next one
     approach: float = 4.0
-    bin: float = 1.0  # m of track per value of the maps, rounded so that their number on a track is whole
+    bin: float = (
+        1.0  # m of track per value of the maps, rounded so that their number on a track is whole
+    )
 
     def __post_init__(self) -> None:
         check_range(0.5, 1000, turn_radius=self.turn_radius)
@@ -119,14 +135,21 @@ class TrackSections(WholeEpisode):
         # Indices in SECTIONS, [P] each.
         self.sections = [classify(line, self.turn_radius, self.approach) for line in self.lines]
         points = [torch.as_tensor(line, dtype=torch.float32) for line in self.lines]
-        self._points = pad_sequence(points, batch_first=True, padding_value=1e6)  # padded with points far away
-        self._section = pad_sequence([torch.as_tensor(of_line) for of_line in self.sections], batch_first=True)
+        self._points = pad_sequence(
+            points, batch_first=True, padding_value=1e6
+        )  # padded with points far away
+        self._section = pad_sequence(
+            [torch.as_tensor(of_line) for of_line in self.sections], batch_first=True
+        )
 
     def locate(self, state: TensorDictBase) -> dict[str, Tensor]:
         """Return the index of the `track` and of the nearest `point` of its middle line, [B] each, of a state [B]."""
         track, position = state["info", "track"].squeeze(-1), state["info", "pose"][..., :2]
         points = self._points.to(position)[track]
-        return {"track": track, "point": (points - position.unsqueeze(-2)).square().sum(-1).argmin(-1)}
+        return {
+            "track": track,
+            "point": (points - position.unsqueeze(-2)).square().sum(-1).argmin(-1),
+        }
 
     def section(self, place: TensorDictBase) -> Tensor:
         """Return the section of each place as an index in SECTIONS, [B]."""
@@ -144,23 +167,32 @@ class TrackSections(WholeEpisode):
         """Return one row per guide and bin of each track with a visited state.
 
         Returns:
-            Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m), `curvature` (1/m) and
-            `section` of the bin's middle, number of `states`, and means of `agreement`, `intervention` and `gradient`.
+            Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m),
+            `curvature` (1/m) and `section` of the bin's middle, number of `states`, and means of
+            `agreement`, `intervention` and `gradient`.
         """
         bins = [self._bins(line) for line in self.lines]
         track, point = data.place["track"], data.place["point"]
-        bin_of_state = np.array([bins[index][p] for index, p in zip(track.tolist(), point.tolist(), strict=True)])
+        bin_of_state = np.array(
+            [bins[index][p] for index, p in zip(track.tolist(), point.tolist(), strict=True)]
+        )
         rows = []
         for row in data.means(track=track, bin=bin_of_state):
             index, line = row["track"], self.lines[row["track"]]
             within = np.flatnonzero(bins[index] == row["bin"])
             middle = within[len(within) // 2]
             step = np.linalg.norm(np.diff(line[: within[0] + 1], axis=0), axis=1)
-            rows.append(row | {
-                "track": self.tracks[index].name, "from": float(step.sum()), "x": float(line[middle, 0]),
-                "y": float(line[middle, 1]), "curvature": float(curvature(line)[middle]),
-                "section": SECTIONS[self.sections[index][middle]],
-            })  # fmt: skip
+            rows.append(
+                row
+                | {
+                    "track": self.tracks[index].name,
+                    "from": float(step.sum()),
+                    "x": float(line[middle, 0]),
+                    "y": float(line[middle, 1]),
+                    "curvature": float(curvature(line)[middle]),
+                    "section": SECTIONS[self.sections[index][middle]],
+                }
+            )
         return rows
 
     def measure_on_lines(
@@ -174,14 +206,22 @@ class TrackSections(WholeEpisode):
         lines: list[Array] = []
         values: dict[str, list[Array]] = {guide: [] for guide in data.guides}
         for middle_line, track in zip(self.lines, self.tracks, strict=True):
-            cars = [car for car, episode in enumerate(data.result.episodes) if episode["case"] == track.name]
+            cars = [
+                car
+                for car, episode in enumerate(data.result.episodes)
+                if episode["case"] == track.name
+            ]
             line = data.result.histories["pose"][cars[-1]][:, :2]
-            line = line[: max(1, len(line) - 1)]  # the last point is the position after the last measured state
+            line = line[
+                : max(1, len(line) - 1)
+            ]  # the last point is the position after the last measured state
             nearest = ((line[:, None] - middle_line) ** 2).sum(-1).argmin(1)
             bins = self._bins(middle_line)[nearest].tolist()
             lines.append(line)
             for guide in data.guides:
-                values[guide].append(np.array([means.get((track.name, guide, k), np.nan) for k in bins]))
+                values[guide].append(
+                    np.array([means.get((track.name, guide, k), np.nan) for k in bins])
+                )
         return lines, values
 
     def _bins(self, line: Array) -> NDArray[np.int64]:

@@ -49,7 +49,9 @@ class Survey:
         """
         rows = []
         for slot, guide in enumerate(self.guides):
-            table = pd.DataFrame({**groups, **{name: values[:, slot] for name, values in self.measures.items()}})
+            table = pd.DataFrame(
+                {**groups, **{name: values[:, slot] for name, values in self.measures.items()}}
+            )
             grouped = table.groupby(list(groups))
             means = grouped.size().rename("states").to_frame().join(grouped.mean()).reset_index()
             rows += [{"guide": guide} | row for row in means.to_dict("records")]
@@ -57,13 +59,19 @@ class Survey:
 
 
 def survey(
-    env: EnvBase, policy: TensorDictModuleBase, sections: WholeEpisode, evaluation: Evaluation, *, donors: int = 16,
-    seed: int = 0, tick: Callable[[], Any] | None = None,
-) -> Survey:  # fmt: skip
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    sections: WholeEpisode,
+    evaluation: Evaluation,
+    *,
+    donors: int = 16,
+    seed: int = 0,
+    tick: Callable[[], Any] | None = None,
+) -> Survey:
     """Evaluate the deterministic agent for one episode per row of an env [B], and measure in every visited state.
 
-    The agent reads `guide_action`. `donors` are as for `intervention`, the seed is theirs, and `tick` is called every
-    step.
+    The agent reads `guide_action`. `donors` are as for `intervention`, the seed is theirs, and
+    `tick` is called every step.
     """
     history: list[TensorDictBase] = []
 
@@ -75,7 +83,10 @@ def survey(
         return state
 
     recorder = InterceptedPolicy(policy, record)
-    sources = [recorder.advising, *(module for module in env.modules() if isinstance(module, GuideActions))]
+    sources = [
+        recorder.advising,
+        *(module for module in env.modules() if isinstance(module, GuideActions)),
+    ]
     guides = next((list(source.names) for source in sources if source is not None), None)
     if guides is None:
         raise ValueError("nothing writes guide_action: put GuideActions into the env")
@@ -114,24 +125,35 @@ class Ablation(NamedTuple):
 
 def ablations(guides: int, sections: int) -> list[Ablation]:
     """Return the removal of each guide everywhere and in each section, given their numbers."""
-    return [Ablation(guide, section) for guide in range(guides) for section in (None, *range(sections))]
+    return [
+        Ablation(guide, section) for guide in range(guides) for section in (None, *range(sections))
+    ]
 
 
 def drive_ablated(
-    env: EnvBase, policy: TensorDictModuleBase, sections: WholeEpisode, evaluation: Evaluation,
-    removed: Sequence[Ablation], replacement: Tensor, *, tick: Callable[[], Any] | None = None,
-) -> list[list[dict[str, Any]]]:  # fmt: skip
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    sections: WholeEpisode,
+    evaluation: Evaluation,
+    removed: Sequence[Ablation],
+    replacement: Tensor,
+    *,
+    tick: Callable[[], Any] | None = None,
+) -> list[list[dict[str, Any]]]:
     """Evaluate the deterministic agent with each ablation, all at the same time.
 
-    Removed advice is replaced by a constant, such as its mean: it carries no information and is not misleading, as
-    advice from other states would be.
+    Removed advice is replaced by a constant, such as its mean: it carries no information and is not
+    misleading, as advice from other states would be.
 
-    The arguments are those of `survey` and the `replacement` [n_guides, A]. Each ablation gets an equal share of the
-    rows of the env, in order. The result is the episodes of each ablation, as in `EvaluationResult`.
+    The arguments are those of `survey` and the `replacement` [n_guides, A]. Each ablation gets an
+    equal share of the rows of the env, in order. The result is the episodes of each ablation, as in
+    `EvaluationResult`.
     """
     rows = env.batch_size.numel()
     if not removed or rows % len(removed):
-        raise ValueError(f"{rows} rows cannot be divided among {len(removed)} ablations; give a multiple")
+        raise ValueError(
+            f"{rows} rows cannot be divided among {len(removed)} ablations; give a multiple"
+        )
     share = rows // len(removed)
     shape = len(removed), max(1, len(sections.names)), len(replacement)
     replaced = torch.zeros(shape, dtype=torch.bool, device=env.device)
@@ -157,20 +179,28 @@ def table_by_section(
     """Return one row per guide everywhere and in each section: means over states, and the effect of its removal.
 
     Returns:
-        Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`, `gradient`, and, with the
-        guide removed there, `lost` (return) and `completed` (share), if it is measured. Sections without a state are
-        left out.
+        Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`,
+        `gradient`, and, with the guide removed there, `lost` (return) and `completed` (share), if
+        it is measured. Sections without a state are left out.
     """
     intact = summarise(data.result.episodes, evaluation.measures)[-1]
     rows = []
     for (slot, section), episodes in ablated.items():
-        states = np.ones(len(data.section), dtype=bool) if section is None else data.section == section
+        states = (
+            np.ones(len(data.section), dtype=bool) if section is None else data.section == section
+        )
         if states.any():
             without = summarise(episodes, evaluation.measures)[-1]
             rows.append(
-                {"guide": data.guides[slot], "section": EVERYWHERE if section is None else sections.names[section]}
+                {
+                    "guide": data.guides[slot],
+                    "section": EVERYWHERE if section is None else sections.names[section],
+                }
                 | {"share": float(states.mean())}
-                | {name: float(values[states, slot].mean()) for name, values in data.measures.items()}
+                | {
+                    name: float(values[states, slot].mean())
+                    for name, values in data.measures.items()
+                }
                 | {"lost": intact["reward"] - without["reward"]}
                 | ({"completed": without["completed"]} if "completed" in without else {})
             )

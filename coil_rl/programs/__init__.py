@@ -14,7 +14,10 @@ def interrupted(signum: int, frame: FrameType | None) -> NoReturn:
     os._exit(130)
 
 
-# Only in a process of a program: coil-NAME, or python -m, which has set no name yet. `app.program` ends it.
+# Only in a process of a program: coil-NAME, or python -m, which has set no name yet. `app.program`
+# ends it.
 _name = Path(sys.argv[0]).name if sys.argv else ""
-if (_name == "-m" or _name.startswith("coil-")) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+if (_name == "-m" or _name.startswith("coil-")) and signal.getsignal(
+    signal.SIGINT
+) is signal.default_int_handler:
     signal.signal(signal.SIGINT, interrupted)

@@ -1,7 +1,7 @@
 """Frame of the console programs: Hydra composes the configuration, and a mistake of the user becomes one sentence.
 
-A program imports torch, and whatever imports it, inside its functions. Help texts and wrong overrides then take a
-second:
+A program imports torch, and whatever imports it, inside its functions. Help texts and wrong
+overrides then take a second:
 
     def train(config: DictConfig) -> float:
         from coil_rl.train.run import run
@@ -38,7 +38,11 @@ from coil_rl.errors import UserError, is_no_bug, sentence
 from coil_rl.train.trust import trust_packages
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
-HYDRA_FILES = ("config.yaml", "hydra.yaml", "overrides.yaml")  # in the subfolder hydra.output_subdir of a job
+HYDRA_FILES = (
+    "config.yaml",
+    "hydra.yaml",
+    "overrides.yaml",
+)  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
 
@@ -79,13 +83,15 @@ def overrides() -> list[tuple[str, str]]:
 def check_used(used: Iterable[str], reason: str) -> None:
     """Raise a `UserError` for an override that has no effect.
 
-    `used` are the top-level keys that have one, besides those of every program that drives; `reason` is why others do
-    not.
+    `used` are the top-level keys that have one, besides those of every program that drives;
+    `reason` is why others do not.
     """
     known = (*used, *COMMON_KEYS)
     for key, text in overrides():
         if re.split(r"[./]", key)[0] not in known:
-            raise UserError(f"{text} has no effect: {reason}; what can be changed is {', '.join(known)}")
+            raise UserError(
+                f"{text} has no effect: {reason}; what can be changed is {', '.join(known)}"
+            )
 
 
 def check_run(config: DictConfig) -> None:
@@ -100,7 +106,11 @@ def check_run(config: DictConfig) -> None:
     check(config)
 
 
-def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[DictConfig], None] = check_run) -> None:
+def run(
+    task: Callable[[DictConfig], Any],
+    config_name: str,
+    check: Callable[[DictConfig], None] = check_run,
+) -> None:
     """Run a task as a program after a check of its configuration; `config_name` is also the name of the program."""
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
@@ -118,16 +128,28 @@ def run(task: Callable[[DictConfig], Any], config_name: str, check: Callable[[Di
             return task(config)
         except Exception as error:
             if is_no_bug(error):
-                refuse(config_name, error)  # here, because Hydra prints a line of its own for an error of the task
+                refuse(
+                    config_name, error
+                )  # here, because Hydra prints a line of its own for an error of the task
             bugs.append(error)
             raise
 
     with program(config_name):
         _check_options(config_name)
         try:
-            hydra.main(version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name)(checked)()
-        except (HydraException, ValueError, OSError, yaml.YAMLError, AssertionError, TypeError) as error:
-            # Outside of the task these errors come from the command line and the configuration files.
+            hydra.main(
+                version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name
+            )(checked)()
+        except (
+            HydraException,
+            ValueError,
+            OSError,
+            yaml.YAMLError,
+            AssertionError,
+            TypeError,
+        ) as error:
+            # Outside of the task these errors come from the command line and the configuration
+            # files.
             if error in bugs:
                 raise
             refuse(config_name, error)
@@ -167,7 +189,12 @@ def refuse(name: str, error: Exception) -> NoReturn:
     """End the program with one sentence and exit code 2, and remove new folders that hold no files of the task."""
     for folder in filter(os.path.exists, _new_folders):  # a name may be too long for one
         inside = {path for path in folder.rglob("*") if not path.is_dir()}
-        of_jobs = {path.with_name(name) for path in inside if path.name == "hydra.yaml" for name in HYDRA_FILES}
+        of_jobs = {
+            path.with_name(name)
+            for path in inside
+            if path.name == "hydra.yaml"
+            for name in HYDRA_FILES
+        }
         if all(path.name == "multirun.yaml" or path in of_jobs for path in inside):
             shutil.rmtree(folder, ignore_errors=True)
     _new_folders.clear()
@@ -180,7 +207,10 @@ def _check_options(config_name: str) -> None:
     parser = get_args_parser()
 
     def error(message: str) -> None:
-        refuse(config_name, UserError(f"{message}; options such as -m come first, then KEY=VALUE (see --help)"))
+        refuse(
+            config_name,
+            UserError(f"{message}; options such as -m come first, then KEY=VALUE (see --help)"),
+        )
 
     vars(parser)["error"] = error
     for override in parser.parse_args().overrides:

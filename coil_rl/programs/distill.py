@@ -21,10 +21,17 @@ def distill(config: DictConfig) -> float:
         proxy_config = distillation.proxy_config(config, name)
         reward = run(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])
-        learned = {name.removeprefix("learner/"): value for name, value in finished.curve[-1].items()}
+        learned = {
+            name.removeprefix("learner/"): value for name, value in finished.curve[-1].items()
+        }
         means = finished.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
         guide, proxy = means.iloc[0], means.iloc[-1]
-        row = {"guide": name, "reward": reward, "guide_reward": guide["reward"], "completed": proxy["completed"]}
+        row = {
+            "guide": name,
+            "reward": reward,
+            "guide_reward": guide["reward"],
+            "completed": proxy["completed"],
+        }
         table.append(learned | row | {"folder": str(finished.folder)})
     print(markdown_table(table, TABLES["proxies"]["columns"]))
     worst = min(table, key=lambda row: row["reward"])

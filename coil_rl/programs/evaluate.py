@@ -14,7 +14,13 @@ from coil_rl.programs import app
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
 OF_A_RUN = ("run", "track", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
-OWN = ("repeats", "policy", "gif", "advice", "fallback")  # keys of `evaluation` of the command, not of the run
+OWN = (
+    "repeats",
+    "policy",
+    "gif",
+    "advice",
+    "fallback",
+)  # keys of `evaluation` of the command, not of the run
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 if TYPE_CHECKING:
@@ -39,8 +45,8 @@ def evaluate(config: DictConfig) -> float:
 def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
     """Return the configuration of a run with the requested evaluation, and its policy.
 
-    Everything is as in the run but for what the command line gives. A folder without a complete run, or one without
-    tracks although tracks are given, is a `UserError`.
+    Everything is as in the run but for what the command line gives. A folder without a complete
+    run, or one without tracks although tracks are given, is a `UserError`.
     """
     from coil_rl.errors import UserError
     from coil_rl.train.build import build_env
@@ -64,7 +70,9 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
             changed.append(key.removeprefix("evaluation."))
     values = OmegaConf.create(resolved["evaluation"])
     for key in changed:
-        OmegaConf.update(config.evaluation, key, OmegaConf.select(values, key), merge=False, force_add=True)
+        OmegaConf.update(
+            config.evaluation, key, OmegaConf.select(values, key), merge=False, force_add=True
+        )
     if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
         config.evaluation.env["cases"] = config.evaluation.cases
     check_values(config)
@@ -78,7 +86,11 @@ def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | N
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
     given = config.run is not None
-    reason = f"run={config.run} has its own configuration" if given else "a guide is evaluated without an agent"
+    reason = (
+        f"run={config.run} has its own configuration"
+        if given
+        else "a guide is evaluated without an agent"
+    )
     app.check_used(OF_A_RUN if given else OF_GUIDES, reason)
     app.check_run(config)
 

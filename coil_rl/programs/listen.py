@@ -31,7 +31,9 @@ def listen(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     run, agent = restore(Path(config.run), config)
     if agent is None:
-        raise UserError(f"run={config.run} has no agent, only a guide; give a run of an agent that observes advice")
+        raise UserError(
+            f"run={config.run} has no agent, only a guide; give a run of an agent that observes advice"
+        )
     try:
         split_policy(agent)
     except ValueError as error:
@@ -44,13 +46,25 @@ def listen(config: DictConfig) -> None:
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
         env = build_env(run, {**run.evaluation.env, "num_envs": rows})
-        data = surveys.survey(env, agent, sections, evaluation, donors=config.donors, seed=config.seed, tick=bar.update)
+        data = surveys.survey(
+            env,
+            agent,
+            sections,
+            evaluation,
+            donors=config.donors,
+            seed=config.seed,
+            tick=bar.update,
+        )
         removed = surveys.ablations(len(data.guides), len(sections.names))
         bar.set_postfix_str("one guide removed")
         env = build_env(run, {**run.evaluation.env, "num_envs": rows * len(removed)})
         mean_advice = data.advice.mean(0)
-        episodes = surveys.drive_ablated(env, agent, sections, evaluation, removed, mean_advice, tick=bar.update)
-    table = surveys.table_by_section(data, sections, evaluation, dict(zip(removed, episodes, strict=True)))
+        episodes = surveys.drive_ablated(
+            env, agent, sections, evaluation, removed, mean_advice, tick=bar.update
+        )
+    table = surveys.table_by_section(
+        data, sections, evaluation, dict(zip(removed, episodes, strict=True))
+    )
     texts = TABLES["listening"]
     columns = {key: column for key, column in texts["columns"].items() if key in table[0]}
     kind = "continuous"
@@ -60,7 +74,11 @@ def listen(config: DictConfig) -> None:
     notes = f"{texts['notes']} {texts[kind]}"
     for head in (part for part in agent.modules() if isinstance(part, AnchoredHead)):
         weights = zip(data.guides, head.weight.tolist(), strict=True)
-        notes += "\nWeight of the anchor: " + ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights) + "."
+        notes += (
+            "\nWeight of the anchor: "
+            + ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights)
+            + "."
+        )
     page = f"{markdown_table(table, columns)}\n\n{notes}"
     write_text(folder / "listening.md", page)
     write_csv(table, folder / "listening_sections.csv")
@@ -74,14 +92,20 @@ def _summary(label: str, table: list[dict[str, Any]]) -> str:
     best = max(means, key=lambda guide: means[guide])
     rows = [row for row in table if row["guide"] == best and row["section"] != "everywhere"]
     where = max(rows, key=lambda row: row["intervention"], default=None)
-    there = f", and by {where['intervention']:.4f} in the section {where['section']}" if where else ""
-    others = "".join(f"; {guide} changes it by {change:.4f}" for guide, change in means.items() if guide != best)
+    there = (
+        f", and by {where['intervention']:.4f} in the section {where['section']}" if where else ""
+    )
+    others = "".join(
+        f"; {guide} changes it by {change:.4f}" for guide, change in means.items() if guide != best
+    )
     return f"{label} depends most on {best}: other advice of it changes the action by {means[best]:.4f}{there}{others}"
 
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    app.check_used(("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration")
+    app.check_used(
+        ("run", "track", "evaluation", "donors"), f"run={config.run} has its own configuration"
+    )
     app.check_run(config)
 
 

@@ -42,7 +42,9 @@ def replay(config: DictConfig) -> None:
         env = build(config.env, "env", McapReplayEnv)
     _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)
-    with tqdm(total=int(env.length.max()) * len(policies), unit="scan", desc="replay", leave=False) as bar:
+    with tqdm(
+        total=int(env.length.max()) * len(policies), unit="scan", desc="replay", leave=False
+    ) as bar:
 
         def tick(name: str) -> None:
             bar.set_postfix_str(name, refresh=False)
@@ -52,12 +54,16 @@ def replay(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     names = _numbered([result.recording.path.name.removesuffix(".mcap") for result in results])
     folders = [folder / name for name in names] if len(names) > 1 else [folder]
-    for destination, result in zip(tqdm(folders, unit="recording", desc="write", leave=False), results, strict=True):
+    for destination, result in zip(
+        tqdm(folders, unit="recording", desc="write", leave=False), results, strict=True
+    ):
         _write(config, result, runs, destination)
     sources = [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
     cautions = [text for result in results if (text := caution(result, env.perception))]
     notes = TABLES["replay"]["notes"].format(max_steering=math.degrees(env.max_steering))
-    text = "\n\n".join([*map(describe, results), *(f"Warning: {each}." for each in cautions), *sources, notes])
+    text = "\n\n".join(
+        [*map(describe, results), *(f"Warning: {each}." for each in cautions), *sources, notes]
+    )
     write_text(folder / "replay.md", text)
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):
@@ -83,10 +89,16 @@ def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Polici
     guide_names = [_topic_name(name) for name in guides]
     run_names = _run_names([run.label for run in configs], [run.seed for run in configs])
     if (repeated := _first_repeated([RECORDED, *guide_names, *run_names])) is not None:
-        raise UserError(f"two policies would be called {repeated}; leave one out, or give the guide another name")
+        raise UserError(
+            f"two policies would be called {repeated}; leave one out, or give the guide another name"
+        )
     runs = dict(zip(run_names, zip(folders, configs, strict=True), strict=True))
-    agents = {name: load_policy_in_env(run, own, env, config.policy) for name, (run, own) in runs.items()}
-    return runs, {name: (env, guide) for name, guide in zip(guide_names, guides.values(), strict=True)} | agents
+    agents = {
+        name: load_policy_in_env(run, own, env, config.policy) for name, (run, own) in runs.items()
+    }
+    return runs, {
+        name: (env, guide) for name, guide in zip(guide_names, guides.values(), strict=True)
+    } | agents
 
 
 def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> None:
@@ -103,7 +115,9 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     attachments = {"config.yaml": OmegaConf.to_yaml(settings, resolve=True).encode()}
     inputs = {"config": attachments["config.yaml"]}
     for name, (run, _) in runs.items():
-        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = (run / "config.yaml").read_bytes()
+        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = (
+            run / "config.yaml"
+        ).read_bytes()
         inputs[f"{name}_checkpoint"] = weights_file(run, config.policy).read_bytes()
     annotate(
         result,
@@ -112,10 +126,16 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
         speed=robot.speed,
         scale=OmegaConf.select(robot, "perception.scale", default=7.0),
         laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
-        about={f"{name}_sha256": hashlib.sha256(content).hexdigest() for name, content in inputs.items()},
+        about={
+            f"{name}_sha256": hashlib.sha256(content).hexdigest()
+            for name, content in inputs.items()
+        },
         attachments=attachments,
     )
-    write_text(folder / "foxglove_layout.json", foxglove_layout(result, scan=robot.scan, command=robot.command))
+    write_text(
+        folder / "foxglove_layout.json",
+        foxglove_layout(result, scan=robot.scan, command=robot.command),
+    )
     write_csv(over_time(result), folder / "steering.csv")
     simulated = " (simulated)" if result.recording.simulated else ""
     draw_steering(result, folder / "steering.png", title=f"{result.recording.path.name}{simulated}")
@@ -131,12 +151,17 @@ def _run_names(labels: Sequence[str], seeds: Sequence[int]) -> list[str]:
     """Return the labels of runs; the seed is appended to equal labels, then a number to equal names."""
     names = [_topic_name(label) for label in labels]
     seeded = zip(names, seeds, strict=True)
-    return _numbered([f"{name}_seed{seed}" if names.count(name) > 1 else name for name, seed in seeded])
+    return _numbered(
+        [f"{name}_seed{seed}" if names.count(name) > 1 else name for name, seed in seeded]
+    )
 
 
 def _numbered(names: Sequence[str]) -> list[str]:
     """Return the names, with a number appended to equal ones."""
-    return [f"{name}_{names[: n + 1].count(name)}" if names.count(name) > 1 else name for n, name in enumerate(names)]
+    return [
+        f"{name}_{names[: n + 1].count(name)}" if names.count(name) > 1 else name
+        for n, name in enumerate(names)
+    ]
 
 
 def _first_repeated(names: Sequence[str]) -> str | None:
@@ -154,7 +179,9 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if config.recording is None:
-        raise UserError("recording must be an MCAP file or a rosbag2 folder, or a list of them: recording=FILE")
+        raise UserError(
+            "recording must be an MCAP file or a rosbag2 folder, or a list of them: recording=FILE"
+        )
     if not config.guide and not config.runs:
         raise UserError("there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]")
     make_folder(Path(config.run_dir))

@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from coil_rl.report.comparison import Comparison
     from coil_rl.report.runs import Run
 
-ACTIONS = {"deterministic": ("deterministic",), "sampled": ("sampled",), "both": ("deterministic", "sampled")}
+ACTIONS = {
+    "deterministic": ("deterministic",),
+    "sampled": ("sampled",),
+    "both": ("deterministic", "sampled"),
+}
 DEFAULT_AGAINST = "ppo"
 MAX_CURVES = 8  # in one plot
 
@@ -38,7 +42,10 @@ def report(config: DictConfig) -> None:
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}
-    parts = [page.section(f"{kind.capitalize()} actions", compared[kind], tables[kind], against) for kind in compared]
+    parts = [
+        page.section(f"{kind.capitalize()} actions", compared[kind], tables[kind], against)
+        for kind in compared
+    ]
     parts += [*page.training(finished), *page.guide_training(finished)]
     normalised = any(comparison.normalised for comparison in compared.values())
     notes = page.notes(against, normalised, "sampled" in compared)
@@ -48,10 +55,19 @@ def report(config: DictConfig) -> None:
     write_text(folder / "report.md", text)
     cases = {actions: comparison.case_table() for actions, comparison in compared.items()}
     for name, by_actions in {"report.csv": tables, "report_cases.csv": cases}.items():
-        rows = [{"actions": actions} | row for actions, table in by_actions.items() for row in table]
+        rows = [
+            {"actions": actions} | row for actions, table in by_actions.items() for row in table
+        ]
         write_csv(rows, folder / name)
-    panels = {f"{kind} actions": driver_intervals(each.agents or each.guides) for kind, each in compared.items()}
-    draw_intervals(panels, folder / "report.png", measure="reward / guide's (mean)" if normalised else "reward (mean)")
+    panels = {
+        f"{kind} actions": driver_intervals(each.agents or each.guides)
+        for kind, each in compared.items()
+    }
+    draw_intervals(
+        panels,
+        folder / "report.png",
+        measure="reward / guide's (mean)" if normalised else "reward (mean)",
+    )
     _draw_curves(finished, next(iter(compared.values())), folder / "report_curves.png")
     print(f"{text}\nreport: see {folder}")
 
@@ -73,7 +89,9 @@ def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> Non
     if several_guides or len(curves) > MAX_CURVES:
         draw_curve_grid(curves, path, guides=guides)
     elif curves:
-        draw_learning_curves(curves, path, guides={"guide": next(iter(guides.values()))} if guides else {})
+        draw_learning_curves(
+            curves, path, guides={"guide": next(iter(guides.values()))} if guides else {}
+        )
 
 
 def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:
@@ -91,7 +109,9 @@ def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | Non
 def _folders(config: DictConfig) -> list[Path]:
     given = list(config.folder) if isinstance(config.folder, ListConfig) else [config.folder]
     if not given or not all(isinstance(folder, str) and folder for folder in given):
-        raise UserError(f"folder={config.folder} must be a folder, or a list of them: folder=[ONE,OTHER]")
+        raise UserError(
+            f"folder={config.folder} must be a folder, or a list of them: folder=[ONE,OTHER]"
+        )
     return [Path(folder).expanduser() for folder in given]
 
 
@@ -104,10 +124,14 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError("a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]")
+        raise UserError(
+            "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
+        )
     first = _folders(config)[0]
     if first.is_dir() and not os.access(first, os.W_OK):
-        raise UserError(f"folder={first} is not writable; put a writable folder first: folder=[YOURS,{first}]")
+        raise UserError(
+            f"folder={first} is not writable; put a writable folder first: folder=[YOURS,{first}]"
+        )
 
 
 main = partial(app.run, report, "report", check)

@@ -37,7 +37,9 @@ def reproduce(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     # Build all results before the first run, so that mistakes cost seconds.
-    results = {name: build(config.results[name], f"results.{name}", Result) for name in requested(config)}
+    results = {
+        name: build(config.results[name], f"results.{name}", Result) for name in requested(config)
+    }
     runs = trained_runs(config, list(results.values()))
     note = config.budgets[config.budget].note
     for name, result in results.items():
@@ -47,7 +49,10 @@ def reproduce(config: DictConfig) -> None:
         write_text(folder / f"{name}.md", text)
         print(text)
     files = {str(name): folder / f"{name}.md" for name in config.results}
-    texts = {name: path.read_text(encoding="utf-8") if path.exists() else None for name, path in files.items()}
+    texts = {
+        name: path.read_text(encoding="utf-8") if path.exists() else None
+        for name, path in files.items()
+    }
     commands = {name: command(config, _key(name), name) for name in files}
     everything, problems = command(config, "all=true"), config.known_problems
     index = pages.all_results(texts, commands, everything, note, problems, config.not_reproduced)
@@ -67,7 +72,9 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
             [*budget.every, *budget.only.get(name, []), *config.train],
             range(budget.seeds_of.get(name, budget.seeds)),
         )
-        for name in dict.fromkeys(experiment for result in results for experiment in result.experiments)
+        for name in dict.fromkeys(
+            experiment for result in results for experiment in result.experiments
+        )
     ]
     launcher = [word for word in HydraConfig.get().overrides.hydra if word.startswith(LAUNCHER)]
     for sweep in planned:
@@ -87,12 +94,18 @@ def requested(config: DictConfig) -> list[str]:
         for key in (f"{kind}={value}" for value in values if value is not None):
             for what, numbers in config.other_figures.items():
                 if key in [f"figure={number}" for number in numbers]:
-                    raise UserError(f"{key} is {what}, which is not reproduced; there are {', '.join(available)}")
+                    raise UserError(
+                        f"{key} is {what}, which is not reproduced; there are {', '.join(available)}"
+                    )
             if key not in available:
-                raise UserError(f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}")
+                raise UserError(
+                    f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}"
+                )
             names.append(available[key])
     if not names:
-        raise UserError(f"nothing is requested; give one of {', '.join(available)}, or several, or all=true")
+        raise UserError(
+            f"nothing is requested; give one of {', '.join(available)}, or several, or all=true"
+        )
     return list(dict.fromkeys(names))
 
 
@@ -103,7 +116,9 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
     options = []
     for word in HydraConfig.get().overrides.task:
         option = word.lstrip("+~")  # Hydra's signs for adding and deleting a key
-        if not word.startswith(requests) and (not option.startswith("results.") or option.startswith(own)):
+        if not word.startswith(requests) and (
+            not option.startswith("results.") or option.startswith(own)
+        ):
             options.append(word)
     return shlex.join(["coil-reproduce", key, f"budget={config.budget}", *options])
 
@@ -114,10 +129,14 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError("results are made one after the other; leave out -m, and request several as in table=[1,4]")
+        raise UserError(
+            "results are made one after the other; leave out -m, and request several as in table=[1,4]"
+        )
     if config.budget not in config.budgets:
         names = list(config.budgets)
-        raise UserError(f"budget={config.budget} must be one of {', '.join(names)}{did_you_mean(config.budget, names)}")
+        raise UserError(
+            f"budget={config.budget} must be one of {', '.join(names)}{did_you_mean(config.budget, names)}"
+        )
     requested(config)
 
 

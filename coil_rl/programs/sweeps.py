@@ -1,7 +1,8 @@
 """Training runs of an experiment file: their folders, and the sweep of `coil-train` that does the missing ones.
 
-The folder of a run contains its fingerprint (`hydra.sweep.subdir` of the file), so that a finished run is found again.
-The experiment files set `existing=resume`: in a repeated sweep a finished run returns at once.
+The folder of a run contains its fingerprint (`hydra.sweep.subdir` of the file), so that a finished
+run is found again. The experiment files set `existing=resume`: in a repeated sweep a finished run
+returns at once.
 """
 
 import shlex
@@ -46,7 +47,9 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
     if not params:
         raise UserError(f"experiment={experiment} has no hydra.sweeper.params: it is no sweep")
     params.pop("seed", None)
-    parsed = OverridesParser.create().parse_overrides([f"{key}={value}" for key, value in params.items()])
+    parsed = OverridesParser.create().parse_overrides(
+        [f"{key}={value}" for key, value in params.items()]
+    )
     (choices,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
     seeds, folders = list(seeds), []
     for choice in choices:
@@ -67,16 +70,21 @@ def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
     print(f"{sweep.experiment}: {count}\n{shlex.join(['coil-train', *command])}", file=sys.stderr)
     if code := start(command):
         remedy = "correct the cause and give the same command again: finished runs are kept"
-        raise UserError(f"the sweep of {sweep.experiment} ended with exit code {code}, see above; {remedy}")
+        raise UserError(
+            f"the sweep of {sweep.experiment} ended with exit code {code}, see above; {remedy}"
+        )
     if missing := sweep.missing:
-        raise UserError(f"{len(missing)} runs of {sweep.experiment} are still missing, the first is {missing[0]}")
+        raise UserError(
+            f"{len(missing)} runs of {sweep.experiment} are still missing, the first is {missing[0]}"
+        )
 
 
 def start(arguments: Sequence[str]) -> int:
     """Run `coil-train` in a process of its own, so that any launcher works, and return the exit code."""
     command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]
     try:
-        # Progress and errors are on standard error; the tables of the runs are not of interest here.
+        # Progress and errors are on standard error; the tables of the runs are not of interest
+        # here.
         return subprocess.run(command, stdout=subprocess.DEVNULL, check=False).returncode
     except KeyboardInterrupt:
         raise KeyboardInterrupt("give the same command again to continue") from None
@@ -86,4 +94,6 @@ def _composed(experiment: str, *overrides: str) -> Any:
     try:
         return compose("train", [f"+experiment={experiment}", *overrides], return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:
-        raise UserError(f"coil-train +experiment={experiment} {' '.join(overrides)}: {sentence(error)}") from error
+        raise UserError(
+            f"coil-train +experiment={experiment} {' '.join(overrides)}: {sentence(error)}"
+        ) from error

@@ -16,14 +16,17 @@ def train(config: DictConfig) -> float:
     from coil_rl.train.run import run
 
     if config.resume is not None:
-        raise UserError(f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER")
+        raise UserError(
+            f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
+        )
     return run(config)
 
 
 def resume(folder: Path) -> float:
     """Finish a run that was stopped, and return the same as `train`.
 
-    A folder without a run, or one that cannot be resumed or would write outside of its folder, is a `UserError`.
+    A folder without a run, or one that cannot be resumed or would write outside of its folder, is a
+    `UserError`.
     """
     from coil_rl.train.check import check
     from coil_rl.train.run import resume_run
@@ -56,10 +59,16 @@ def main() -> None:
     # Without Hydra, which would compose another configuration and make another folder.
     with app.program("train"):
         trust = [argument for argument in arguments if argument.startswith("trust=")]
-        if others := " ".join(argument for argument in arguments if argument not in (resumed, *trust)):
-            problem = f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml"
+        if others := " ".join(
+            argument for argument in arguments if argument not in (resumed, *trust)
+        ):
+            problem = (
+                f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml"
+            )
             raise UserError(f"{problem}; leave out {others}")
-        trust_packages(OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(trust)).trust)
+        trust_packages(
+            OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(trust)).trust
+        )
         resume(Path(resumed.removeprefix("resume=")).expanduser())
 
 

@@ -18,28 +18,41 @@ from coil_rl.envs.track import SIDES
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import style
 
-MARKERS, FLOAT, BOOL = "visualization_msgs/msg/MarkerArray", "std_msgs/msg/Float64", "std_msgs/msg/Bool"
+MARKERS, FLOAT, BOOL = (
+    "visualization_msgs/msg/MarkerArray",
+    "std_msgs/msg/Float64",
+    "std_msgs/msg/Bool",
+)
 CYLINDER, LINE_STRIP, DELETE_ALL = 3, 4, 3
 COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
 DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
 CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
 FADED = 0.3  # opacity of a boundary from the memory
 
-ROSBAG2 = "rosbag2"  # metadata record with the numbers of messages in the original, which the copy does not have
+# metadata record with the numbers of messages in the original, which the copy does not have
+ROSBAG2 = "rosbag2"
 TRANSFORMS = ("/tf", "/tf_static")
 POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
 
 
 def annotate(
-    result: OpenLoop, path: Path, *, topics: Collection[str], speed: float, scale: float, laser_yaw: float = 0.0,
-    about: Mapping[str, str], attachments: Mapping[str, bytes],
-) -> None:  # fmt: skip
+    result: OpenLoop,
+    path: Path,
+    *,
+    topics: Collection[str],
+    speed: float,
+    scale: float,
+    laser_yaw: float = 0.0,
+    about: Mapping[str, str],
+    attachments: Mapping[str, bytes],
+) -> None:
     """Write a recording with the steering of each policy and the perceived cones and boundaries.
 
-    Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones` (yellow left, blue
-    right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log times of the scans. Markers have the stamp
-    and the frame of the scan. A boundary from the memory is faded. Metadata and attachments are copied. Equal results
-    make equal bytes. A recording that can no longer be read is a `RecordingError`.
+    Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones`
+    (yellow left, blue right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log
+    times of the scans. Markers have the stamp and the frame of the scan. A boundary from the memory
+    is faded. Metadata and attachments are copied. Equal results make equal bytes. A recording that
+    can no longer be read is a `RecordingError`.
 
     Args:
         result: of one recording.
@@ -48,7 +61,8 @@ def annotate(
         speed: m/s of the robot, for the commands.
         scale: factor from the robot's metres to those of the cone world.
         laser_yaw: radians, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
-        about: entries of the metadata record `coil`, to which the SHA-256 of the recording is added.
+        about: entries of the metadata record `coil`, to which the SHA-256 of the recording is
+            added.
         attachments: YAML files by name.
     """
     recording = result.recording
@@ -66,7 +80,9 @@ def annotate(
         for policy in result.policies:
             steering = result.steering[policy]
             angles = steering.action * result.max_steering
-            for time, angle, turn_rate in zip(times, angles.tolist(), steering.omega.tolist(), strict=True):
+            for time, angle, turn_rate in zip(
+                times, angles.tolist(), steering.omega.tolist(), strict=True
+            ):
                 writer.add(f"/coil/{policy}/steering", FLOAT, time, {"data": angle})
                 writer.add(f"/coil/{policy}/cmd_vel", TWIST, time, twist(speed, turn_rate))
         _add_view(writer, result, laser_yaw, scale)
@@ -85,26 +101,43 @@ def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale
     cones = result.cones @ to_laser
     ever_valid = np.logical_or.accumulate(result.valid, axis=0)
     recording = result.recording
-    for row, (time, stamp) in enumerate(zip(recording.log_time.tolist(), recording.stamp.tolist(), strict=True)):
+    for row, (time, stamp) in enumerate(
+        zip(recording.log_time.tolist(), recording.stamp.tolist(), strict=True)
+    ):
         top = header(stamp, recording.frame)
         cone_markers, line_markers = ([{"header": top, "action": DELETE_ALL}] for _ in range(2))
         for side, name in enumerate(SIDES):
             size = {"x": DIAMETERS[name], "y": DIAMETERS[name], "z": CONE_HEIGHT}
             for number, (x, y) in enumerate(cones[row, side, : result.count[row, side]].tolist()):
-                pose = {"position": {"x": x, "y": y, "z": CONE_HEIGHT / 2}, "orientation": {"w": 1.0}}
-                cone_markers.append(_marker(top, name, CYLINDER, 1.0, id=number, pose=pose, scale=size))
+                pose = {
+                    "position": {"x": x, "y": y, "z": CONE_HEIGHT / 2},
+                    "orientation": {"w": 1.0},
+                }
+                cone_markers.append(
+                    _marker(top, name, CYLINDER, 1.0, id=number, pose=pose, scale=size)
+                )
             if ever_valid[row, side]:
                 opacity = 1.0 if result.valid[row, side] else FADED
                 points = [{"x": x, "y": y} for x, y in lines[row, side].tolist()]
                 pose, size = {"orientation": {"w": 1.0}}, {"x": LINE_WIDTH}
-                line_markers.append(_marker(top, name, LINE_STRIP, opacity, pose=pose, scale=size, points=points))
+                line_markers.append(
+                    _marker(top, name, LINE_STRIP, opacity, pose=pose, scale=size, points=points)
+                )
         writer.add("/coil/cones", MARKERS, time, {"markers": cone_markers})
         writer.add("/coil/boundary", MARKERS, time, {"markers": line_markers})
         writer.add("/coil/valid", BOOL, time, {"data": bool(result.both_valid[row])})
 
 
-def _marker(top: dict[str, Any], side: str, kind: int, opacity: float, **fields: Any) -> dict[str, Any]:
-    return {"header": top, "ns": side, "type": kind, "color": COLOURS[side] | {"a": opacity}, **fields}
+def _marker(
+    top: dict[str, Any], side: str, kind: int, opacity: float, **fields: Any
+) -> dict[str, Any]:
+    return {
+        "header": top,
+        "ns": side,
+        "type": kind,
+        "color": COLOURS[side] | {"a": opacity},
+        **fields,
+    }
 
 
 def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:
@@ -115,18 +148,29 @@ def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None =
         if name.startswith("3D!"):
             # Old drivers write frames with a leading slash, Foxglove does not.
             panel["followTf"] = result.recording.frame.removeprefix("/")
-            panel["topics"] = {scan if topic == SCAN else topic: value for topic, value in panel["topics"].items()}
+            panel["topics"] = {
+                scan if topic == SCAN else topic: value for topic, value in panel["topics"].items()
+            }
         elif name.startswith("Plot!"):
-            panel["paths"] = [line for path in panel["paths"] for line in _plot_lines(path, result, command)]
+            panel["paths"] = [
+                line for path in panel["paths"] for line in _plot_lines(path, result, command)
+            ]
     return json.dumps(layout, indent=2) + "\n"
 
 
-def _plot_lines(path: Mapping[str, Any], result: OpenLoop, command: str | None) -> list[dict[str, Any]]:
+def _plot_lines(
+    path: Mapping[str, Any], result: OpenLoop, command: str | None
+) -> list[dict[str, Any]]:
     """Return the lines for a path of the shipped layout: one per policy, or the recorded commands if there are any."""
     if POLICY in path["value"]:
         colours = style.strong_strokes(result.policies)
         return [
-            {**path, "value": path["value"].replace(POLICY, policy), "label": policy, "color": colours[policy].colour}
+            {
+                **path,
+                "value": path["value"].replace(POLICY, policy),
+                "label": policy,
+                "color": colours[policy].colour,
+            }
             for policy in result.policies
         ]
     if command is None or RECORDED not in result.steering:

@@ -20,7 +20,8 @@ STEERING_KEYS = (("next", "steering"), ("next", "omega"), ("next", "info", "smoo
 VIEW_KEYS = ("cones", "cone_count", "observation", ("info", "valid"))
 
 Floats = NDArray[np.float64]
-# By name: the replay env with the transforms of the policy, and the policy. All share one replay env.
+# By name: the replay env with the transforms of the policy, and the policy. All share one replay
+# env.
 Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 
 
@@ -28,7 +29,8 @@ Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 class Steering:
     """Steering of one policy at each of N scans, [N] each."""
 
-    action: Floats  # the steering that reaches the robot, as a fraction of the maximum, positive to the left
+    # the steering that reaches the robot, as a fraction of the maximum, positive to the left
+    action: Floats
     omega: Floats  # radians/s, the turn rate at that steering
     smoothness: Floats  # |a - a_avg|, as in the cone world
 
@@ -38,11 +40,15 @@ class OpenLoop:
     """Result for one recording of N scans."""
 
     recording: Recording
-    cones: NDArray[np.float32]  # [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first
+    cones: NDArray[
+        np.float32
+    ]  # [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first
     count: NDArray[np.int64]  # [N, 2], of the cones
     observation: NDArray[np.float32]  # [N, 20]
     valid: NDArray[np.bool_]  # [N, 2] whether each side is valid in the scan
-    steering: dict[str, Steering]  # by policy; `recorded_steering` is last, as `RECORDED`, if there are commands
+    steering: dict[
+        str, Steering
+    ]  # by policy; `recorded_steering` is last, as `RECORDED`, if there are commands
     max_steering: float  # radians of an action of 1
 
     @property
@@ -58,11 +64,16 @@ class OpenLoop:
 
 @torch.no_grad()
 def open_loop(
-    env: McapReplayEnv, policies: Policies, *, seed: int = 0, tick: Callable[[str], Any] | None = None
+    env: McapReplayEnv,
+    policies: Policies,
+    *,
+    seed: int = 0,
+    tick: Callable[[str], Any] | None = None,
 ) -> list[OpenLoop]:
     """Return the result of each recording of an env without transforms. Each policy observes its own last action.
 
-    The seed of PyTorch's generator is set again for each policy. `tick` is called with its name after every scan.
+    The seed of PyTorch's generator is set again for each policy. `tick` is called with its name
+    after every scan.
     """
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}
@@ -75,7 +86,9 @@ def open_loop(
 
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             policy_env, policy = policy_env.eval(), policy.eval()
-            rollouts[name] = policy_env.rollout(scans, policy, callback=after_scan, break_when_any_done=False).cpu()
+            rollouts[name] = policy_env.rollout(
+                scans, policy, callback=after_scan, break_when_any_done=False
+            ).cpu()
         after_scan()
     return [_result(env, row, rollouts) for row in range(len(env.recordings))]
 
@@ -89,16 +102,21 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
         for name, step in steps.items()
     }
     if recording.commands is not None:
-        steering[RECORDED] = recorded_steering(recording, env.speed, env.car_length, env.max_steering)
+        steering[RECORDED] = recorded_steering(
+            recording, env.speed, env.car_length, env.max_steering
+        )
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
     return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering)
 
 
-def recorded_steering(recording: Recording, speed: float, car_length: float, max_steering: float) -> Steering:
+def recorded_steering(
+    recording: Recording, speed: float, car_length: float, max_steering: float
+) -> Steering:
     """Return the recorded commands as steering, NaN before the first command (equations 99 and 100).
 
-    See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the steering is straight.
+    See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the
+    steering is straight.
 
     Args:
         recording: with commands.
@@ -107,7 +125,9 @@ def recorded_steering(recording: Recording, speed: float, car_length: float, max
         max_steering: radians of an action of 1.
     """
     speeds, omega = recording.commands_of_scans(speed).T
-    sine = np.divide(omega * car_length, speeds, out=np.where(np.isnan(omega), np.nan, 0.0), where=speeds != 0)
+    sine = np.divide(
+        omega * car_length, speeds, out=np.where(np.isnan(omega), np.nan, 0.0), where=speeds != 0
+    )
     action = (np.arcsin(sine.clip(-1, 1)) / max_steering).clip(-1, 1)
     before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()

@@ -19,12 +19,18 @@ MOST = 0.5  # share of the clusters
 
 def describe(result: OpenLoop) -> str:
     """Return a section of Markdown about one recording."""
-    columns = {"policy": ("policy", ""), "smoothness": ("smoothness", ".3f"), "omega": ("omega (rad/s)", ".3f")}
+    columns = {
+        "policy": ("policy", ""),
+        "smoothness": ("smoothness", ".3f"),
+        "omega": ("omega (rad/s)", ".3f"),
+    }
     steering = result.steering.items()
-    frame = pd.DataFrame({
-        "smoothness": {name: pd.Series(each.smoothness).mean() for name, each in steering},
-        "omega": {name: pd.Series(each.omega).abs().mean() for name, each in steering},
-    })  # fmt: skip
+    frame = pd.DataFrame(
+        {
+            "smoothness": {name: pd.Series(each.smoothness).mean() for name, each in steering},
+            "omega": {name: pd.Series(each.omega).abs().mean() for name, each in steering},
+        }
+    )
     if len(frame) > 1:
         distances = disagreement(result)
         frame = frame.join(distances.mask(np.eye(len(distances), dtype=bool)).add_prefix("from "))
@@ -50,7 +56,9 @@ def caution(result: OpenLoop, perception: object) -> str:
         some = slice(None, None, -(-len(recording.ranges) // CHECKED_SCANS))
         rejected = perception.rejected(recording.ranges[some], recording.angles(some))
         if rejected > MOST:
-            problems.append(f"{rejected:.0%} of the clusters in sight are unlike any cone of the training")
+            problems.append(
+                f"{rejected:.0%} of the clusters in sight are unlike any cone of the training"
+            )
     if not problems:
         return ""
     remedy = "check env.perception, or train the classifier on your own cones with coil-reproduce figure=25"
@@ -76,33 +84,55 @@ def outcome(result: OpenLoop) -> str:
 
 def over_time(result: OpenLoop) -> list[dict[str, Any]]:
     """Return a row per scan: time (s), whether both boundaries are valid, actions and omegas (radians/s)."""
-    columns: dict[str, Any] = {"time": result.recording.seconds, "valid": result.both_valid.astype(int)}
+    columns: dict[str, Any] = {
+        "time": result.recording.seconds,
+        "valid": result.both_valid.astype(int),
+    }
     for policy, steering in result.steering.items():
         columns |= {f"{policy}/steering": steering.action, f"{policy}/omega": steering.omega}
     return pd.DataFrame(columns).to_dict("records")
 
 
-def draw_steering(result: OpenLoop, path: str | os.PathLike[str], *, title: str | None = None) -> None:
+def draw_steering(
+    result: OpenLoop, path: str | os.PathLike[str], *, title: str | None = None
+) -> None:
     """Draw steering and omega of each policy over time; recorded commands are dashed, scans not valid are grey."""
     seconds, invalid = result.recording.seconds, ~result.both_valid
     strokes = style.strong_strokes(result.policies)
     if RECORDED in result.steering:
         strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHED)
-    lines = {name: {"color": stroke.colour, "ls": stroke.linestyle} for name, stroke in strokes.items()}
-    handles: list[Artist] = [Line2D([], [], lw=1.6, label=name, **line) for name, line in lines.items()]
+    lines = {
+        name: {"color": stroke.colour, "ls": stroke.linestyle} for name, stroke in strokes.items()
+    }
+    handles: list[Artist] = [
+        Line2D([], [], lw=1.6, label=name, **line) for name, line in lines.items()
+    ]
     if invalid.any():
         handles.append(Patch(color=style.ASPHALT, lw=0, label="a boundary from the memory"))
     with style.picture(path, title, handles, 5.0, h_pad=0.08) as figure:
         steering_axes, omega_axes = figure.subplots(2, sharex=True)
-        for axes, label in ((steering_axes, "steering (degrees)"), (omega_axes, "omega (radians/s)")):
+        for axes, label in (
+            (steering_axes, "steering (degrees)"),
+            (omega_axes, "omega (radians/s)"),
+        ):
             axes.set_ylabel(label)
             axes.spines[["top", "right"]].set_visible(False)
             axes.axhline(0, color=style.KERB, lw=0.7)
             axes.margins(x=0.01)
-            background = {"step": "mid", "transform": axes.get_xaxis_transform(), "color": style.ASPHALT, "lw": 0}
+            background = {
+                "step": "mid",
+                "transform": axes.get_xaxis_transform(),
+                "color": style.ASPHALT,
+                "lw": 0,
+            }
             axes.fill_between(seconds, 0, 1, where=invalid, **background)
             axes.set_axisbelow(True)
         for name, line in lines.items():
-            steering_axes.plot(seconds, np.degrees(result.steering[name].action * result.max_steering), lw=1.1, **line)
+            steering_axes.plot(
+                seconds,
+                np.degrees(result.steering[name].action * result.max_steering),
+                lw=1.1,
+                **line,
+            )
             omega_axes.plot(seconds, result.steering[name].omega, lw=1.1, **line)
         omega_axes.set_xlabel("time (s)")

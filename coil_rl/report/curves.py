@@ -28,18 +28,21 @@ AGENT = "#1a1a1a"  # the agent in `draw_phases`
 
 
 def draw_learning_curves(
-    runs: Mapping[str, Sequence[Rows]], path: str | os.PathLike[str], *, guides: Mapping[str, float] | None = None,
+    runs: Mapping[str, Sequence[Rows]],
+    path: str | os.PathLike[str],
+    *,
+    guides: Mapping[str, float] | None = None,
     title: str | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw the return of the kept policies against frames, one curve per label.
 
-    Several runs of one label are drawn as their mean, over the frames that all of them reached, with the 95 % t
-    interval of that mean as a band.
+    Several runs of one label are drawn as their mean, over the frames that all of them reached,
+    with the 95 % t interval of that mean as a band.
 
     Args:
-        runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with "frames" (env frames
-            so far) and "evaluation/return", which may be missing, None or NaN; of an anchored policy also with the
-            weight of its guide, drawn as thin steps.
+        runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with
+            "frames" (env frames so far) and "evaluation/return", which may be missing, None or NaN;
+            of an anchored policy also with the weight of its guide, drawn as thin steps.
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
@@ -49,7 +52,9 @@ def draw_learning_curves(
     handles: list[Artist] = []
     for label, stroke in strokes.items():
         seeds = f" ({len(runs[label])} runs)" if len(runs[label]) > 1 else ""
-        handles.append(Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=2, label=label + seeds))
+        handles.append(
+            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=2, label=label + seeds)
+        )
     if any(len(seeds) > 1 for seeds in runs.values()):
         handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
     with style.picture(path, title, handles, 4.2) as figure:
@@ -66,12 +71,19 @@ def draw_learning_curves(
         for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
             axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
             axes.annotate(
-                f"{name}\n{value:.1f}", (1, value), (4, 0), xycoords=("axes fraction", "data"),
-                textcoords="offset points", va="center", color=colour,
-            )  # fmt: skip
+                f"{name}\n{value:.1f}",
+                (1, value),
+                (4, 0),
+                xycoords=("axes fraction", "data"),
+                textcoords="offset points",
+                va="center",
+                color=colour,
+            )
 
 
-def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]) -> None:
+def _draw_anchors(
+    axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]
+) -> None:
     """Draw the weights of guides on an axis inside the plot, and a cross where the brake restored an earlier policy."""
     if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
         return
@@ -85,11 +97,21 @@ def _draw_anchors(axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mappi
     weights.set(ylim=(0, 4), yticks=[0, 1])  # at the foot of the plot
     weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
     weights.spines[:].set_visible(False)
-    weights.text(0.01, 0.01, "guide's weight; x: went back", transform=weights.transAxes, size=7, color=style.QUIET)
+    weights.text(
+        0.01,
+        0.01,
+        "guide's weight; x: went back",
+        transform=weights.transAxes,
+        size=7,
+        color=style.QUIET,
+    )
 
 
 def draw_curve_grid(
-    runs: Mapping[str, Sequence[Rows]], path: str | os.PathLike[str], *, guides: Mapping[str, float] | None = None
+    runs: Mapping[str, Sequence[Rows]],
+    path: str | os.PathLike[str],
+    *,
+    guides: Mapping[str, float] | None = None,
 ) -> None:
     """Draw one small learning curve per label, at least one, with the other labels faint behind it.
 
@@ -103,7 +125,9 @@ def draw_curve_grid(
     handles.append(Patch(color=colour, alpha=0.25, lw=0, label="95 % interval of the mean"))
     handles.append(Line2D([], [], color=style.KERB, lw=0.6, label="the others"))
     handles += [Line2D([], [], label="its guide", **guide_line)] if guides else []
-    with style.picture(path, None, handles, 0.35 + GRID_ROW_HEIGHT * rows, add_header=True, h_pad=0.08) as figure:
+    with style.picture(
+        path, None, handles, 0.35 + GRID_ROW_HEIGHT * rows, add_header=True, h_pad=0.08
+    ) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
             for other_frames, other_mean, *_ in curves.values():  # its own is drawn over
@@ -112,7 +136,11 @@ def draw_curve_grid(
             axes.plot(frames, mean, color=colour, lw=1.5, zorder=2.2)
             if guides and label in guides:
                 axes.axhline(guides[label], **guide_line)
-            axes.set_title(f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label, size=9, loc="left")
+            axes.set_title(
+                f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label,
+                size=9,
+                loc="left",
+            )
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(left=0)
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -124,20 +152,28 @@ def draw_curve_grid(
 
 
 def draw_phases(
-    rows: Sequence[Mapping[str, float]], guides: Sequence[str], path: str | os.PathLike[str], *,
+    rows: Sequence[Mapping[str, float]],
+    guides: Sequence[str],
+    path: str | os.PathLike[str],
+    *,
     title: str | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw one run of Dynamic COIL: returns, change of each guide's action, and learning rates.
 
-    The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`, at least one, and
-    `guides` the names in the order of the run.
+    The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`,
+    at least one, and `guides` the names in the order of the run.
     """
     colours = {name: style.AGENTS[index % len(style.AGENTS)] for index, name in enumerate(guides)}
-    updates = [row for row in rows if not math.isnan(row["learner/guide"])]  # without the state before the first one
+    updates = [
+        row for row in rows if not math.isnan(row["learner/guide"])
+    ]  # without the state before the first one
     frames = _column(updates, "frames")
     handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent")]
     alone: dict[str, Any] = {"ls": style.DASHED, "lw": 1.1, "marker": "o", "ms": 4}
-    handles += [Line2D([], [], color=colour, label=f"{name} alone", **alone) for name, colour in colours.items()]
+    handles += [
+        Line2D([], [], color=colour, label=f"{name} alone", **alone)
+        for name, colour in colours.items()
+    ]
     handles.append(Patch(color=style.QUIET, alpha=0.25, lw=0, label="a guide learns (its colour)"))
     with style.picture(path, title, handles, 6.8, h_pad=0.08) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1, 1))
@@ -145,17 +181,27 @@ def draw_phases(
         for name, colour in colours.items():
             top.plot(*points(rows, f"guide/{name}").T, color=colour, **alone)
             middle.plot(frames, _column(updates, f"learner/moved_{name}"), color=colour, lw=1.4)
-        learner = _column(updates, "learner/guide")  # index of the guide that learns; their number for all of them
+        learner = _column(
+            updates, "learner/guide"
+        )  # index of the guide that learns; their number for all of them
         guide_rate = _column(updates, "learner/guide_learning_rate")
         rates = {AGENT: _column(updates, "learner/learning_rate")}
         for index, colour in enumerate(colours.values()):
-            rates[colour] = np.where((learner == index) | (learner == len(colours)), guide_rate, np.nan)
+            rates[colour] = np.where(
+                (learner == index) | (learner == len(colours)), guide_rate, np.nan
+            )
         edges = np.concatenate([[0.0], frames])
         for colour, values in rates.items():
-            bottom.stairs(np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None)
+            bottom.stairs(
+                np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None
+            )
         bottom.set_yscale("log")
         bottom.yaxis.set_major_formatter("{x:g}")
-        for axes, label in {top: "return", middle: "moved (action)", bottom: "learning rate"}.items():
+        for axes, label in {
+            top: "return",
+            middle: "moved (action)",
+            bottom: "learning rate",
+        }.items():
             style.lighten(axes)
             axes.set(ylabel=label, xmargin=0, xlim=(0, None))
             for start, end, index in zip(edges, frames, learner.astype(int), strict=False):
@@ -169,7 +215,8 @@ def draw_phases(
 def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
     """Return the mean curve of several runs, each part [P]; P = 0 without data.
 
-    These are the frames, the mean over the runs, and the low and the high end of its 95 % t interval.
+    These are the frames, the mean over the runs, and the low and the high end of its 95 % t
+    interval.
     """
     curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     if not curves:
@@ -186,9 +233,10 @@ def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Arr
 def learning(run: Run) -> dict[str, float]:
     """Return the evaluation curve of a run in numbers, NaN where unknown.
 
-    These are the `frames` of the run; the return of the `first`, the `final` and the `best` policy, which is chosen in
-    other cases, with the frames `best_at`; the mean of the curve (`area`, under the curve divided by the frames); the
-    return of the best `guide`; and the frames `until_90` and `until_100` percent of that.
+    These are the `frames` of the run; the return of the `first`, the `final` and the `best` policy,
+    which is chosen in other cases, with the frames `best_at`; the mean of the curve (`area`, under
+    the curve divided by the frames); the return of the best `guide`; and the frames `until_90` and
+    `until_100` percent of that.
     """
     curve, choice = points(run.curve, RETURN), points(run.curve, CHOICE)
     guide = max(run.guide_returns.values(), default=math.nan)
@@ -199,14 +247,21 @@ def learning(run: Run) -> dict[str, float]:
     at, values = curve.T
     best = int((choice if len(choice) == len(curve) else curve)[:, 1].argmax())
     return {
-        "frames": frames, "guide": guide, "first": values[0], "final": values[-1], "best": values[best],
-        "best_at": at[best], "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
+        "frames": frames,
+        "guide": guide,
+        "first": values[0],
+        "final": values[-1],
+        "best": values[best],
+        "best_at": at[best],
+        "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
         "until_90": frames_until(at, values, 0.9 * guide) if guide > 0 else math.nan,
         "until_100": frames_until(at, values, guide),
-    }  # fmt: skip
+    }
 
 
-def frames_until(frames: Sequence[float] | Array, returns: Sequence[float] | Array, level: float) -> float:
+def frames_until(
+    frames: Sequence[float] | Array, returns: Sequence[float] | Array, level: float
+) -> float:
     """Return the frames at which a curve first reaches a level, by linear interpolation; NaN if it never does."""
     reached = np.flatnonzero(np.asarray(returns) >= level)
     if not len(reached):

@@ -19,9 +19,30 @@ if TYPE_CHECKING:
 
 COLOUR = style.AGENTS[0]
 BAR: dict[str, Any] = {"color": COLOUR, "alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
-SEED: dict[str, Any] = {"ls": "", "marker": "o", "ms": 3.6, "mfc": style.QUIET, "mec": "none", "alpha": 0.5}
-DOT: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5.5, "mfc": COLOUR, "mec": style.BACKGROUND, "mew": 0.6}
-HOLLOW: dict[str, Any] = {"ls": "", "marker": "o", "ms": 5.0, "mfc": style.BACKGROUND, "mec": COLOUR, "mew": 1.1}
+SEED: dict[str, Any] = {
+    "ls": "",
+    "marker": "o",
+    "ms": 3.6,
+    "mfc": style.QUIET,
+    "mec": "none",
+    "alpha": 0.5,
+}
+DOT: dict[str, Any] = {
+    "ls": "",
+    "marker": "o",
+    "ms": 5.5,
+    "mfc": COLOUR,
+    "mec": style.BACKGROUND,
+    "mew": 0.6,
+}
+HOLLOW: dict[str, Any] = {
+    "ls": "",
+    "marker": "o",
+    "ms": 5.0,
+    "mfc": style.BACKGROUND,
+    "mec": COLOUR,
+    "mew": 1.1,
+}
 GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.3, "zorder": 1.5}
 
 
@@ -42,16 +63,24 @@ def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
     """Return a row for the score of each driver, with its single seeds and its guide."""
     return [
         Interval(
-            group.title, group.score.mean, group.score.low, group.score.high,
+            group.title,
+            group.score.mean,
+            group.score.low,
+            group.score.high,
             points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
-            guide=group.guide.score.mean if group.guide else None, hollow=bool(group.advice),
+            guide=group.guide.score.mean if group.guide else None,
+            hollow=bool(group.advice),
         )
         for group in groups
-    ]  # fmt: skip
+    ]
 
 
 def draw_intervals(
-    panels: Mapping[str, Sequence[Interval]], path: str | os.PathLike[str], *, measure: str, title: str | None = None
+    panels: Mapping[str, Sequence[Interval]],
+    path: str | os.PathLike[str],
+    *,
+    measure: str,
+    title: str | None = None,
 ) -> None:
     """Draw one panel, or several side by side that share their rows; `panels` are at least one row by heading."""
     rows = [row for panel in panels.values() for row in panel]
@@ -63,15 +92,21 @@ def draw_intervals(
         "one seed": (SEED, any(row.points for row in rows)),
         "its guide": (GUIDE, any(row.guide is not None for row in rows)),
     }
-    handles = [Line2D([], [], label=label, **stroke) for label, (stroke, used) in legend.items() if used]
-    with style.picture(path, title, handles, 0.62 + 0.27 * len(labels), add_header=True, h_pad=0.08) as figure:
+    handles = [
+        Line2D([], [], label=label, **stroke) for label, (stroke, used) in legend.items() if used
+    ]
+    with style.picture(
+        path, title, handles, 0.62 + 0.27 * len(labels), add_header=True, h_pad=0.08
+    ) as figure:
         axes_row = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
         for axes, (heading, panel) in zip(axes_row, panels.items(), strict=True):
             axes.set_xlabel(measure)
             if len(panels) > 1:
                 axes.set_title(heading, size=9, loc="left")
             draw_panel(axes, {labels.index(row.label): row for row in panel})
-        axes_row[0].set(yticks=range(len(labels)), yticklabels=labels, ylim=(len(labels) - 0.5, -0.5))
+        axes_row[0].set(
+            yticks=range(len(labels)), yticklabels=labels, ylim=(len(labels) - 0.5, -0.5)
+        )
 
 
 def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:

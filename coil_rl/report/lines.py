@@ -40,41 +40,55 @@ MEASURE_COLOURS = ListedColormap(mpl.colormaps["magma_r"](np.linspace(0.02, 0.88
 
 
 def draw_lines(
-    tracks: Sequence[Track], lines: Mapping[str, Sequence[ArrayLike]], path: str | os.PathLike[str], *,
+    tracks: Sequence[Track],
+    lines: Mapping[str, Sequence[ArrayLike]],
+    path: str | os.PathLike[str],
+    *,
     crashed: Mapping[str, Sequence[bool]] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Draw the lines of several drivers on several tracks, all at one scale.
 
     Args:
         tracks: N of them, at least one.
-        lines: N lines per driver, each [T, 2] m, x right and y up; T may be 0, rows that are not finite are left out.
-            Drivers whose name starts with "guide" are drawn in grey dashes; the last driver is on top.
+        lines: N lines per driver, each [T, 2] m, x right and y up; T may be 0, rows that are not
+            finite are left out. Drivers whose name starts with "guide" are drawn in grey dashes;
+            the last driver is on top.
         path: output file, 8 inches wide.
         crashed: per driver, whether each of the N lines ended in a crash; a cross marks it.
     """
     driven, ended = _finite(lines), crashed or {}
     strokes = style.strokes(driven)
-    handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label) for label, s in strokes.items()]
+    handles = [
+        Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=label)
+        for label, s in strokes.items()
+    ]
     plot = TrackPlot(tracks, legend=[*handles, *_crash_handle(ended)])
     for z, (label, stroke) in enumerate(strokes.items()):
         for index, (track, line) in enumerate(zip(tracks, driven[label], strict=True)):
             offset = plot.offsets[index]
             for lap in _split_laps(line, track):
                 xy = (lap + offset).T
-                plot.axes.plot(*xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100)
+                plot.axes.plot(
+                    *xy, color=stroke.colour, ls=stroke.linestyle, lw=1.4, zorder=4 + z / 100
+                )
             if label in ended and ended[label][index] and len(line):
                 plot.axes.plot(*(line[-1] + offset), mfc=stroke.colour, zorder=5 + z / 100, **CRASH)
     style.save(plot.figure, path)
 
 
 def animate_lines(
-    tracks: Sequence[Track], lines: Mapping[str, Sequence[ArrayLike]], path: str | os.PathLike[str], *, rate: float,
-    crashed: Mapping[str, Sequence[bool]] | None = None, seconds: float = 12.0,
-) -> None:  # fmt: skip
+    tracks: Sequence[Track],
+    lines: Mapping[str, Sequence[ArrayLike]],
+    path: str | os.PathLike[str],
+    *,
+    rate: float,
+    crashed: Mapping[str, Sequence[bool]] | None = None,
+    seconds: float = 12.0,
+) -> None:
     """Write a GIF, 800 px wide, in which all drivers drive on all tracks at the same time; it repeats.
 
-    The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the maximum duration in
-    `seconds`; lines are never shown slower than they were driven.
+    The arguments are those of `draw_lines`, the `rate` of the lines in steps per second, and the
+    maximum duration in `seconds`; lines are never shown slower than they were driven.
     """
     driven, ended = _finite(lines), crashed or {}
     colours = {label: stroke.colour for label, stroke in style.strokes(driven).items()}
@@ -101,43 +115,68 @@ def animate_lines(
         for time in tqdm(times, desc="animation", unit="frame", leave=False, disable=None):
             canvas.restore_region(background)
             for line, crashes, tail, head in cars:
-                now, start = min(round(time * rate), len(line) - 1), round((time - TAIL * speed) * rate)
+                now, start = (
+                    min(round(time * rate), len(line) - 1),
+                    round((time - TAIL * speed) * rate),
+                )
                 tail.set_data(*line[max(0, start) : now + 1].T)
                 head.set_data(*line[max(0, now) : now + 1].T)
                 if crashes and now == len(line) - 1:
                     head.set(marker=CRASH["marker"], markersize=CRASH["ms"])
                 axes.draw_artist(tail)
                 axes.draw_artist(head)
-            clock.set_text(f"{time:.1f} s ({speed:.0f}× speed)" if speed >= 1.5 else f"{time:.1f} s")
+            clock.set_text(
+                f"{time:.1f} s ({speed:.0f}× speed)" if speed >= 1.5 else f"{time:.1f} s"
+            )
             figure.draw_artist(clock)
             yield Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
     images = frames()
-    first = next(images).quantize(method=Image.Quantize.FASTOCTREE)  # its legend has the colours of all drivers
+    first = next(images).quantize(
+        method=Image.Quantize.FASTOCTREE
+    )  # its legend has the colours of all drivers
     others = (image.quantize(palette=first, dither=Image.Dither.NONE) for image in images)
     durations = [round(1000 / FPS)] * (len(times) - 1) + [round(1000 * PAUSE)]
     with whole_file(path) as unfinished:
-        first.save(unfinished, format="GIF", save_all=True, append_images=others, duration=durations, loop=0)
+        first.save(
+            unfinished,
+            format="GIF",
+            save_all=True,
+            append_images=others,
+            duration=durations,
+            loop=0,
+        )
 
 
 def draw_listening_map(
-    tracks: Sequence[Track], lines: Sequence[ArrayLike], values: Mapping[str, Sequence[ArrayLike]],
-    path: str | os.PathLike[str], *, label: str, title: str | None = None,
-) -> None:  # fmt: skip
+    tracks: Sequence[Track],
+    lines: Sequence[ArrayLike],
+    values: Mapping[str, Sequence[ArrayLike]],
+    path: str | os.PathLike[str],
+    *,
+    label: str,
+    title: str | None = None,
+) -> None:
     """Draw the driven lines once per guide, coloured by a measure on one colour scale.
 
     Args:
         tracks: N of them, at least one.
         lines: N driven lines, [T, 2] m each, T at least 1.
-        values: by guide, at least one, the values at the points of each line, N times [T]; NaN is left out.
+        values: by guide, at least one, the values at the points of each line, N times [T]; NaN is
+            left out.
         path: output file.
         label: of the colour bar, measure and unit.
         title: above the map.
     """
-    highest = float(np.nanmax([0.0, *np.concatenate([row for rows in values.values() for row in rows])])) or 1.0
+    highest = (
+        float(np.nanmax([0.0, *np.concatenate([row for rows in values.values() for row in rows])]))
+        or 1.0
+    )
     colours = ScalarMappable(Normalize(0, highest), MEASURE_COLOURS)
     panels = [(guide, index) for guide in values for index in range(len(tracks))]
-    titled = [replace(tracks[index], name=f"{guide}: {tracks[index].name}") for guide, index in panels]
+    titled = [
+        replace(tracks[index], name=f"{guide}: {tracks[index].name}") for guide, index in panels
+    ]
     plot = TrackPlot(titled, title=title, groups=len(values))
     rim = [StrokeEffect(linewidth=5.2, foreground=style.BACKGROUND), Normal()]
     for panel, (guide, index) in enumerate(panels):
@@ -147,25 +186,37 @@ def draw_listening_map(
         finite = np.isfinite(segment_values)
         plot.axes.add_collection(
             LineCollection(
-                list(segments[finite]), array=segment_values[finite], cmap=MEASURE_COLOURS, norm=colours.norm,
-                lw=4.0, capstyle="round", zorder=4, path_effects=rim,
+                list(segments[finite]),
+                array=segment_values[finite],
+                cmap=MEASURE_COLOURS,
+                norm=colours.norm,
+                lw=4.0,
+                capstyle="round",
+                zorder=4,
+                path_effects=rim,
             )
-        )  # fmt: skip
+        )
     with mpl.rc_context(style.LETTERS):  # a colour bar in the lower right corner
         width, height = plot.figure.get_size_inches()
         left, bottom, bar_width, bar_height = width - style.MARGIN - 0.34 - 2.2, 0.13, 2.2, 0.11
-        axes = plot.figure.add_axes((left / width, bottom / height, bar_width / width, bar_height / height))
+        axes = plot.figure.add_axes(
+            (left / width, bottom / height, bar_width / width, bar_height / height)
+        )
         bar = plot.figure.colorbar(colours, cax=axes, orientation="horizontal")
         bar.outline.set_visible(False)
         bar.set_ticks([])
         middle = (bottom + bar_height / 2) / height
-        plot.figure.text((left - 0.07) / width, middle, f"{label}  0", size=8, ha="right", va="center")
+        plot.figure.text(
+            (left - 0.07) / width, middle, f"{label}  0", size=8, ha="right", va="center"
+        )
         axes.text(1.03, 0.5, f"{highest:.2g}", size=8, va="center", transform=axes.transAxes)
     style.save(plot.figure, path)
 
 
 def _crash_handle(ended: Mapping[str, Sequence[bool]]) -> list[Line2D]:
-    handle = Line2D([], [], ls="", marker="X", ms=7, mfc=style.INK, mec=style.BACKGROUND, label="crash")
+    handle = Line2D(
+        [], [], ls="", marker="X", ms=7, mfc=style.INK, mec=style.BACKGROUND, label="crash"
+    )
     return [handle] if any(any(crashes) for crashes in ended.values()) else []
 
 

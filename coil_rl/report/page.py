@@ -15,7 +15,9 @@ MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 
 
-def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None) -> str:
+def section(
+    heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
+) -> str:
     """Return the section for one kind of actions; `rows` are `comparison.table(against)`."""
     score, spec = comparison.score
     names = {"other": _other(against), "score": score}
@@ -38,7 +40,9 @@ def section(heading: str, comparison: Comparison, rows: Sequence[Mapping[str, An
     table = markdown_table(with_cells(rows, spec), columns)
     parts = _parts(comparison, TERM, "term of the reward", ".1f")
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
-    return "\n\n".join([f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")])
+    return "\n\n".join(
+        [f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")]
+    )
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
@@ -47,7 +51,9 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
         {
             **row,
             "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
-            "difference cell": Estimate(*(row[f"difference{end}"] for end in ("", "_low", "_high"))).cell(f"+{spec}"),
+            "difference cell": Estimate(
+                *(row[f"difference{end}"] for end in ("", "_low", "_high"))
+            ).cell(f"+{spec}"),
         }
         for row in rows
     ]
@@ -59,9 +65,15 @@ def guide_training(runs: Sequence[Run]) -> list[str]:
     for label, of_label in _trained(runs):
         curves = [run.curve for run in of_label]
         row: dict[str, Any] = {"label": label, "seeds": len(curves)}
-        for key in dict.fromkeys(key for curve in curves for key in curve[0] if key.startswith(GUIDE_RETURN)):
-            returns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
-            row[key] = f"{mean(seed[0] for seed in returns):.1f} to {mean(seed[-1] for seed in returns):.1f}"
+        for key in dict.fromkeys(
+            key for curve in curves for key in curve[0] if key.startswith(GUIDE_RETURN)
+        ):
+            returns = [
+                [line[key] for line in curve if not math.isnan(line[key])] for curve in curves
+            ]
+            row[key] = (
+                f"{mean(seed[0] for seed in returns):.1f} to {mean(seed[-1] for seed in returns):.1f}"
+            )
         rows += [row] if len(row) > 2 else []
     columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
     columns |= {key: (key.removeprefix(GUIDE_RETURN), "") for row in rows for key in list(row)[2:]}
@@ -75,10 +87,16 @@ def training(runs: Sequence[Run]) -> list[str]:
         numbers = [learning(run) for run in of_label]
         seconds = [run.seconds for run in of_label if run.seconds is not None]
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
-        row |= {"label": label, "seeds": len(of_label), "seconds": mean(seconds) if seconds else None}
+        row |= {
+            "label": label,
+            "seeds": len(of_label),
+            "seconds": mean(seconds) if seconds else None,
+        }
         for key in ("until_90", "until_100"):
             reached = [seed[key] for seed in numbers if not math.isnan(seed[key])]
-            some = f" ({len(reached)} of {len(numbers)} seeds)" if len(reached) < len(numbers) else ""
+            some = (
+                f" ({len(reached)} of {len(numbers)} seeds)" if len(reached) < len(numbers) else ""
+            )
             row[f"{key} cell"] = f"{mean(reached):,.0f}{some}" if reached else None
         rows += [row] if not math.isnan(row["area"]) else []
     rows.sort(key=lambda row: -float(row["area"]))
@@ -87,7 +105,12 @@ def training(runs: Sequence[Run]) -> list[str]:
 
 def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     """Return an explanation of the tables."""
-    used = {"order": True, "normalised": normalised, "against": against is not None, "sampled": sampled}
+    used = {
+        "order": True,
+        "normalised": normalised,
+        "against": against is not None,
+        "sampled": sampled,
+    }
     text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
     return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
 
@@ -114,7 +137,9 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
     groups = {group.title: group.parts(prefix) for group in comparison.groups}
     rows = [{"driver": title} | parts for title, parts in groups.items() if parts]
     names = dict.fromkeys(key for row in rows for key in list(row)[1:])
-    columns = {"driver": (heading, "")} | {name: (name.removeprefix(prefix), spec) for name in names}
+    columns = {"driver": (heading, "")} | {
+        name: (name.removeprefix(prefix), spec) for name in names
+    }
     return [markdown_table(rows, columns)] if rows else []
 
 
@@ -131,4 +156,6 @@ def cases_table(groups: Sequence[Group], file: str) -> str:
             reward, completed = means["reward"], means.get("completed", 1.0)
             row[case] = f"{reward:.1f} ({completed:.0%} completed)" if completed < 1 else reward
         rows.append(row)
-    return markdown_table(rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names})
+    return markdown_table(
+        rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names}
+    )

@@ -48,9 +48,18 @@ class DrivenLines(Picture):
 
     def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the lines."""
-        tracks, first = self.tracks[: self.most], {driver: result[: self.most] for driver, result in drives.items()}
-        lines = {driver: [pose[:, :2] for pose in result.histories["pose"]] for driver, result in first.items()}
-        crashed = {driver: [bool(row.get("crashed")) for row in result.episodes] for driver, result in first.items()}
+        tracks, first = (
+            self.tracks[: self.most],
+            {driver: result[: self.most] for driver, result in drives.items()},
+        )
+        lines = {
+            driver: [pose[:, :2] for pose in result.histories["pose"]]
+            for driver, result in first.items()
+        }
+        crashed = {
+            driver: [bool(row.get("crashed")) for row in result.episodes]
+            for driver, result in first.items()
+        }
         draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
         rate = next(iter(drives.values())).rate
         if self.gif and not math.isnan(rate):
@@ -71,7 +80,9 @@ class Returns(Picture):
                 # Spread evenly, so that equal returns stay visible.
                 heights = row + 0.3 * (np.arange(len(rewards)) / max(1, len(rewards) - 1) - 0.5)
                 axes.plot(rewards, heights, "o", color=strokes[name].colour, ms=4, alpha=0.5, mew=0)
-                axes.plot([rewards.mean()] * 2, [row - 0.3, row + 0.3], color=strokes[name].colour, lw=2)
+                axes.plot(
+                    [rewards.mean()] * 2, [row - 0.3, row + 0.3], color=strokes[name].colour, lw=2
+                )
             axes.set_yticks(range(len(names)), names)
 
 
@@ -105,5 +116,10 @@ class Film(Picture):
         if images:
             with whole_file(folder / "episode.gif") as unfinished:
                 images[0].save(
-                    unfinished, "GIF", save_all=True, append_images=images[1:], duration=self.duration, loop=0
+                    unfinished,
+                    "GIF",
+                    save_all=True,
+                    append_images=images[1:],
+                    duration=self.duration,
+                    loop=0,
                 )

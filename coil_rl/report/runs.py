@@ -18,7 +18,10 @@ from coil_rl.train.trust import read_yaml
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "case")
-EVALUATION, SELECTION = "evaluation", "selection"  # sets of cases: for reports, and for the choice of the best policy
+EVALUATION, SELECTION = (
+    "evaluation",
+    "selection",
+)  # sets of cases: for reports, and for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
 PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
@@ -31,15 +34,23 @@ class Run:
     folder: Path
     label: str  # shared by the seeds of one method
     seed: int
-    needs_guide: bool | None  # whether the agent needs the guide during evaluation; None without an agent
-    # One row per driver and case, empty until the run is finished: `driver` ("guide", "guide NAME" for one of several,
-    # or the label), `advice` (its modification, such as "zeroed"; empty for none), `actions` ("deterministic" or
-    # "sampled"), `case`, `reward`, and the measures.
+    needs_guide: (
+        bool | None
+    )  # whether the agent needs the guide during evaluation; None without an agent
+    # One row per driver and case, empty until the run is finished: `driver` ("guide", "guide NAME"
+    # for one of several, or the label), `advice` (its modification, such as "zeroed"; empty for
+    # none), `actions` ("deterministic" or "sampled"), `case`, `reward`, and the measures.
     evaluation: pd.DataFrame = field(default_factory=pd.DataFrame, repr=False)
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)  # definitions by name
-    curve: Sequence[dict[str, float]] = field(default=(), repr=False)  # rows of metrics.csv; empty without training
-    guide_returns: Mapping[str, float] = field(default_factory=dict)  # mean of each guide in the evaluation, if known
-    seconds: float | None = None  # duration of the training; None if unknown, as for an interrupted run
+    curve: Sequence[dict[str, float]] = field(
+        default=(), repr=False
+    )  # rows of metrics.csv; empty without training
+    guide_returns: Mapping[str, float] = field(
+        default_factory=dict
+    )  # mean of each guide in the evaluation, if known
+    seconds: float | None = (
+        None  # duration of the training; None if unknown, as for an interrupted run
+    )
 
     @property
     def finished(self) -> bool:
@@ -55,12 +66,20 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
     runs: dict[Path, Run] = {}
     for folder in folders:
         if not folder.is_dir():
-            raise UserError(f"folder={folder} does not exist; give a folder with runs of coil-train")
-        run_folders = [path.parent for path in sorted(folder.rglob("config.yaml")) if _is_run(path, folder)]
+            raise UserError(
+                f"folder={folder} does not exist; give a folder with runs of coil-train"
+            )
+        run_folders = [
+            path.parent for path in sorted(folder.rglob("config.yaml")) if _is_run(path, folder)
+        ]
         if not run_folders:
-            raise UserError(f"folder={folder} holds no run of coil-train: nothing in it has a config.yaml")
+            raise UserError(
+                f"folder={folder} holds no run of coil-train: nothing in it has a config.yaml"
+            )
         # Overlapping folders may hold the same run.
-        runs |= {path.resolve(): _read_run(path) for path in run_folders if path.resolve() not in runs}
+        runs |= {
+            path.resolve(): _read_run(path) for path in run_folders if path.resolve() not in runs
+        }
     return list(runs.values())
 
 
@@ -68,7 +87,9 @@ def _is_run(config: Path, folder: Path) -> bool:
     """Return whether a config.yaml belongs to a run, not to `.hydra` or to a run inside of a run (a proxy)."""
     parts = config.relative_to(folder).parts
     outer = [folder.joinpath(*parts[:depth], config.name) for depth in range(len(parts) - 1)]
-    return not any(part.startswith(".") for part in parts) and not any(path.exists() for path in outer)
+    return not any(part.startswith(".") for part in parts) and not any(
+        path.exists() for path in outer
+    )
 
 
 def _read_run(folder: Path) -> Run:
@@ -77,18 +98,24 @@ def _read_run(folder: Path) -> Run:
         config = read_yaml(path)
         if not isinstance(config, DictConfig):
             raise ValueError("a list")
-        run = Run(folder, str(config["label"]), int(config["seed"]), config["method"]["needs_guide"])
+        run = Run(
+            folder, str(config["label"]), int(config["seed"]), config["method"]["needs_guide"]
+        )
         nodes = OmegaConf.select(config, "evaluation.measures") or {}
         measures = measures_of({name: node for name, node in nodes.items()})
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split("\n    full_key")[0].split())
         remedy = "restore the file that coil-train wrote, or remove the run from the folder"
-        raise UserError(f"{path} has no valid label, seed and method.needs_guide ({problem}); {remedy}") from error
+        raise UserError(
+            f"{path} has no valid label, seed and method.needs_guide ({problem}); {remedy}"
+        ) from error
     path = folder / "evaluation.csv"
     if not path.exists():
         return run
     with file_of_a_run(path, f"remove the file and write it again by coil-train resume={folder}"):
-        evaluation = _read_evaluation(path, [name for name, measure in measures.items() if measure.title])
+        evaluation = _read_evaluation(
+            path, [name for name, measure in measures.items() if measure.title]
+        )
     remedy = "restore the file, or remove the run from the folder"
     with file_of_a_run(path := folder / "metrics.csv", remedy):
         curve = read_curve(path) if path.exists() else []
@@ -98,7 +125,14 @@ def _read_run(folder: Path) -> Run:
             saved = json.loads(path.read_text()) if path.exists() else {}
             numbers[name] = {key: float(value) for key, value in saved.items()}
     returns, seconds = numbers["guide_return"], numbers["training_time"].get("seconds")
-    return replace(run, evaluation=evaluation, measures=measures, curve=curve, guide_returns=returns, seconds=seconds)
+    return replace(
+        run,
+        evaluation=evaluation,
+        measures=measures,
+        curve=curve,
+        guide_returns=returns,
+        seconds=seconds,
+    )
 
 
 def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:

@@ -1,6 +1,7 @@
 """Statistics of a few seeds: t intervals, tests of paired differences, Holm's correction, intervals of shares.
 
-`scipy.stats` is imported where it is used, because that takes a second and a training run does not use it.
+`scipy.stats` is imported where it is used, because that takes a second and a training run does not
+use it.
 """
 
 import math
@@ -45,8 +46,9 @@ def mean_interval(values: ArrayLike) -> tuple[Any, Any, Any]:
 def estimate(values: ArrayLike) -> Estimate:
     """Return the mean of one value per seed, with its interval and p-value.
 
-    From ten seeds on, p is the share of sign patterns of the values with such a mean (two-sided, exact up to 14 seeds);
-    with fewer it is that of a t test. A single seed has no interval and no p-value. NaN or no seeds give NaN.
+    From ten seeds on, p is the share of sign patterns of the values with such a mean (two-sided,
+    exact up to 14 seeds); with fewer it is that of a t test. A single seed has no interval and no
+    p-value. NaN or no seeds give NaN.
     """
     from scipy import stats
 
@@ -58,9 +60,13 @@ def estimate(values: ArrayLike) -> Estimate:
     mean, low, high = map(float, mean_interval(of_seeds))
     if len(of_seeds) >= SIGN_FLIP_SEEDS:
         p = stats.permutation_test(
-            (of_seeds,), np.mean, permutation_type="samples", n_resamples=RESAMPLES, vectorized=True,
+            (of_seeds,),
+            np.mean,
+            permutation_type="samples",
+            n_resamples=RESAMPLES,
+            vectorized=True,
             rng=np.random.default_rng(0),
-        ).pvalue  # fmt: skip
+        ).pvalue
     elif high == mean:
         p = float(mean == 0)
     else:

@@ -41,7 +41,11 @@ LETTERS: Any = {
     "axes.labelcolor": INK,
     "axes.edgecolor": KERB,
 }
-LETTERS |= {f"{axis}tick.{key}": colour for axis in "xy" for key, colour in (("color", KERB), ("labelcolor", INK))}
+LETTERS |= {
+    f"{axis}tick.{key}": colour
+    for axis in "xy"
+    for key, colour in (("color", KERB), ("labelcolor", INK))
+}
 
 
 class Stroke(NamedTuple):
@@ -55,7 +59,9 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke for each driver: grey dashes if its name starts with "guide", the next strong colour if not."""
     labels = list(labels)
     guides = [label for label in labels if label.lower().startswith("guide")]
-    greys = {label: Stroke(GUIDES[index % len(GUIDES)], DASHED) for index, label in enumerate(guides)}
+    greys = {
+        label: Stroke(GUIDES[index % len(GUIDES)], DASHED) for index, label in enumerate(guides)
+    }
     strong = strong_strokes(label for label in labels if label not in greys)
     return {label: greys.get(label) or strong[label] for label in labels}
 
@@ -70,13 +76,18 @@ def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 
 @contextmanager
 def picture(
-    path: str | os.PathLike[str], title: str | None, handles: Sequence[Artist], height: float, *,
-    add_header: bool = False, h_pad: float = 0.1,
-) -> Iterator[Figure]:  # fmt: skip
+    path: str | os.PathLike[str],
+    title: str | None,
+    handles: Sequence[Artist],
+    height: float,
+    *,
+    add_header: bool = False,
+    h_pad: float = 0.1,
+) -> Iterator[Figure]:
     """Yield an empty figure with title and legend; write it when the block ends.
 
-    It is 8 inches wide and `height` inches high, with `add_header` without title and legend. The suffix of the path
-    decides the format. `h_pad` is the vertical padding of the layout in inches.
+    It is 8 inches wide and `height` inches high, with `add_header` without title and legend. The
+    suffix of the path decides the format. `h_pad` is the vertical padding of the layout in inches.
     """
     with mpl.rc_context(LETTERS):
         figure = Figure(figsize=(WIDTH, height), dpi=RESOLUTION)
@@ -85,7 +96,9 @@ def picture(
             header += 0.06
             height += header
             figure.set_figheight(height)
-        figure.set_layout_engine("constrained", rect=(0, 0, 1, 1 - header / height), w_pad=MARGIN / 2, h_pad=h_pad)
+        figure.set_layout_engine(
+            "constrained", rect=(0, 0, 1, 1 - header / height), w_pad=MARGIN / 2, h_pad=h_pad
+        )
         yield figure
         save(figure, path)
 
@@ -108,13 +121,31 @@ def draw_header(figure: Figure, handles: Sequence[Artist], title: str | None) ->
     corner = figure.dpi_scale_trans + ScaledTranslation(0, 1, BboxTransformTo(figure.bbox))
     height = 0.11
     if title:
-        figure.text(MARGIN, -height, title, size=11, weight="bold", va="top", transform=corner, in_layout=False)
+        figure.text(
+            MARGIN,
+            -height,
+            title,
+            size=11,
+            weight="bold",
+            va="top",
+            transform=corner,
+            in_layout=False,
+        )
         height += 0.26
     for columns in range(len(handles), 0, -1):
         legend = figure.legend(
-            handles=handles, ncols=columns, loc="upper left", bbox_to_anchor=(MARGIN, -height), bbox_transform=corner,
-            frameon=False, borderaxespad=0, borderpad=0, handlelength=1.9, handletextpad=0.5, columnspacing=1.4,
-        )  # fmt: skip
+            handles=handles,
+            ncols=columns,
+            loc="upper left",
+            bbox_to_anchor=(MARGIN, -height),
+            bbox_transform=corner,
+            frameon=False,
+            borderaxespad=0,
+            borderpad=0,
+            handlelength=1.9,
+            handletextpad=0.5,
+            columnspacing=1.4,
+        )
         extent = legend.get_window_extent()
         if extent.width <= (WIDTH - 2 * MARGIN) * figure.dpi or columns == 1:
             legend.set_in_layout(False)

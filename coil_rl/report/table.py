@@ -18,14 +18,16 @@ tabulate.MIN_PADDING = 0  # extra width of headings
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
 
-def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, Sequence[str]]) -> str:
+def markdown_table(
+    rows: Sequence[Mapping[str, object]], columns: Mapping[str, Sequence[str]]
+) -> str:
     """Return a Markdown table; columns of numbers are right-aligned.
 
     A column that no row has, or a number that does not fit its format, is a `ValueError`.
 
     Args:
-        rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text stays as it is,
-            so a cell may be a formatted "31.2 ± 0.4".
+        rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text
+            stays as it is, so a cell may be a formatted "31.2 ± 0.4".
         columns: heading (with unit) and number format by key, in the order of the table.
 
     Example:
@@ -39,9 +41,14 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, S
     keys = dict.fromkeys(key for row in rows for key in row)
     for key, (heading, _) in columns.items():
         if rows and key not in keys:
-            raise ValueError(f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}.")
+            raise ValueError(
+                f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}."
+            )
     values = [[_to_python(row.get(key)) for key in columns] for row in rows]
-    numeric = [all(pd.isna(value) or _is_number(value) for value in column) for column in zip(*values, strict=True)]
+    numeric = [
+        all(pd.isna(value) or _is_number(value) for value in column)
+        for column in zip(*values, strict=True)
+    ]
     specs = [spec for _, spec in columns.values()]
     return tabulate.tabulate(
         [[_format(value, spec) for value, spec in zip(row, specs, strict=True)] for row in values],
@@ -55,8 +62,8 @@ def markdown_table(rows: Sequence[Mapping[str, object]], columns: Mapping[str, S
 def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]) -> None:
     """Write rows as CSV with full precision; the file appears whole or not at all.
 
-    The columns are all keys in the order of their first appearance. Missing keys and None become an empty cell, NaN
-    becomes nan.
+    The columns are all keys in the order of their first appearance. Missing keys and None become an
+    empty cell, NaN becomes nan.
     """
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8", newline="") as file:
@@ -80,4 +87,8 @@ def _format(value: object, spec: str) -> str:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return format(value, spec) if _is_number(value) else " ".join(str(value).split()).replace("|", "\\|")
+    return (
+        format(value, spec)
+        if _is_number(value)
+        else " ".join(str(value).split()).replace("|", "\\|")
+    )

@@ -46,9 +46,16 @@ class Drawing(Result):
         page = PAGES[f"figure_{number}"]
         panels, numbers = self._panels()
         names = list(dict.fromkeys(chain.from_iterable(panels.values())))
-        lines: dict[str, Any] = {name: {"color": stroke.colour} for name, stroke in style.strong_strokes(names).items()}
+        lines: dict[str, Any] = {
+            name: {"color": stroke.colour} for name, stroke in style.strong_strokes(names).items()
+        }
         for name, (colour, line) in page.get("lines", {}).items():
-            lines[name] = {"color": getattr(style, colour, colour), "mec": style.INK, "mew": 0.4, **line}
+            lines[name] = {
+                "color": getattr(style, colour, colour),
+                "mec": style.INK,
+                "mew": 0.4,
+                **line,
+            }
         handles = [Line2D([], [], label=name, **lines[name]) for name in names]
         title, rows = f"Figure {number}: {page['title']}", page.get("rows", 1)
         with style.picture(stem.with_suffix(".png"), title, handles, page["height"]) as figure:
@@ -59,12 +66,15 @@ class Drawing(Result):
                 style.lighten(axes)
                 for name, points in series.items():
                     axes.plot(*points.T, **lines[name])
-        write_csv([
-            {"panel": heading, "series": name, "x": x, "y": y}
-            for heading, series in panels.items()
-            for name, points in series.items()
-            for x, y in points[np.isfinite(points).all(1)].tolist()
-        ], stem.with_suffix(".csv"))  # fmt: skip
+        write_csv(
+            [
+                {"panel": heading, "series": name, "x": x, "y": y}
+                for heading, series in panels.items()
+                for name, points in series.items()
+                for x, y in points[np.isfinite(points).all(1)].tolist()
+            ],
+            stem.with_suffix(".csv"),
+        )
         return f"## {title}\n\n{page['notes'].format(**numbers)}"
 
     @abstractmethod
@@ -82,7 +92,8 @@ class Figure10(Drawing):
         for sign, title in ((-1.0, "A < 0"), (1.0, "A > 0")):
             points = []
             for ratio in RATIOS.tolist():
-                # The loss is the mean of two terms; the second one has the ratio 1 and the opposite advantage.
+                # The loss is the mean of two terms; the second one has the ratio 1 and the opposite
+                # advantage.
                 old = (log_prob - torch.tensor([math.log(ratio), 0.0])).requires_grad_()
                 rows["action_log_prob"], rows["advantage"] = old, torch.tensor([[sign], [-sign]])
                 losses = ppo.losses(rows)
@@ -93,7 +104,11 @@ class Figure10(Drawing):
                 points.append((2 * float(losses["mean_ratio"]) - 1, gain, float(slope[0])))
             term, slopes = np.split(np.array(points), [2], axis=1)
             clipped.append(term[slopes[:, 0] == 0])
-            panels[title] = {"one term": term, "clipped": clipped[-1], "r = 1": np.array([[1.0, sign]])}
+            panels[title] = {
+                "one term": term,
+                "clipped": clipped[-1],
+                "r = 1": np.array([[1.0, sign]]),
+            }
         return panels, {"low": clipped[0][:, 0].max(), "high": clipped[1][:, 0].min()}
 
 
@@ -111,7 +126,12 @@ class OnTheWay(Drawing):
         state = env.reset()
         for _ in range(round(self.seconds * env.rate)):
             state = step_mdp(env.step(guide(state)))
-        return env, state["cones"], state["cone_count"], {"track": self.track.name, "seconds": self.seconds}
+        return (
+            env,
+            state["cones"],
+            state["cone_count"],
+            {"track": self.track.name, "seconds": self.seconds},
+        )
 
 
 class Figure19(OnTheWay):
@@ -122,10 +142,15 @@ class Figure19(OnTheWay):
         frame = Frame(env.pose.double())
         around = {"left cones": self.track.left, "right cones": self.track.right}
         around["middle"] = resample(self.track.middle(), 1.0)
-        series = {name: _facing_up(frame.to_car(torch.tensor(points.T))) for name, points in around.items()}
+        series = {
+            name: _facing_up(frame.to_car(torch.tensor(points.T)))
+            for name, points in around.items()
+        }
         seen = np.concatenate(list(_visible(cones[0], count[0]).values()))
         series["detected"] = np.stack([0 * seen, seen, seen + np.nan], 1).reshape(-1, 2)
-        for side, samples in zip(SIDES, frame.to_car(env.samples.double())[..., 0].unbind(2), strict=True):
+        for side, samples in zip(
+            SIDES, frame.to_car(env.samples.double())[..., 0].unbind(2), strict=True
+        ):
             series[f"estimate of the {side} boundary"] = _facing_up(samples)
         numbers |= {"left": int(count[0, 0]), "right": int(count[0, 1])}
         return {"": {**series, "car": np.zeros((1, 2))}}, numbers
@@ -136,8 +161,12 @@ class Figure21(Drawing):
 
     def _panels(self) -> Panels:
         tracks = shipped_tracks("train")[:4]
-        panels = {track.name: {"left cones": track.left, "right cones": track.right} for track in tracks}
-        return panels, {"lengths": ", ".join(f"{track.name} {track.length:.1f} m" for track in tracks)}
+        panels = {
+            track.name: {"left cones": track.left, "right cones": track.right} for track in tracks
+        }
+        return panels, {
+            "lengths": ", ".join(f"{track.name} {track.length:.1f} m" for track in tracks)
+        }
 
 
 class Figure26(Drawing):
@@ -151,7 +180,12 @@ class Figure26(Drawing):
         series = {**_visible(cones[0] / perception.scale, count[0]), "robot": np.zeros((1, 2))}
         series["LiDAR points"] = _facing_up(torch.from_numpy(np.stack([points.x, points.y])))
         counts = {name.split()[0]: len(of_name) for name, of_name in series.items()}
-        return {"": series}, {"scan": SCAN, "sight": perception.range_max, "side": perception.bearing_max, **counts}
+        return {"": series}, {
+            "scan": SCAN,
+            "sight": perception.range_max,
+            "side": perception.bearing_max,
+            **counts,
+        }
 
 
 class Figure30(Drawing):
@@ -161,8 +195,12 @@ class Figure30(Drawing):
         guide, alpha = SplineGuide(), torch.linspace(-60, 60, 121, dtype=torch.float64)
         ahead = torch.stack([alpha.deg2rad().cos(), alpha.deg2rad().sin()])
         angles = {d: guide.max_steering * guide._pursuit(d * ahead) for d in DISTANCES}
-        series = {f"d = {d:g} m": torch.stack([alpha, beta], 1).numpy() for d, beta in angles.items()}
-        return {"": series}, {"greatest": ", ".join(f"{beta[-1]:.1f}° at {d:g} m" for d, beta in angles.items())}
+        series = {
+            f"d = {d:g} m": torch.stack([alpha, beta], 1).numpy() for d, beta in angles.items()
+        }
+        return {"": series}, {
+            "greatest": ", ".join(f"{beta[-1]:.1f}° at {d:g} m" for d, beta in angles.items())
+        }
 
 
 class Figure31(OnTheWay):

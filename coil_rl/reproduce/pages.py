@@ -29,7 +29,13 @@ class Claim(NamedTuple):
         if number is None:
             return None
         decided = p < SIGNIFICANT
-        word = "undecided" if not decided else "held up" if self.sign * self.estimate.mean > 0 else "did not hold up"
+        word = (
+            "undecided"
+            if not decided
+            else "held up"
+            if self.sign * self.estimate.mean > 0
+            else "did not hold up"
+        )
         seeds = "1 seed" if self.estimate.seeds == 1 else f"{self.estimate.seeds} seeds"
         return f"**{word}**: {number}, {seeds}" + ("" if math.isnan(p) else f", p {p:.3f}")
 
@@ -42,13 +48,22 @@ def certain_verdict(holds: bool, details: str) -> str:
 def claims_section(claims: Sequence[Mapping[str, Any]], columns: Mapping[str, str]) -> str:
     """Return the last section of a page, a table of claims: `claim`, `world`, and cells of the columns by key.
 
-    Cells that are a `Claim` become verdicts; those of a world are a family of tests. The main world is "", or missing.
+    Cells that are a `Claim` become verdicts; those of a world are a family of tests. The main world
+    is "", or missing.
     """
     headings = {key: (heading, "") for key, heading in {"claim": "claim", **columns}.items()}
-    found = [(row.get("world"), cell.estimate.p) for row in claims for cell in row.values() if isinstance(cell, Claim)]
+    found = [
+        (row.get("world"), cell.estimate.p)
+        for row in claims
+        for cell in row.values()
+        if isinstance(cell, Claim)
+    ]
     corrected = {world: iter(holm([p for of, p in found if of == world])) for world in dict(found)}
     rows = [
-        {key: cell.verdict(float(next(p))) if isinstance(cell, Claim) else cell for key, cell in row.items()}
+        {
+            key: cell.verdict(float(next(p))) if isinstance(cell, Claim) else cell
+            for key, cell in row.items()
+        }
         | {"claim": ", ".join(filter(None, [row["claim"], row.get("world")]))}
         for row in claims
         for p in [corrected.get(row.get("world"), iter(()))]
@@ -68,7 +83,10 @@ def page(text: str, name: str, note: str | None, origin: str) -> str:
     """
     heading, _, rest = text.partition("\n")
     picture = f"![{heading.lstrip('# ')}]({name}.png)"
-    return "\n\n".join([heading, *_warning(note), picture, rest.strip(), f"{FOOTER}{origin}</sub>"]) + "\n"
+    return (
+        "\n\n".join([heading, *_warning(note), picture, rest.strip(), f"{FOOTER}{origin}</sub>"])
+        + "\n"
+    )
 
 
 def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
@@ -88,21 +106,33 @@ def origin(command: str, commit: str, runs: Sequence[Run] = ()) -> str:
 
 
 def all_results(
-    pages: Mapping[str, str | None], commands: Mapping[str, str], command: str, note: str | None,
-    known_problems: Iterable[str], not_reproduced: Iterable[str],
-) -> str:  # fmt: skip
+    pages: Mapping[str, str | None],
+    commands: Mapping[str, str],
+    command: str,
+    note: str | None,
+    known_problems: Iterable[str],
+    not_reproduced: Iterable[str],
+) -> str:
     """Return RESULTS.md, given the page (None if missing) and the command of each result, and the command of all."""
     split = [_split_claims(text) for text in pages.values() if text is not None]
     parts = ["# Results", *_warning(note), PAGES["results"]["introduction"].format(command=command)]
-    if claims := [f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table]:
+    if claims := [
+        f"**{text.splitlines()[0].lstrip('# ')}**\n\n{table}" for text, table in split if table
+    ]:
         verdicts = PAGES["results"]["verdicts"].format(seeds=SIGN_FLIP_SEEDS)
         parts += ["## What held up, and what did not", verdicts, *claims]
     parts += [text.replace(f"> **{note}**\n\n", "").strip() for text, _ in split]
     if missing := [f"- `{commands[name]}`" for name, text in pages.items() if text is None]:
         parts += ["## Not made yet", "\n".join(missing)]
-    lists = {"What is known about the paper's numbers": known_problems, "What cannot be shown here": not_reproduced}
+    lists = {
+        "What is known about the paper's numbers": known_problems,
+        "What cannot be shown here": not_reproduced,
+    }
     for heading, sentences in lists.items():
-        parts += [f"## {heading}", "\n".join(f"- {' '.join(sentence.split())}" for sentence in sentences)]
+        parts += [
+            f"## {heading}",
+            "\n".join(f"- {' '.join(sentence.split())}" for sentence in sentences),
+        ]
     return "\n\n".join(parts) + "\n"
 
 

@@ -15,7 +15,9 @@ from coil_rl.report.runs import Run
 Runs = Mapping[str, Sequence[Run]]  # finished runs by experiment, a file name in `conf/experiment`
 NO_RUNS: Runs = MappingProxyType({})
 # By result: the paper's numbers and claims, and notes on the tables.
-PAGES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "result_pages.yaml").read_text("utf-8"))
+PAGES: Any = yaml.safe_load(
+    (resources.files("coil_rl.conf") / "result_pages.yaml").read_text("utf-8")
+)
 
 
 class Result(ABC):
@@ -27,23 +29,31 @@ class Result(ABC):
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
         """Make the result from the finished runs of its experiments, and return its page in Markdown.
 
-        The numbers are written to `stem.csv`, the picture to `stem.png`; `stem` is a path without suffix.
+        The numbers are written to `stem.csv`, the picture to `stem.png`; `stem` is a path without
+        suffix.
         """
 
 
 class WorldsResult(Result):
     """A result about runs in the main world and in variants of it.
 
-    `experiments` are in the main world, and `worlds` has those in each variant by its name. The other runs are compared
-    with those of the label `against`.
+    `experiments` are in the main world, and `worlds` has those in each variant by its name. The
+    other runs are compared with those of the label `against`.
     """
 
     def __init__(
-        self, experiments: Sequence[str], worlds: Mapping[str, Sequence[str]] | None = None, against: str = "ppo"
+        self,
+        experiments: Sequence[str],
+        worlds: Mapping[str, Sequence[str]] | None = None,
+        against: str = "ppo",
     ) -> None:
         # The main world has no name.
-        self.worlds = {"": list(experiments)} | {name: list(variant) for name, variant in (worlds or {}).items()}
-        self.experiments = [experiment for experiments in self.worlds.values() for experiment in experiments]
+        self.worlds = {"": list(experiments)} | {
+            name: list(variant) for name, variant in (worlds or {}).items()
+        }
+        self.experiments = [
+            experiment for experiments in self.worlds.values() for experiment in experiments
+        ]
         self.against = against
 
 
@@ -54,5 +64,7 @@ def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
     for label, of_label in selected.items():
         if not of_label:
             existing = ", ".join(dict.fromkeys(run.label for run in available)) or "none"
-            raise UserError(f"no run of {', '.join(runs)} has the label {label}; available: {existing}")
+            raise UserError(
+                f"no run of {', '.join(runs)} has the label {label}; available: {existing}"
+            )
     return selected

@@ -1,8 +1,8 @@
 """The claim that COIL is "at least as good as its guide" (paper 3.2), tested with tabular COIL.
 
-Q-learning with a guide's advice on random worlds, small enough to compute the value of each policy exactly, so that
-every case is a yes or a no; next to it Q-learning without advice. The agent observes the state, or only its class out
-of a few; the guide always observes the state.
+Q-learning with a guide's advice on random worlds, small enough to compute the value of each policy
+exactly, so that every case is a yes or a no; next to it Q-learning without advice. The agent
+observes the state, or only its class out of a few; the guide always observes the state.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -44,18 +44,30 @@ class TabularCoil(Result):
     epsilon: float = 0.2  # see `q_learning`
     power: float = 0.6  # see `q_learning`
     episode_steps: int = 50  # length of an episode
-    steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000)  # after which the policies are evaluated
+    steps: Sequence[int] = (
+        100,
+        300,
+        1_000,
+        3_000,
+        10_000,
+        30_000,
+    )  # after which the policies are evaluated
 
     def __post_init__(self) -> None:
         check_range(1, worlds=self.worlds, actions=self.actions, classes=self.classes)
         if self.states < max(3, self.classes):
-            raise ValueError(f"states={self.states} must be at least 3, and at least classes={self.classes}")
+            raise ValueError(
+                f"states={self.states} must be at least 3, and at least classes={self.classes}"
+            )
         check_range(0, 1, noise=self.noise)
         self.steps = tuple(self.steps)
         if not self.steps or list(self.steps) != sorted(set(self.steps)) or self.steps[0] < 1:
             raise ValueError(f"steps={list(self.steps)} must be increasing integers from 1")
         self.learn = partial(
-            tabular.q_learning, epsilon=self.epsilon, power=self.power, episode_steps=self.episode_steps
+            tabular.q_learning,
+            epsilon=self.epsilon,
+            power=self.power,
+            episode_steps=self.episode_steps,
         )
         self.learn(tabular.toymaker(), 0, np.random.default_rng(0))  # checks its options
         self.guides: Mapping[str, Callable[[tabular.MDP], Array]] = {
@@ -70,17 +82,30 @@ class TabularCoil(Result):
         seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
         rows = [row for seed in seeds for row in self._world(seed)]
         write_csv(rows, stem.with_suffix(".csv"))
-        groups = [self._group(rows, view, guide) for view in ("state", "class") for guide in self.guides]
+        groups = [
+            self._group(rows, view, guide) for view in ("state", "class") for guide in self.guides
+        ]
         _draw(groups, self.steps, stem.with_suffix(".png"))
-        table = markdown_table(groups, {
-            "view": ("agent observes", ""), "guide": ("guide", ""), "guide_score": ("guide's score", ".2f"),
-            "coil_score": ("COIL", ".2f"), "plain_score": ("plain", ".2f"),
-            **{f"share_{n}": (f"≥ guide, {n:,} steps", ".0%") for n in self.steps[-1::-2][::-1]},
-            "interval": ("95 %", ""), "nearly": (f"≥ guide - {NEARLY}", ".0%"),
-            "plain_share": ("plain ≥ guide", ".0%"),
-        })  # fmt: skip
+        table = markdown_table(
+            groups,
+            {
+                "view": ("agent observes", ""),
+                "guide": ("guide", ""),
+                "guide_score": ("guide's score", ".2f"),
+                "coil_score": ("COIL", ".2f"),
+                "plain_score": ("plain", ".2f"),
+                **{
+                    f"share_{n}": (f"≥ guide, {n:,} steps", ".0%") for n in self.steps[-1::-2][::-1]
+                },
+                "interval": ("95 %", ""),
+                "nearly": (f"≥ guide - {NEARLY}", ".0%"),
+                "plain_share": ("plain ≥ guide", ".0%"),
+            },
+        )
         reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)
-        ours = pages.certain_verdict(reached == cases, f"in {reached} of {cases} worlds, guides and views")
+        ours = pages.certain_verdict(
+            reached == cases, f"in {reached} of {cases} worlds, guides and views"
+        )
         claims = [{"claim": "COIL ends at least as good as its guide, guaranteed", "ours": ours}]
         section = pages.claims_section(claims, {"ours": f"ours, {self.steps[-1]:,} steps"})
         notes = PAGES["tabular_coil"]["notes"].format(worlds=self.worlds)
@@ -90,8 +115,14 @@ class TabularCoil(Result):
         """Yield the scores in one world, a row for each view, guide and number of steps."""
         rng = np.random.default_rng(seed)
         mdp = tabular.garnet(self.states, self.actions, rng)
-        views = {"state": np.arange(self.states), "class": rng.permutation(self.states) % self.classes}
-        random, best = _value(mdp, random_guide(mdp)), _value(mdp, tabular.value_iteration(mdp).policy)
+        views = {
+            "state": np.arange(self.states),
+            "class": rng.permutation(self.states) % self.classes,
+        }
+        random, best = (
+            _value(mdp, random_guide(mdp)),
+            _value(mdp, tabular.value_iteration(mdp).policy),
+        )
         for view, observations in views.items():
             plain = self._learned_values(mdp, observations, seed)
             for name, guide in self.guides.items():
@@ -108,27 +139,36 @@ class TabularCoil(Result):
     def _learned_values(self, mdp: tabular.MDP, observations: Integers, seed: int) -> Array:
         """Return the value of the greedy policy after each number of steps."""
         rng = np.random.default_rng(seed)
-        learned = self.learn(mdp, self.steps[-1], rng, observations=observations, snapshots=self.steps)
+        learned = self.learn(
+            mdp, self.steps[-1], rng, observations=observations, snapshots=self.steps
+        )
         return np.array([_value(mdp, Q.argmax(axis=1)[observations]) for Q in learned.history])
 
     def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:
         """Return shares and mean scores over all worlds, for one view and guide."""
         of_group = [row for row in rows if row["view"] == view and row["guide"] == guide]
-        scores = [[row[f"{agent}_score"] for row in of_group] for agent in ("guide", "coil", "plain")]
+        scores = [
+            [row[f"{agent}_score"] for row in of_group] for agent in ("guide", "coil", "plain")
+        ]
         own, coil, plain = np.array(scores).reshape(3, self.worlds, len(self.steps))
         reached = (coil >= own - ROUNDING).sum(axis=0)
         shares = reached / self.worlds
         interval = binomtest(int(reached[-1]), self.worlds).proportion_ci(method="wilson")
         return {
-            "view": "the state" if view == "state" else f"one of {self.classes} classes", "guide": guide,
-            "guide_score": own.mean(), "coil_score": coil[:, -1].mean(), "plain_score": plain[:, -1].mean(),
+            "view": "the state" if view == "state" else f"one of {self.classes} classes",
+            "guide": guide,
+            "guide_score": own.mean(),
+            "coil_score": coil[:, -1].mean(),
+            "plain_score": plain[:, -1].mean(),
             **{f"share_{n}": share for n, share in zip(self.steps, shares, strict=True)},
             "interval": f"{interval.low:.0%} to {interval.high:.0%}",
             "nearly": (coil[:, -1] >= own[:, -1] - NEARLY).mean(),
             "plain_share": (plain >= own - ROUNDING).mean(axis=0)[-1],
-            "reached": int(reached[-1]), "shares": shares,
-            "coil_scores": coil.mean(axis=0), "plain_scores": plain.mean(axis=0),
-        }  # fmt: skip
+            "reached": int(reached[-1]),
+            "shares": shares,
+            "coil_scores": coil.mean(axis=0),
+            "plain_scores": plain.mean(axis=0),
+        }
 
 
 def _value(mdp: tabular.MDP, policy: Array | Integers) -> float:
@@ -138,24 +178,34 @@ def _value(mdp: tabular.MDP, policy: Array | Integers) -> float:
 
 def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path) -> None:
     """Draw one column per view: shares above, scores below."""
-    views, guides = (list(dict.fromkeys(group[key] for group in groups)) for key in ("view", "guide"))
+    views, guides = (
+        list(dict.fromkeys(group[key] for group in groups)) for key in ("view", "guide")
+    )
     lines: dict[str, Any] = {
         name: {"color": colour, "lw": 2, "marker": "o", "ms": 4}
         for name, colour in zip(guides, style.AGENTS, strict=False)
     }
     handles = [Line2D([], [], label=f"COIL, guide {name}", **line) for name, line in lines.items()]
     handles.append(Line2D([], [], label="plain Q-learning", **PLAIN))
-    handles.append(Line2D([], [], color=style.QUIET, lw=1.2, ls=style.DASHED, label="guide alone (its colour)"))
+    handles.append(
+        Line2D([], [], color=style.QUIET, lw=1.2, ls=style.DASHED, label="guide alone (its colour)")
+    )
     with style.picture(path, "Tabular COIL and its guides", handles, height=5.6) as figure:
         grid = figure.subplots(2, len(views), sharex=True, sharey="row", squeeze=False)
         for (share, score), view in zip(grid.T, views, strict=True):
             of_view = [group for group in groups if group["view"] == view]
             for index, group in enumerate(of_view):
                 line = lines[group["guide"]]
-                shift = ScaledTranslation(0, (index - 1.5) * LINE_OFFSET / 72, figure.dpi_scale_trans)
-                share.plot(steps, group["shares"], transform=share.transData + shift, clip_on=False, **line)
+                shift = ScaledTranslation(
+                    0, (index - 1.5) * LINE_OFFSET / 72, figure.dpi_scale_trans
+                )
+                share.plot(
+                    steps, group["shares"], transform=share.transData + shift, clip_on=False, **line
+                )
                 score.plot(steps, group["coil_scores"], **line)
-                score.axhline(group["guide_score"], color=line["color"], lw=1.2, ls=style.DASHED, zorder=1.5)
+                score.axhline(
+                    group["guide_score"], color=line["color"], lw=1.2, ls=style.DASHED, zorder=1.5
+                )
                 if group["guide_score"] < LOWEST_SCORE:
                     text = f"↓ guide {group['guide']} at {group['guide_score']:.2f}"
                     where = {"xycoords": "axes fraction", "textcoords": "offset points"}

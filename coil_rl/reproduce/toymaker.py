@@ -34,18 +34,32 @@ class Table1(Result):
         Q = value_iteration(mdp, self.tolerance).Q
         rows = [
             {
-                "state": mdp.states[s], "action": mdp.actions[a], "ours": Q[s, a], "paper": PAPER_Q[s, a],
+                "state": mdp.states[s],
+                "action": mdp.actions[a],
+                "ours": Q[s, a],
+                "paper": PAPER_Q[s, a],
                 "difference": Q[s, a] - PAPER_Q[s, a],
             }
             for s, a in np.ndindex(Q.shape)
-        ]  # fmt: skip
+        ]
         write_csv(rows, stem.with_suffix(".csv"))
         difference = (Q - PAPER_Q).flatten()
-        _draw_differences([f"{row['state']}, {row['action']}" for row in rows], difference, stem.with_suffix(".png"))
-        table = markdown_table([row | {"rounded": row["ours"]} for row in rows], {
-            "state": ("state", ""), "action": ("action", ""), "ours": ("Q", ".4f"), "rounded": ("rounded", ".2f"),
-            "paper": ("paper", ".2f"), "difference": ("difference", "+.4f"),
-        })  # fmt: skip
+        _draw_differences(
+            [f"{row['state']}, {row['action']}" for row in rows],
+            difference,
+            stem.with_suffix(".png"),
+        )
+        table = markdown_table(
+            [row | {"rounded": row["ours"]} for row in rows],
+            {
+                "state": ("state", ""),
+                "action": ("action", ""),
+                "ours": ("Q", ".4f"),
+                "rounded": ("rounded", ".2f"),
+                "paper": ("paper", ".2f"),
+                "difference": ("difference", "+.4f"),
+            },
+        )
         equal, largest = int((np.abs(difference) <= ROUNDING).sum()), np.abs(difference).max()
         notes = (
             f"{equal} of {len(difference)} values round to the printed ones; the largest difference is {largest:.4f}. "
@@ -83,18 +97,28 @@ class Figure6(Result):
         _draw_convergence(mdp.states, history[: len(rows)], limit, stem.with_suffix(".png"))
         paper = f"about {PAPER_ITERATIONS}"
         table = markdown_table(
-            [{"short": share, "ours": int((error > share).sum()), "paper": paper} for share in SHARES],
-            {"short": ("short of its limit by", ".1%"), "ours": ("iterations", "d"), "paper": ("paper", "")},
+            [
+                {"short": share, "ours": int((error > share).sum()), "paper": paper}
+                for share in SHARES
+            ],
+            {
+                "short": ("short of its limit by", ".1%"),
+                "ours": ("iterations", "d"),
+                "paper": ("paper", ""),
+            },
         )
         after = history[min(PAPER_ITERATIONS, len(history) - 1)]
-        values = ", ".join(f"{value:.2f} of {final:.2f}" for value, final in zip(after, limit, strict=True))
+        values = ", ".join(
+            f"{value:.2f} of {final:.2f}" for value, final in zip(after, limit, strict=True)
+        )
         notes = f"After {PAPER_ITERATIONS} iterations V is {values}. The paper does not define convergence."
         return f"## Figure 6: value iteration on the toymaker\n\n{table}\n\n{notes}"
 
 
 def most_explained(differences: Array) -> int:
     """Return the largest number of differences that one common shift brings within rounding."""
-    # Among intervals of equal width, the most that share a point share the lower end of one of them.
+    # Among intervals of equal width, the most that share a point share the lower end of one of
+    # them.
     lower = differences - ROUNDING
     return max(int(((lower <= end) & (end <= lower + 2 * ROUNDING)).sum()) for end in lower)
 
@@ -104,12 +128,16 @@ def _draw_differences(labels: list[str], differences: Array, path: Path) -> None
         Line2D([], [], color=style.AGENTS[0], ls="", marker="o", ms=6, label="ours - paper"),
         Patch(color=style.ASPHALT, lw=0, label="rounding to two decimals"),
     ]
-    with style.picture(path, "Table 1: Q of the toymaker, beside the paper's", handles, height=2.4) as figure:
+    with style.picture(
+        path, "Table 1: Q of the toymaker, beside the paper's", handles, height=2.4
+    ) as figure:
         axes = figure.add_subplot(xlabel="difference of Q")
         style.lighten(axes, grid="x")
         axes.axvspan(-ROUNDING, ROUNDING, color=style.ASPHALT, lw=0)
         axes.axvline(0, color=style.KERB, lw=1)
-        axes.plot(differences, range(len(differences)), color=style.AGENTS[0], ls="", marker="o", ms=6)
+        axes.plot(
+            differences, range(len(differences)), color=style.AGENTS[0], ls="", marker="o", ms=6
+        )
         axes.set_yticks(range(len(differences)), labels)
         reach = 1.15 * max(3 * ROUNDING, float(np.abs(differences).max()))
         axes.set(xlim=(-reach, reach), ylim=(len(differences) - 0.5, -0.5))
@@ -118,7 +146,9 @@ def _draw_differences(labels: list[str], differences: Array, path: Path) -> None
 def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, path: Path) -> None:
     dashes: Any = {"color": style.QUIET, "ls": style.DASHED, "lw": 1.3}
     colours = dict(zip(states, style.AGENTS, strict=False))
-    handles: list[Artist] = [Line2D([], [], color=c, lw=2, label=f"V of {state}") for state, c in colours.items()]
+    handles: list[Artist] = [
+        Line2D([], [], color=c, lw=2, label=f"V of {state}") for state, c in colours.items()
+    ]
     handles.append(Line2D([], [], label="limit", **dashes))
     with style.picture(path, "Figure 6: value iteration on the toymaker", handles, 4.2) as figure:
         axes = figure.add_subplot(xlabel="iteration", ylabel="V", xlim=(0, len(history) - 1))
@@ -129,6 +159,10 @@ def _draw_convergence(states: tuple[str, ...], history: Array, limit: Array, pat
         if len(history) > PAPER_ITERATIONS + 1:
             axes.axvline(PAPER_ITERATIONS, color=style.KERB, lw=1)
             axes.annotate(
-                f"paper: converged\nafter about {PAPER_ITERATIONS}", (PAPER_ITERATIONS, 0), (4, 6),
-                xycoords=("data", "axes fraction"), textcoords="offset points", color=style.QUIET,
-            )  # fmt: skip
+                f"paper: converged\nafter about {PAPER_ITERATIONS}",
+                (PAPER_ITERATIONS, 0),
+                (4, 6),
+                xycoords=("data", "axes fraction"),
+                textcoords="offset points",
+                color=style.QUIET,
+            )

@@ -36,21 +36,32 @@ class Table4(WorldsResult):
             ]
             for world, experiments in self.worlds.items()
         }
-        write_csv([{"world": world} | row for world in rows for row in rows[world]], stem.with_suffix(".csv"))
+        write_csv(
+            [{"world": world} | row for world in rows for row in rows[world]],
+            stem.with_suffix(".csv"),
+        )
         tables = {world: self._table(of_world) for world, of_world in rows.items()}
         _draw_returns(rows[""], tables[""], self.against, stem.with_suffix(".png"))
         columns = {
-            "label": ("method", ""), "runs": ("runs", "d"), "best cell": ("best: mean (95 %)", ""),
+            "label": ("method", ""),
+            "runs": ("runs", "d"),
+            "best cell": ("best: mean (95 %)", ""),
             "final cell": ("final: mean (95 %)", ""),
-            "guide": ("its guide", ".1f"), "difference cell": (f"best - {self.against}'s (95 %)", ""),
+            "guide": ("its guide", ".1f"),
+            "difference cell": (f"best - {self.against}'s (95 %)", ""),
             "better": (f"better than {self.against}", ".0%"),
-        }  # fmt: skip
+        }
         parts = ["## Table 4: the return of the trained policies", _paper_table(tables[""])]
         for world, table in tables.items():
             parts += [*pages.world_heading(world), markdown_table(table, columns)]
         parts += [PAGES["table_4"]["notes"].format(against=self.against)]
         claims = []
-        coil = [(world, line) for world, table in tables.items() for line in table if line["label"] == "coil"]
+        coil = [
+            (world, line)
+            for world, table in tables.items()
+            for line in table
+            if line["label"] == "coil"
+        ]
         for world, line in coil if self.against == "ppo" else []:
             row = {"world": world, "claim": "COIL's best return is above PPO's"}
             paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
@@ -69,27 +80,34 @@ class Table4(WorldsResult):
         for label, by_seed in by_label.items():
             best, final, guide = (np.array([row[key] for row in by_seed.values()]) for key in KEYS)
             common = [seed for seed in by_seed if seed in reference and label != self.against]
-            ours, theirs = (np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference))
+            ours, theirs = (
+                np.array([seeds[seed]["best"] for seed in common]) for seeds in (by_seed, reference)
+            )
             line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
             line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
             for key, values in {"best": best, "final": final, "difference": ours - theirs}.items():
                 line[key] = estimate(values)
                 line[f"{key} cell"] = line[key].cell("+.1f" if key == "difference" else ".1f")
             table.append(line)
-        return sorted(table, key=lambda line: -line["best"].mean if math.isfinite(line["best"].mean) else math.inf)
+        return sorted(
+            table,
+            key=lambda line: -line["best"].mean if math.isfinite(line["best"].mean) else math.inf,
+        )
 
 
 class Figure22(WorldsResult):
     """Learning curves of the runs with some labels, with the return of the guide of the first one as a line.
 
-    A label is drawn in every world that has runs of it. Variants of the main world have pictures of their own,
-    `stem_2.png` and so on.
+    A label is drawn in every world that has runs of it. Variants of the main world have pictures of
+    their own, `stem_2.png` and so on.
     """
 
     def __init__(
-        self, experiments: Sequence[str], labels: Sequence[str] = ("coil", "ppo"),
+        self,
+        experiments: Sequence[str],
+        labels: Sequence[str] = ("coil", "ppo"),
         worlds: Mapping[str, Sequence[str]] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(experiments, worlds)
         if not labels:
             raise ValueError("labels=[] draws nothing; give at least one")
@@ -102,23 +120,40 @@ class Figure22(WorldsResult):
         parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[Row]()
         for number, (world, experiments) in enumerate(self.worlds.items(), start=1):
             of_world = [run for experiment in experiments for run in learned[experiment]]
-            by_label = {label: [run for run in of_world if run.label == label] for label in self.labels}
+            by_label = {
+                label: [run for run in of_world if run.label == label] for label in self.labels
+            }
             by_label = {label: of_label for label, of_label in by_label.items() if of_label}
-            curves = {label: [run.curve for run in of_label] for label, of_label in by_label.items()}
-            own = [max(run.guide_returns.values()) for run in next(iter(by_label.values())) if run.guide_returns]
+            curves = {
+                label: [run.curve for run in of_label] for label, of_label in by_label.items()
+            }
+            own = [
+                max(run.guide_returns.values())
+                for run in next(iter(by_label.values()))
+                if run.guide_returns
+            ]
             guide = float(np.mean(own)) if own else math.nan
             means = {label: mean_curve(of_label, RETURN) for label, of_label in curves.items()}
             for label, curve in means.items():
-                values = [dict(zip(POINT, point, strict=True)) for point in zip(*curve, strict=True)]
+                values = [
+                    dict(zip(POINT, point, strict=True)) for point in zip(*curve, strict=True)
+                ]
                 rows += [{"world": world, "label": label, **point} for point in values]
             reached = {label: _frames_to(guide, of_label) for label, of_label in by_label.items()}
             picture = stem.with_name(f"{stem.name}_{number}.png" if world else f"{stem.name}.png")
-            title = ", ".join(filter(None, ("Figure 22: the return of the trained policies", world)))
+            title = ", ".join(
+                filter(None, ("Figure 22: the return of the trained policies", world))
+            )
             guides = {} if math.isnan(guide) else {GUIDE: guide}
             draw_learning_curves(curves, picture, guides=guides, title=title)
-            parts += [*pages.world_heading(world), *([f"![{title}]({picture.name})"] if world else [])]
+            parts += [
+                *pages.world_heading(world),
+                *([f"![{title}]({picture.name})"] if world else []),
+            ]
             parts += [_curve_table(means, by_label, reached)]
-            parts += [] if math.isnan(guide) else [f"The guide alone earns {guide:.1f} in these cases."]
+            parts += (
+                [] if math.isnan(guide) else [f"The guide alone earns {guide:.1f} in these cases."]
+            )
             claims += _claims(means, reached, world)
         write_csv(rows, stem.with_suffix(".csv"))
         parts.append(PAGES["figure_22"]["notes"])
@@ -126,7 +161,9 @@ class Figure22(WorldsResult):
         return "\n\n".join(parts)
 
 
-def _claims(means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str) -> list[Row]:
+def _claims(
+    means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[int, float]], world: str
+) -> list[Row]:
     """Return the verdicts on the learning curves in one world, as rows of `claims_section`."""
     claims: list[Row] = []
     for claim, driver, other in PAGES["figure_22"]["claims"]:
@@ -135,7 +172,9 @@ def _claims(means: Mapping[str, Sequence[Array]], reached: Mapping[str, Mapping[
         if claim == "above":
             (frames, mean, *_), (_, others, *_) = means[driver], means[other]
             above = (mean > others)[frames > 0]  # both begin untrained
-            ours: Any = pages.certain_verdict(bool(above.all()), f"at {above.sum()} of {len(above)} points")
+            ours: Any = pages.certain_verdict(
+                bool(above.all()), f"at {above.sum()} of {len(above)} points"
+            )
         else:
             seeds = sorted(reached[driver].keys() & reached[other].keys())
             more = [reached[driver][seed] - reached[other][seed] for seed in seeds]
@@ -156,9 +195,10 @@ def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:
 
 
 def _curve_table(
-    means: Mapping[str, Sequence[Array]], runs: Mapping[str, Sequence[Run]],
+    means: Mapping[str, Sequence[Array]],
+    runs: Mapping[str, Sequence[Run]],
     reached: Mapping[str, Mapping[int, float]],
-) -> str:  # fmt: skip
+) -> str:
     """Return the table of the curves of a world: returns after parts of the training, and frames up to the guide."""
     table = []
     for label, (frames, mean, low, high) in means.items():
@@ -170,7 +210,9 @@ def _curve_table(
                 line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
         table.append(line | {"reached": estimate(list(reached[label].values())).cell(",.0f")})
     columns = {"label": ("method", ""), "runs": ("runs", "d")}
-    columns |= {str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()}
+    columns |= {
+        str(f): (f"return after {text} of the frames (95 %)", "") for f, text in FRACTIONS.items()
+    }
     columns |= {"reached": ("frames up to the guide (95 %)", "")}
     return markdown_table(table, columns)
 
@@ -180,29 +222,50 @@ def _paper_table(table: Sequence[Row]) -> str:
     by_label = {line["label"]: line for line in table}
     rows: list[dict[str, Any]] = [{"source": "paper, best", **PAPER_RETURNS}]
     for key in ("best", "final"):
-        ours = {label: by_label[label][key].mean if label in by_label else None for label in PAPER_RETURNS}
+        ours = {
+            label: by_label[label][key].mean if label in by_label else None
+            for label in PAPER_RETURNS
+        }
         rows.append({"source": f"ours, {key}"} | ours)
     for row in rows:
         coil, ppo = row["coil"], row["ppo"]
         row["ratio"] = coil / ppo - 1 if coil is not None and ppo is not None and ppo > 0 else None
-    return markdown_table(rows, {
-        "source": ("mean over runs", ""), "coil": ("COIL", ".1f"), "ppo": ("RL (PPO)", ".1f"),
-        "ratio": ("COIL over RL", "+.1%"),
-    })  # fmt: skip
+    return markdown_table(
+        rows,
+        {
+            "source": ("mean over runs", ""),
+            "coil": ("COIL", ".1f"),
+            "ppo": ("RL (PPO)", ".1f"),
+            "ratio": ("COIL over RL", "+.1%"),
+        },
+    )
 
 
 def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path: Path) -> None:
     # One guide for all: guides with placebo advice would only stretch the axis.
-    guide = next((line["guide"] for line in table if line["label"] == against and math.isfinite(line["guide"])), None)
+    guide = next(
+        (
+            line["guide"]
+            for line in table
+            if line["label"] == against and math.isfinite(line["guide"])
+        ),
+        None,
+    )
     panels = {
         key: [
             Interval(
-                line["label"], line[key].mean, line[key].low, line[key].high, guide=guide,
-                points=[row[key] for row in rows if row["label"] == line["label"]] if line["runs"] > 1 else [],
+                line["label"],
+                line[key].mean,
+                line[key].low,
+                line[key].high,
+                guide=guide,
+                points=[row[key] for row in rows if row["label"] == line["label"]]
+                if line["runs"] > 1
+                else [],
             )
             for line in table
         ]
         for key in ("best", "final")
-    }  # fmt: skip
+    }
     title = "Table 4: the return of the trained policies"
     draw_intervals(panels, path, measure="return (mean of the runs)", title=title)

@@ -17,7 +17,14 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC, OneClassSVM
 
-from coil_rl.envs.robot.clusters import FEATURES, Array, Integers, measure, points_of, single_linkage
+from coil_rl.envs.robot.clusters import (
+    FEATURES,
+    Array,
+    Integers,
+    measure,
+    points_of,
+    single_linkage,
+)
 from coil_rl.envs.robot.drives import SimulatedDrive
 from coil_rl.envs.robot.lidar import RANGE_MIN
 from coil_rl.envs.robot.perception import ConeClassifier
@@ -25,7 +32,9 @@ from coil_rl.errors import UserError
 from coil_rl.files import write_text
 
 Flags = NDArray[np.bool_]
-Scans = tuple[NDArray[np.floating], NDArray[np.floating]]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
+Scans = tuple[
+    NDArray[np.floating], NDArray[np.floating]
+]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
 
 FOLDS = 5
 EVERY = 4  # scans, as neighbouring scans are nearly equal
@@ -77,31 +86,48 @@ def share_of(correct: int, total: int) -> Share:
     return Share(correct / total, float(low), float(high), total - correct, total)
 
 
-def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int = FOLDS) -> Training:
+def train_classifier(
+    features: Array, thick: Flags, drives: Integers, folds: int = FOLDS
+) -> Training:
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
-    Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001) with a small share of
-    exceptions tells cones from other objects. Fewer groups than folds, or only one kind of cone, are a `UserError`.
+    Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001)
+    with a small share of exceptions tells cones from other objects. Fewer groups than folds, or
+    only one kind of cone, are a `UserError`.
 
     Args:
         features: [N, 3] m, width, depth and girth of each cluster.
         thick: [N] whether the cone is thick.
-        drives: [N] group of each cluster; a group is held out as a whole and should have both kinds of cone.
+        drives: [N] group of each cluster; a group is held out as a whole and should have both kinds
+            of cone.
         folds: number of folds.
     """
     groups = len(np.unique(drives))
     if groups < max(2, folds):
-        raise UserError(f"{groups} drives are too few for {folds} folds; record more, or set folds to at most {groups}")
+        raise UserError(
+            f"{groups} drives are too few for {folds} folds; record more, or set folds to at most {groups}"
+        )
     if thick.all() or not thick.any():
-        raise UserError(f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing")
+        raise UserError(
+            f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing"
+        )
     pipeline = make_pipeline(StandardScaler(), SVC(C=100.0))
     splits = GroupKFold(folds).split(features, thick, drives)
     try:
-        predicted = cross_validate(pipeline, features, thick, cv=splits, return_indices=True, error_score="raise")
+        predicted = cross_validate(
+            pipeline, features, thick, cv=splits, return_indices=True, error_score="raise"
+        )
     except ValueError:
-        raise UserError("without one fold only one kind of cone is left; number the drives in pairs") from None
+        raise UserError(
+            "without one fold only one kind of cone is left; number the drives in pairs"
+        ) from None
     accuracy = predicted["test_score"]
-    correct = round(sum(score * len(rows) for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)))
+    correct = round(
+        sum(
+            score * len(rows)
+            for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)
+        )
+    )
     scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
     known = OneClassSVM(nu=UNUSUAL, gamma=machine.gamma).fit(scaler.transform(features))
     machines = (machine, known)
@@ -109,7 +135,9 @@ def train_classifier(features: Array, thick: Flags, drives: Integers, folds: int
     weights = block_diag(*(each.dual_coef_ for each in machines))
     intercept = np.concatenate([each.intercept_ for each in machines])
     # The value of gamma="scale" has no public name.
-    classifier = ConeClassifier(scaler.mean_, scaler.scale_, support, weights, intercept, float(machine._gamma))
+    classifier = ConeClassifier(
+        scaler.mean_, scaler.scale_, support, weights, intercept, float(machine._gamma)
+    )
     return Training(classifier, accuracy, correct, len(features))
 
 
@@ -122,15 +150,23 @@ def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
     if pairs < 2:
         given = f"{len(left)} drives past left cones and {len(right)} past right ones"
         raise UserError(f"{given} are too few to learn from; record two of each, better five")
-    (thin, thin_drive), (thick, thick_drive) = clusters_in_range(left, EVERY), clusters_in_range(right, EVERY)
+    (thin, thin_drive), (thick, thick_drive) = (
+        clusters_in_range(left, EVERY),
+        clusters_in_range(right, EVERY),
+    )
     features = np.concatenate([thin, thick])
     is_thick = np.arange(len(features)) >= len(thin)
-    return train_classifier(features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs))
+    return train_classifier(
+        features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs)
+    )
 
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
     """Write a classifier as JSON."""
-    lines = [f'  "{part.name}": {json.dumps(getattr(classifier, part.name).tolist())}' for part in fields(classifier)]
+    lines = [
+        f'  "{part.name}": {json.dumps(getattr(classifier, part.name).tolist())}'
+        for part in fields(classifier)
+    ]
     write_text(Path(path), "{\n" + ",\n".join(lines) + "\n}")
 
 
@@ -139,11 +175,17 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
     try:
         classifier = ConeClassifier(**json.loads(Path(path).read_text(encoding="utf-8")))
     except OSError as error:
-        raise UserError(f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot") from None
+        raise UserError(
+            f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot"
+        ) from None
     except (ValueError, TypeError) as error:
-        raise UserError(f"{path} is not a cone classifier ({error}); train one with coil-reproduce figure=25") from None
+        raise UserError(
+            f"{path} is not a cone classifier ({error}); train one with coil-reproduce figure=25"
+        ) from None
     if len(classifier.mean) != len(FEATURES):
-        raise UserError(f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again")
+        raise UserError(
+            f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again"
+        )
     return classifier
 
 
@@ -155,20 +197,28 @@ def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, I
         points = points_of(ranges[::every], own_angles[::every], RANGE_MIN, RANGE + MARGIN)
         clusters = measure(points, single_linkage(points))
         features.append(clusters.features[np.hypot(*clusters.centroid.T) <= RANGE])
-    return np.concatenate(features), np.repeat(np.arange(len(features)), [len(rows) for rows in features])
+    return np.concatenate(features), np.repeat(
+        np.arange(len(features)), [len(rows) for rows in features]
+    )
 
 
-def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE) -> LabelledClusters:
+def label_clusters(
+    drives: Sequence[SimulatedDrive], max_distance: float = RANGE
+) -> LabelledClusters:
     """Return the clusters of drives up to a distance in m, labelled with the cone of most of their points.
 
     Clusters of outliers alone are left out.
     """
     columns: list[list[NDArray[np.generic]]] = []
     for number, drive in enumerate(drives):
-        points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
+        points = points_of(
+            drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN
+        )
         label = single_linkage(points)
         clusters = measure(points, label)
-        votes = np.zeros((int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64)  # last: no cone
+        votes = np.zeros(
+            (int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64
+        )  # last: no cone
         np.add.at(votes, (label, drive.hit.numpy()[points.scan, points.beam]), 1)
         cone = np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)[clusters.label]
         distance = np.hypot(*clusters.centroid.T)
@@ -176,19 +226,28 @@ def label_clusters(drives: Sequence[SimulatedDrive], max_distance: float = RANGE
         cone, scan = cone[rows], clusters.scan[rows]
         thick, visibility = drive.thick.numpy()[cone], drive.visibility.numpy()[scan, cone]
         drive_index = np.full(len(cone), number)
-        columns.append([clusters.features[rows], thick, drive_index, scan, cone, distance[rows], visibility])
+        columns.append(
+            [clusters.features[rows], thick, drive_index, scan, cone, distance[rows], visibility]
+        )
     return LabelledClusters(*(np.concatenate(column) for column in zip(*columns, strict=True)))
 
 
 def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
     """Return the share of correctly classified clusters of cones: `all`, by range, and by visibility of the cone."""
-    return _shares(classifier.classify(labelled.features) == labelled.thick, labelled.distance, labelled.visibility)
+    return _shares(
+        classifier.classify(labelled.features) == labelled.thick,
+        labelled.distance,
+        labelled.visibility,
+    )
 
 
-def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict[str, dict[str, Share]]:
+def recall(
+    classifier: ConeClassifier, drives: Sequence[SimulatedDrive]
+) -> dict[str, dict[str, Share]]:
     """Return the share of `thin` and of `thick` cones with a correctly classified cluster.
 
-    A cone counts if its surface is in range and at least one beam hits it. Shares: `all`, by range, by visibility.
+    A cone counts if its surface is in range and at least one beam hits it. Shares: `all`, by range,
+    by visibility.
     """
     labelled = label_clusters(drives, RANGE + MARGIN)
     correct = classifier.classify(labelled.features) == labelled.thick
@@ -203,13 +262,21 @@ def recall(classifier: ConeClassifier, drives: Sequence[SimulatedDrive]) -> dict
         in_range = (distance > RANGE_MIN) & (distance <= RANGE) & (visibility > 0)
         for name, thick in (("thin", False), ("thick", True)):
             cells = in_range & (drive.thick.numpy() == thick)
-            columns[name].append([recognised[cells].astype(float), distance[cells], visibility[cells]])
-    return {name: _shares(*map(np.concatenate, zip(*rows, strict=True))) for name, rows in columns.items()}
+            columns[name].append(
+                [recognised[cells].astype(float), distance[cells], visibility[cells]]
+            )
+    return {
+        name: _shares(*map(np.concatenate, zip(*rows, strict=True)))
+        for name, rows in columns.items()
+    }
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
     shares = {"all": share_of(int(correct.sum()), len(correct))}
-    for name, value, bins in (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS)):
+    for name, value, bins in (
+        ("m", distance, RANGE_BINS),
+        ("visible", visibility, VISIBILITY_BINS),
+    ):
         for low, high in pairwise(bins):
             rows = (value > low) & (value <= high)
             shares[f"{low:g}-{high:g} {name}"] = share_of(int(correct[rows].sum()), int(rows.sum()))

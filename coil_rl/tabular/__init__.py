@@ -1,7 +1,8 @@
 """Tabular methods of the paper's second section.
 
-In the paper's order: `mdp`, Markov decision processes as arrays; `planning`, dynamic programming with a known model;
-`learning`, control from sampled transitions; `coil`, the same methods with a guide's advice.
+In the paper's order: `mdp`, Markov decision processes as arrays; `planning`, dynamic programming
+with a known model; `learning`, control from sampled transitions; `coil`, the same methods with a
+guide's advice.
 """
 
 from coil_rl.tabular.coil import observations_with_advice as observations_with_advice

@@ -1,12 +1,14 @@
 """Tabular COIL: the guide's action becomes part of the state (equation 97).
 
-The policy is pi(s, a_guide(s), a). The world in which the advice belongs to the state is again a Markov decision
-process, so every method for Markov decision processes is COIL there, Q-learning included.
+The policy is pi(s, a_guide(s), a). The world in which the advice belongs to the state is again a
+Markov decision process, so every method for Markov decision processes is COIL there, Q-learning
+included.
 
-Advice does not help an agent that observes the whole state: the best policy is as good without it. Deterministic advice
-only renames the states, and random advice adds states to learn. Advice helps an agent with fewer observations than the
-guide: following the guide becomes one of its policies, so the best COIL policy is at least as good as the guide. There
-is no guarantee that Q-learning finds it.
+Advice does not help an agent that observes the whole state: the best policy is as good without it.
+Deterministic advice only renames the states, and random advice adds states to learn. Advice helps
+an agent with fewer observations than the guide: following the guide becomes one of its policies, so
+the best COIL policy is at least as good as the guide. There is no guarantee that Q-learning finds
+it.
 """
 
 import numpy as np
@@ -19,8 +21,8 @@ from coil_rl.tabular.planning import value_iteration
 def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
     """Return the world with the guide's advice in the state.
 
-    The guide's policy is actions [S], or their probabilities [S, A]; then one is drawn whenever a state is entered. Of
-    the S * A states of the result, s * A + g is state s with the advice g.
+    The guide's policy is actions [S], or their probabilities [S, A]; then one is drawn whenever a
+    state is entered. Of the S * A states of the result, s * A + g is state s with the advice g.
 
     Example:
         >>> from coil_rl.tabular import toymaker, with_advice

@@ -1,8 +1,9 @@
 """Learning from experience: a simulator, a model estimate (equations 50 and 51) and Q-learning (equation 52).
 
-Q-learning updates Q(s, a) <- Q(s, a) + alpha (r + gamma max Q(s', .) - Q(s, a)) after each step. Q converges to the
-optimal Q if every action is taken infinitely often in every state, and the step sizes alpha of each pair have an
-infinite sum and their squares a finite one (theorem 2.3). `epsilon` provides the first, `power` the second.
+Q-learning updates Q(s, a) <- Q(s, a) + alpha (r + gamma max Q(s', .) - Q(s, a)) after each step. Q
+converges to the optimal Q if every action is taken infinitely often in every state, and the step
+sizes alpha of each pair have an infinite sum and their squares a finite one (theorem 2.3).
+`epsilon` provides the first, `power` the second.
 """
 
 from bisect import bisect_right
@@ -91,7 +92,9 @@ class ModelEstimate:
     @property
     def R(self) -> Array:  # noqa: N802
         """[S, A, S]: mean reward of each transition (equation 51); 0 for one without samples."""
-        return np.divide(self.rewards, self.counts, out=np.zeros_like(self.rewards), where=self.counts > 0)
+        return np.divide(
+            self.rewards, self.counts, out=np.zeros_like(self.rewards), where=self.counts > 0
+        )
 
     def mdp(self, gamma: float) -> MDP:
         """Return the estimate as a world to plan in; raises a `ValueError` if an action has no sample in some state."""
@@ -135,10 +138,12 @@ def q_learning(
         steps: number of transitions.
         rng: of the world and of the actions.
         epsilon: probability of a random action, more than 0.
-        power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem 2.3).
-        episode_steps: steps after which an episode is truncated; the last state's value is still bootstrapped.
-        observations: [S] integers from 0, the observation of each state. States with the same observation share their
-            row of Q, and the theorem no longer applies.
+        power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem
+            2.3).
+        episode_steps: steps after which an episode is truncated; the last state's value is still
+            bootstrapped.
+        observations: [S] integers from 0, the observation of each state. States with the same
+            observation share their row of Q, and the theorem no longer applies.
         snapshots: numbers of steps after which Q is added to `history`.
 
     Example:
@@ -148,15 +153,21 @@ def q_learning(
         [1, 1]
     """
     if not 0 < epsilon <= 1:
-        raise ValueError(f"epsilon={epsilon} must be more than 0, so that every action is tried, and at most 1")
+        raise ValueError(
+            f"epsilon={epsilon} must be more than 0, so that every action is tried, and at most 1"
+        )
     if not 0.5 < power <= 1:
-        raise ValueError(f"power={power} must be more than 1/2 and at most 1, or Q-learning need not converge")
+        raise ValueError(
+            f"power={power} must be more than 1/2 and at most 1, or Q-learning need not converge"
+        )
     if wrong := [snapshot for snapshot in snapshots if not 0 <= snapshot <= steps]:
         raise ValueError(f"snapshots: {wrong[0]} must be between 0 and steps={steps}")
     count, actions = len(mdp.states), len(mdp.actions)
     observed = np.arange(count) if observations is None else np.asarray(observations)
     if observed.shape != (count,) or observed.dtype.kind not in "iu" or observed.min() < 0:
-        raise ValueError(f"observations must be {count} integers from 0, one a state; got {observed.tolist()}")
+        raise ValueError(
+            f"observations must be {count} integers from 0, one a state; got {observed.tolist()}"
+        )
 
     # Plain lists: element by element they are several times faster than arrays.
     observation = observed.tolist()
@@ -179,5 +190,7 @@ def q_learning(
 
 def _cumulative(probabilities: Array) -> Array:
     """Return the cumulative distribution along the last axis; it ends at exactly 1."""
-    total = probabilities.cumsum(axis=-1)  # a draw below 1 must never select an outcome of probability 0
+    total = probabilities.cumsum(
+        axis=-1
+    )  # a draw below 1 must never select an outcome of probability 0
     return total / total[..., -1:]

@@ -13,8 +13,8 @@ Integers = NDArray[np.int64]
 class MDP:
     """A finite Markov decision process: transition probabilities, rewards and a discount factor.
 
-    A state that every action leaves unchanged, with reward 0, is terminal: it ends an episode. Arrays that are no
-    Markov decision process are a `ValueError` that names the entry.
+    A state that every action leaves unchanged, with reward 0, is terminal: it ends an episode.
+    Arrays that are no Markov decision process are a `ValueError` that names the entry.
 
     Args:
         P: [S, A, S], P[s, a, s'] the probability that action a leads from state s to state s'.
@@ -44,7 +44,9 @@ class MDP:
         self.P: Array = np.array(P, dtype=np.float64)
         self.R: Array = np.array(R, dtype=np.float64)
         if self.P.ndim != 3 or self.P.shape[0] != self.P.shape[2] or not self.P.size:
-            raise ValueError(f"P must have the shape [S, A, S], states by actions by states; it has {self.P.shape}")
+            raise ValueError(
+                f"P must have the shape [S, A, S], states by actions by states; it has {self.P.shape}"
+            )
         if self.R.shape != self.P.shape:
             raise ValueError(f"R must have the shape of P, {self.P.shape}; it has {self.R.shape}")
         if not 0 <= gamma < 1:
@@ -61,10 +63,20 @@ class MDP:
                 raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
             problem = f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where})"
             raise ValueError(f"{problem}; they sum to {total[s, a]:g}")
-        self.start: Array = np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
-        if self.start.shape != (count,) or (self.start < 0).any() or not np.isclose(self.start.sum(), 1):
-            raise ValueError(f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}")
-        self.r: Array = (self.P * self.R).sum(axis=2)  # [S, A], expected reward of an action in a state
+        self.start: Array = (
+            np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
+        )
+        if (
+            self.start.shape != (count,)
+            or (self.start < 0).any()
+            or not np.isclose(self.start.sum(), 1)
+        ):
+            raise ValueError(
+                f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}"
+            )
+        self.r: Array = (self.P * self.R).sum(
+            axis=2
+        )  # [S, A], expected reward of an action in a state
 
     @property
     def terminal(self) -> NDArray[np.bool_]:
@@ -89,11 +101,17 @@ class MDP:
                 raise ValueError(f"{problem}; actions are 0 to {choices - 1}")
             return np.eye(choices)[array]
         if array.shape != (count, choices):
-            expected = f"[{count}] integers, an action a state, or [{count}, {choices}] probabilities"
-            raise ValueError(f"A policy is {expected}; got {array.dtype} of the shape {array.shape}")
+            expected = (
+                f"[{count}] integers, an action a state, or [{count}, {choices}] probabilities"
+            )
+            raise ValueError(
+                f"A policy is {expected}; got {array.dtype} of the shape {array.shape}"
+            )
         for s in range(count):
             if (array[s] < 0).any() or not np.isclose(array[s].sum(), 1):
-                raise ValueError(f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}")
+                raise ValueError(
+                    f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}"
+                )
         return array.astype(np.float64)
 
 
@@ -108,19 +126,29 @@ def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...
 def toymaker(gamma: float = 0.95) -> MDP:
     """Return Howard's toymaker (1960), the paper's first example, small enough to solve by hand.
 
-    The toy is successful or not, and the toymaker advertises or not. Advertising costs reward now and makes a
-    successful toy more likely; with a discount factor below 20/29, about 0.69, it does not pay.
+    The toy is successful or not, and the toymaker advertises or not. Advertising costs reward now
+    and makes a successful toy more likely; with a discount factor below 20/29, about 0.69, it does
+    not pay.
     """
     P = [[[0.5, 0.5], [0.8, 0.2]], [[0.4, 0.6], [0.7, 0.3]]]
     R = [[[9.0, 3.0], [4.0, 4.0]], [[3.0, -7.0], [1.0, -19.0]]]
-    return MDP(P, R, gamma, states=("successful toy", "unsuccessful toy"), actions=("no advertising", "advertising"))
+    return MDP(
+        P,
+        R,
+        gamma,
+        states=("successful toy", "unsuccessful toy"),
+        actions=("no advertising", "advertising"),
+    )
 
 
-def garnet(states: int, actions: int, rng: Generator, *, branches: int = 3, gamma: float = 0.9) -> MDP:
+def garnet(
+    states: int, actions: int, rng: Generator, *, branches: int = 3, gamma: float = 0.9
+) -> MDP:
     """Return a random world (a Garnet, Archibald et al. 1995).
 
-    Each action leads to `branches` randomly drawn states, from 1 to `states`, with probabilities from a flat Dirichlet
-    distribution and a normally distributed reward that does not depend on the next state.
+    Each action leads to `branches` randomly drawn states, from 1 to `states`, with probabilities
+    from a flat Dirichlet distribution and a normally distributed reward that does not depend on the
+    next state.
     """
     if not 1 <= branches <= states:
         raise ValueError(f"branches={branches} must be between 1 and states={states}")

@@ -1,6 +1,7 @@
 """Dynamic programming: optimal control of a known Markov decision process (paper algorithms 1 to 3).
 
-All three iterate the Bellman equation as an assignment, V <- r + gamma P V, a contraction with factor gamma.
+All three iterate the Bellman equation as an assignment, V <- r + gamma P V, a contraction with
+factor gamma.
 """
 
 from dataclasses import dataclass
@@ -43,13 +44,18 @@ def solve(mdp: MDP, policy: ArrayLike) -> Array:
     return np.linalg.solve(np.eye(len(r)) - mdp.gamma * P, r)
 
 
-def policy_iteration(mdp: MDP, policy: ArrayLike | None = None, tolerance: float = 1e-12) -> PlanningResult:
+def policy_iteration(
+    mdp: MDP, policy: ArrayLike | None = None, tolerance: float = 1e-12
+) -> PlanningResult:
     """Alternate policy evaluation and greedy improvement until the policy is stable (algorithm 2).
 
-    It starts from `policy` [S], by default the first action everywhere. `history` has V of each intermediate policy.
+    It starts from `policy` [S], by default the first action everywhere. `history` has V of each
+    intermediate policy.
     """
     count = len(mdp.states)
-    policy = np.zeros(count, dtype=np.int64) if policy is None else np.asarray(policy, dtype=np.int64)
+    policy = (
+        np.zeros(count, dtype=np.int64) if policy is None else np.asarray(policy, dtype=np.int64)
+    )
     history = []
     while True:
         V = policy_evaluation(mdp, policy, tolerance)
@@ -79,7 +85,9 @@ def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
 def _converged(mdp: MDP, V: Array, previous: Array, tolerance: float) -> bool:
     """Return whether V is within the tolerance of its limit, by the geometric bound on the remaining changes."""
     if not tolerance > 0:
-        raise ValueError(f"tolerance={tolerance} must be more than 0, or the iteration would not end")
+        raise ValueError(
+            f"tolerance={tolerance} must be more than 0, or the iteration would not end"
+        )
     # Rounding limits what can be reached.
     rounding = 4 * np.finfo(np.float64).eps * max(1.0, float(np.abs(V).max()))
     remaining = mdp.gamma / (1 - mdp.gamma) * float(np.abs(V - previous).max())

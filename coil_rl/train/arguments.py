@@ -39,10 +39,16 @@ def check_arguments(
     for key in sorted(given.keys() - known):
         if not accepts_any or key.startswith("_"):
             takes = ", ".join(known) or "nothing"
-            raise UserError(f"{name}: {title} takes no {key}; it takes {takes}{did_you_mean(key, known)}")
-    missing = [key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}]
+            raise UserError(
+                f"{name}: {title} takes no {key}; it takes {takes}{did_you_mean(key, known)}"
+            )
+    missing = [
+        key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}
+    ]
     if missing and "_partial_" not in node:
-        raise UserError(f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE")
+        raise UserError(
+            f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE"
+        )
     for key in given.keys() & known:
         _check_type(given[key], known[key].annotation, f"{name}.{key}")
 
@@ -76,9 +82,15 @@ def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any
     """Return a value without nodes inside it that have a `_target_`, whose results are not known yet."""
     if isinstance(value, Mapping):
         entries = {key: _known(entry, sequence) for key, entry in value.items()}
-        return _TARGET if "_target_" in value else {k: entry for k, entry in entries.items() if entry is not _TARGET}
+        return (
+            _TARGET
+            if "_target_" in value
+            else {k: entry for k, entry in entries.items() if entry is not _TARGET}
+        )
     if isinstance(value, list):
-        return sequence(entry for entry in (_known(entry, sequence) for entry in value) if entry is not _TARGET)
+        return sequence(
+            entry for entry in (_known(entry, sequence) for entry in value) if entry is not _TARGET
+        )
     return value
 
 
@@ -88,7 +100,9 @@ def validation_message(error: ValidationError, value: Any, name: str = "") -> st
     path = max((path for path, _ in details), key=len)
     expected = []
     for other, detail in details:
-        is_list = detail["type"] == "sequence_str" or detail.get("ctx", {}).get("class") == "Sequence"
+        is_list = (
+            detail["type"] == "sequence_str" or detail.get("ctx", {}).get("class") == "Sequence"
+        )
         if other == path:
             expected.append("a list" if is_list else detail["msg"].removeprefix("Input should be "))
     for part in path:
@@ -119,18 +133,25 @@ def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
     """Return the parameters of a target, including those that a class of this project passes on to its base class."""
     has_init = inspect.isclass(target) and target.__init__ is not object.__init__
     try:
-        # The signature of a class with a metaclass, such as an env of TorchRL, is that of the metaclass.
-        own = list(_signature(target.__init__ if has_init else target).parameters.values())[has_init:]
+        # The signature of a class with a metaclass, such as an env of TorchRL, is that of the
+        # metaclass.
+        own = list(_signature(target.__init__ if has_init else target).parameters.values())[
+            has_init:
+        ]
     except ValueError:  # builtins without a signature
         return None
-    passes_on = has_init and ("__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own))
+    passes_on = has_init and (
+        "__init__" not in vars(target) or any(p.kind is p.VAR_KEYWORD for p in own)
+    )
     if not inspect.isclass(target) or not passes_on or not target.__module__.startswith("coil_rl."):
         return own
     base = _parameters(target.__bases__[0])
     if base is None:
         return own
     names = {parameter.name for parameter in own}
-    return [p for p in own if p.kind is not p.VAR_KEYWORD] + [p for p in base if p.name not in names]
+    return [p for p in own if p.kind is not p.VAR_KEYWORD] + [
+        p for p in base if p.name not in names
+    ]
 
 
 def _signature(function: Callable[..., Any]) -> inspect.Signature:

@@ -23,8 +23,16 @@ class Brake:
     anchor: Anchor  # of the policy
     policy: TensorDictModuleBase  # of the learner; copies of it act
     build: Callable[[int], EnvBase]  # makes an env with all cases for a number of policies
-    failure: Measure | None = None  # measure that is true for an episode that failed, if there is one
-    names: Sequence[str] = ("look/return", "look/lower_return", "look/failures", "look/lower_failures", "look/back")
+    failure: Measure | None = (
+        None  # measure that is true for an episode that failed, if there is one
+    )
+    names: Sequence[str] = (
+        "look/return",
+        "look/lower_return",
+        "look/failures",
+        "look/lower_failures",
+        "look/back",
+    )
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether there is a look after an update."""
@@ -48,7 +56,9 @@ class Brake:
 
     def _look(self, weights: Sequence[Tensor]) -> Look:
         """Drive all cases with each of some weights of the guides."""
-        (key,) = [name for name, value in self.policy.named_buffers() if value is self.anchor.head.weight]
+        (key,) = [
+            name for name, value in self.policy.named_buffers() if value is self.anchor.head.weight
+        ]
         states = [{**self.policy.state_dict(), key: weight} for weight in weights]
         with torch.random.fork_rng():
             results = self._drive(self.build(len(states)), policy_batch(self.policy, states))
@@ -57,7 +67,9 @@ class Brake:
         return Look(parts["return"], [int(count) for count in failures])
 
     @torch.no_grad()
-    def _drive(self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]) -> dict[str, Tensor]:
+    def _drive(
+        self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
+    ) -> dict[str, Tensor]:
         failure = {"failure": self.failure} if self.failure else {}
         totals = Totals({"return": Measure("episode_reward", "last")} | failure)
         with tqdm(unit="step", desc="look", leave=False, mininterval=0.5) as bar:

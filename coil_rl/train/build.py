@@ -36,16 +36,22 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         cause = error.__cause__
         if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
             message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
-            raise UserError(f"{name}: {textwrap.shorten(str(message), 500, placeholder=' ...')}") from error
+            raise UserError(
+                f"{name}: {textwrap.shorten(str(message), 500, placeholder=' ...')}"
+            ) from error
         if isinstance(cause, ImportError):
-            raise UserError(f"{name}: {node['_target_']} needs a package ({cause}); install it") from error
+            raise UserError(
+                f"{name}: {node['_target_']} needs a package ({cause}); install it"
+            ) from error
         if cause is None:  # Hydra itself refuses to call the target
             raise UserError(f"{name}: {error}") from error
         if isinstance(cause, MemoryError) or "allocate" in str(cause):
             raise UserError(f"{name}: there is not enough memory; make it smaller") from error
         raise
     if expected is not None and not isinstance(built, expected):
-        raise UserError(f"{name}: {node['_target_']} makes {type(built).__name__}, not {expected.__name__}")
+        raise UserError(
+            f"{name}: {node['_target_']} makes {type(built).__name__}, not {expected.__name__}"
+        )
     return built
 
 
@@ -57,7 +63,9 @@ def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, A
     if isinstance(node, (DictConfig, ListConfig)):
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     if not isinstance(node, Mapping) or "_target_" not in node:
-        raise UserError(f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or function")
+        raise UserError(
+            f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or function"
+        )
     _check(node, name, program)
     return dict(node)
 
@@ -81,15 +89,20 @@ def _target(path: Any, name: str) -> Callable[..., Any]:
             f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
         ) from error
     if not callable(target):
-        raise UserError(f"{name}: {path} is {target!r}, which cannot be called; give a class or a function")
+        raise UserError(
+            f"{name}: {path} is {target!r}, which cannot be called; give a class or a function"
+        )
     return target
 
 
-def build_env(config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None) -> EnvBase:
+def build_env(
+    config: DictConfig, overrides: Mapping[str, Any] | None = None, *, advice: str | None = None
+) -> EnvBase:
     """Return the env of a configuration with all transforms; it also writes the sum of rewards, `episode_reward`.
 
-    `overrides` are of `env`; `advice` is the key in `evaluation.advice` of one more transform of the advice. Errors are
-    those of `build`; transforms that do not fit together are a `UserError` too.
+    `overrides` are of `env`; `advice` is the key in `evaluation.advice` of one more transform of
+    the advice. Errors are those of `build`; transforms that do not fit together are a `UserError`
+    too.
     """
     return add_transforms(config, build_bare_env(config, overrides), advice=advice)
 
@@ -122,10 +135,14 @@ def build_transforms(config: DictConfig, advice: str | None = None) -> list[Tran
     if transforms:
         transforms += build_all(config.degrade, "degrade")
     if advice:
-        transforms.append(build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform))
+        transforms.append(
+            build(config.evaluation.advice[advice], f"evaluation.advice.{advice}", Transform)
+        )
     if config.action:
         transforms.append(build(config.action, "action", Transform))
-    if network := OmegaConf.select(config, "learner.network"):  # one with a memory needs an env that carries it
+    if network := OmegaConf.select(
+        config, "learner.network"
+    ):  # one with a memory needs an env that carries it
         transforms += getattr(build(network, "learner.network"), "env_transforms", list)()
     return transforms
 
@@ -136,19 +153,24 @@ def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
 
 
 def build_guided_env(
-    config: DictConfig, overrides: Mapping[str, Any], guides: Mapping[str, TensorDictModuleBase] | None = None
+    config: DictConfig,
+    overrides: Mapping[str, Any],
+    guides: Mapping[str, TensorDictModuleBase] | None = None,
 ) -> tuple[EnvBase, TensorDictModuleBase]:
     """Return the env of a configuration, and a policy that follows its guides, with degraded advice.
 
     Args:
         config: with `env`, `guide` and `degrade`.
-        overrides: of `env`, with `num_envs`: the number of rows for each guide. Those of the first guide come first.
+        overrides: of `env`, with `num_envs`: the number of rows for each guide. Those of the first
+            guide come first.
         guides: instead of those of the configuration.
     """
     guides = guides or build_guides(config)
     count = overrides["num_envs"]
     env = build_bare_env(config, {**overrides, "num_envs": count * len(guides)})
-    env = _transformed(env, [GuideActions(guides), *build_all(config.degrade, "degrade")], "degrade")
+    env = _transformed(
+        env, [GuideActions(guides), *build_all(config.degrade, "degrade")], "degrade"
+    )
     return env, FollowAdvice(env, [guide for guide in range(len(guides)) for _ in range(count)])
 
 
@@ -170,14 +192,18 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
     return dict(resolved)
 
 
-def cases_node(config: DictConfig, cases: str, drivers: int = 1, count: int | None = None) -> dict[str, Any]:
+def cases_node(
+    config: DictConfig, cases: str, drivers: int = 1, count: int | None = None
+) -> dict[str, Any]:
     """Return the overrides of `env` in which each driver drives a set of cases; `count` replaces their number."""
     curve = config.evaluation.curve
     count = count or curve.num_envs
     return {**curve.env, curve.count_key: count, **curve.cases[cases], "num_envs": drivers * count}
 
 
-def build_learner(config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None) -> Any:
+def build_learner(
+    config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None
+) -> Any:
     """Return the learner of a configuration, which observes `observes` and `method.observes` of an env.
 
     `guides` are for a learner that trains guides.
@@ -203,7 +229,10 @@ def trains_guides(config: DictConfig) -> bool:
 
 def what_guides_see(config: DictConfig) -> dict[str, str]:
     """Return by name the attribute `sees` of the guides that may know more than an agent."""
-    guides = {name: getattr(_target(node.get("_target_"), name), "sees", "") for name, node in config.guide.items()}
+    guides = {
+        name: getattr(_target(node.get("_target_"), name), "sees", "")
+        for name, node in config.guide.items()
+    }
     return {name: sees for name, sees in guides.items() if sees}
 
 
@@ -218,4 +247,7 @@ def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
         raise UserError(
             f"guide: there is none, but method={config.method.name} needs one; give guide=NAME, or method=ppo"
         )
-    return {name: build(node, f"guide.{name}", TensorDictModuleBase) for name, node in config.guide.items()}
+    return {
+        name: build(node, f"guide.{name}", TensorDictModuleBase)
+        for name, node in config.guide.items()
+    }

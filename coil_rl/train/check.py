@@ -24,7 +24,11 @@ from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.train import build
 from coil_rl.train.arguments import validation_message
 from coil_rl.train.config import TrainConfig
-from coil_rl.train.distillation import guides_with_untrained_proxies, guides_without_parameters, proxy_config
+from coil_rl.train.distillation import (
+    guides_with_untrained_proxies,
+    guides_without_parameters,
+    proxy_config,
+)
 from coil_rl.train.evaluate_run import build_evaluation, build_pictures, recorded
 from coil_rl.train.measures import measures_of
 from coil_rl.transforms import GuideActions
@@ -52,8 +56,13 @@ def check_parts(config: DictConfig) -> None:
     trains = OmegaConf.get_type(config) is TrainConfig
     has_agent = trains and config.method.observes is not None
     if has_agent and (kind := build.learner_kind(config)) != config.method.learner:
-        learner, (purpose, example) = config.learner["_target_"].rpartition(".")[2], KINDS[config.method.learner]
-        needed = f"method={config.method.name} needs a learner that {purpose}, such as learner={example}"
+        learner, (purpose, example) = (
+            config.learner["_target_"].rpartition(".")[2],
+            KINDS[config.method.learner],
+        )
+        needed = (
+            f"method={config.method.name} needs a learner that {purpose}, such as learner={example}"
+        )
         raise UserError(f"{needed}, but {learner} is one that {KINDS[kind][0]}")
     cases, record = len(build_evaluation(config).cases), recorded(build_pictures(config))
     if trains or OmegaConf.select(config, "run") is None:
@@ -61,7 +70,9 @@ def check_parts(config: DictConfig) -> None:
     build.build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         if not config.label or config.label.split()[:1] == ["guide"] or "/" in config.label:
-            raise UserError(f"label={config.label} cannot be used: it must not be empty, begin with guide or contain /")
+            raise UserError(
+                f"label={config.label} cannot be used: it must not be empty, begin with guide or contain /"
+            )
         _check_training(config)
         if config.method.transforms:
             for advice in config.evaluation.advice:
@@ -81,8 +92,13 @@ def check_values(config: DictConfig) -> None:
         raise UserError(validation_message(error, values)) from None
     for name in ("budget", "proxy.budget"):
         budget = OmegaConf.select(config, name)
-        if isinstance(budget, DictConfig) and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH:
-            raise UserError(f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}")
+        if (
+            isinstance(budget, DictConfig)
+            and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH
+        ):
+            raise UserError(
+                f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}"
+            )
     for name in ("device", "env.device"):
         if not isinstance(device := OmegaConf.select(config, name), str):
             continue
@@ -92,7 +108,9 @@ def check_values(config: DictConfig) -> None:
             torch.empty(0, device=device)
         except (AssertionError, RuntimeError) as error:
             problem = str(error).splitlines()[0]
-            raise UserError(f"{name}={device} cannot be used ({problem}); take {name}=cpu") from error
+            raise UserError(
+                f"{name}={device} cannot be used ({problem}); take {name}=cpu"
+            ) from error
 
 
 def _unknown_key(config: DictConfig, *path: str) -> str:
@@ -107,13 +125,19 @@ def _check_drivers(config: DictConfig, cases: int, recorded: Iterable[NestedKey]
     name = config.env.get("_target_", "it")
     if "num_envs" not in config.env:
         hint = "(for the actions of policies on a recording: coil-replay recording=FILE)"
-        raise UserError(f"env: {name} has no key num_envs, so no policy can act in it; choose another env {hint}")
+        raise UserError(
+            f"env: {name} has no key num_envs, so no policy can act in it; choose another env {hint}"
+        )
     build.check_node(config.env, "env")
     env = build.build_bare_env(config, {**config.evaluation.env, "num_envs": 1})
     check_measures(config, env)
     for key in recorded:
         _check_entry(env, key, "evaluation.pictures")
-    if not config.guide and not config.method.needs_guide and "advice" not in config.method.transforms:
+    if (
+        not config.guide
+        and not config.method.needs_guide
+        and "advice" not in config.method.transforms
+    ):
         return
     guides = build.build_guides(config)
     for name, guide in guides.items():
@@ -134,7 +158,9 @@ def check_measures(config: DictConfig, env: EnvBase) -> None:
 def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
     """Raise a `UserError` if an env does not write an entry; `name` is the key of the configuration that names it."""
     specs = (env.observation_spec, env.full_reward_spec, env.full_done_spec)
-    known = {_dotted(each): each for spec in specs for each in spec.keys(True)} | {EPISODE_REWARD: EPISODE_REWARD}
+    known = {_dotted(each): each for spec in specs for each in spec.keys(True)} | {
+        EPISODE_REWARD: EPISODE_REWARD
+    }
     if _dotted(key) not in known:
         has = f"{', '.join(sorted(known))}{did_you_mean(_dotted(key), known)}"
         raise UserError(f"{name}={_dotted(key)} is no entry of the env; it has {has}")
@@ -159,7 +185,9 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
     except RuntimeError as error:
         problem = str(error).partition("\n")[0]
-        raise UserError(f"{name}: it cannot act on the observations of this env ({problem})") from error
+        raise UserError(
+            f"{name}: it cannot act on the observations of this env ({problem})"
+        ) from error
 
 
 def _check_cases(config: DictConfig, cases: int, build_drive: Callable[..., Any]) -> None:
@@ -167,18 +195,26 @@ def _check_cases(config: DictConfig, cases: int, build_drive: Callable[..., Any]
     try:
         build_drive(config, {**config.evaluation.env, "num_envs": cases})
     except UserError as error:
-        raise UserError(f"each case of the evaluation has one row, {cases} in all: {error}") from error
+        raise UserError(
+            f"each case of the evaluation has one row, {cases} in all: {error}"
+        ) from error
 
 
 def _check_training(config: DictConfig) -> None:
     if not build.observed_keys(config):
-        raise UserError("observes=[]: the agent has no observations; give the entries of the env that it observes")
+        raise UserError(
+            "observes=[]: the agent has no observations; give the entries of the env that it observes"
+        )
     env = build.build_env(config, config.training.env)
     if build.trains_guides(config) and config.degrade:
-        raise UserError(f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out")
+        raise UserError(
+            f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
+        )
     guides = build.build_guides(config) if build.trains_guides(config) else {}
     check_proxies(config, guides_without_parameters(guides))
-    learner = build.build_learner(config, env, guides_with_untrained_proxies(config) if guides else None)
+    learner = build.build_learner(
+        config, env, guides_with_untrained_proxies(config) if guides else None
+    )
     frames = config.budget.num_envs * config.budget.steps
     minibatches = getattr(learner, "minibatches", 0)
     if 2 * minibatches > frames:
@@ -188,11 +224,15 @@ def _check_training(config: DictConfig) -> None:
     grouped = config.track and getattr(learner, "validate", False) and learner.group_key is not None
     if grouped and len(build.build(config.track.train, "track.train")) == 1:
         remedy = "set learner.group_key=null, or learner.validate=false"
-        raise UserError(f"track.train gives one track, which cannot be left out to validate; {remedy}")
+        raise UserError(
+            f"track.train gives one track, which cannot be left out to validate; {remedy}"
+        )
     if cases := list(config.evaluation.curve.cases):
         if set(cases) != {EVALUATION, SELECTION}:
             given = ", ".join(cases)
-            raise UserError(f"evaluation.curve.cases has {given}; give {EVALUATION} and {SELECTION}, or none")
+            raise UserError(
+                f"evaluation.curve.cases has {given}; give {EVALUATION} and {SELECTION}, or none"
+            )
         for name in cases:
             build.build_env(config, build.cases_node(config, name))
     if config.logger:
@@ -200,7 +240,9 @@ def _check_training(config: DictConfig) -> None:
     groups = ("episode", "step")
     for group, keys in config.watch.items():
         if group not in groups:
-            raise UserError(f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}")
+            raise UserError(
+                f"there is no key watch.{group}; watch has episode, step{did_you_mean(group, groups)}"
+            )
         for name, key in keys.items():
             if not isinstance(key, ListConfig):
                 raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")

@@ -18,8 +18,8 @@ DIGITS = 64  # of a SHA-256
 def save(state: Any, path: Path) -> None:
     """Write a state atomically.
 
-    The file is the zip archive of `torch.save` with the SHA-256 of its content as the archive's comment, so that
-    `torch.load` can read it too.
+    The file is the zip archive of `torch.save` with the SHA-256 of its content as the archive's
+    comment, so that `torch.load` can read it too.
     """
     content = _content(state)
     with whole_file(path) as unfinished:
@@ -29,14 +29,18 @@ def save(state: Any, path: Path) -> None:
 def load(path: Path, device: str = "cpu") -> Any:
     """Read a state without running code; a file that is not exactly what `save` wrote is a `UserError`."""
     if not path.is_file():
-        raise UserError(f"there is no file {path}; give the folder of a run that coil-train has finished")
+        raise UserError(
+            f"there is no file {path}; give the folder of a run that coil-train has finished"
+        )
     content = path.read_bytes()
     if _checksum(content[:-DIGITS]) != content[-DIGITS:]:
         raise UserError(f"{path} is damaged: its checksum is wrong; train again or use another")
     try:
         return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
     except Exception as error:
-        raise UserError(f"{path} is damaged ({type(error).__name__}); train again or use another") from error
+        raise UserError(
+            f"{path} is damaged ({type(error).__name__}); train again or use another"
+        ) from error
 
 
 def save_newest(state: Any, folder: Path) -> None:
@@ -51,7 +55,8 @@ def save_newest(state: Any, folder: Path) -> None:
 def load_newest(folder: Path) -> Any | None:
     """Return the newest checkpoint of a run, or the previous one if it is damaged; None before the first one.
 
-    The use of the previous one is reported on standard error. If both are damaged, that is a `UserError`.
+    The use of the previous one is reported on standard error. If both are damaged, that is a
+    `UserError`.
     """
     newest, previous = folder / NEWEST, folder / PREVIOUS
     if not newest.exists() and not previous.exists():

@@ -1,6 +1,7 @@
 """Typed root configurations of the programs, and the fingerprint of a run.
 
-The types of the fields are checked by OmegaConf, their ranges by pydantic (`coil_rl.train.check.check_values`).
+The types of the fields are checked by OmegaConf, their ranges by pydantic
+(`coil_rl.train.check.check_values`).
 """
 
 import hashlib
@@ -77,8 +78,12 @@ class TrainingConfig(NodeConfig):
     """Training values for an env, and overrides of `env` in training; `imitation_env` is for methods that imitate."""
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
-    noise_correlation: Annotated[float, Field(ge=0, le=1)] = 0.0  # of the noise of continuous actions, see `Rollout`
-    anchored: dict[str, Any] = field(default_factory=dict)  # of anchored COIL, see its file in conf/method
+    noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
+        0.0  # of the noise of continuous actions, see `Rollout`
+    )
+    anchored: dict[str, Any] = field(
+        default_factory=dict
+    )  # of anchored COIL, see its file in conf/method
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
 
@@ -235,7 +240,9 @@ class RunsBudgetConfig(NodeConfig):
     """Training runs of `coil-reproduce`: number of seeds, and overrides of all runs and of single experiments."""
 
     seeds: Annotated[int, Field(ge=1)] = MISSING
-    seeds_of: dict[str, Annotated[int, Field(ge=1)]] = field(default_factory=dict)  # by experiment, where it is another
+    seeds_of: dict[str, Annotated[int, Field(ge=1)]] = field(
+        default_factory=dict
+    )  # by experiment, where it is another
     note: str | None = None
     every: list[str] = field(default_factory=list)
     only: dict[str, list[str]] = field(default_factory=dict)
@@ -265,7 +272,9 @@ class ReproduceConfig(ProgramConfig):
 def fingerprint(config: DictConfig) -> str:
     """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
     identity: dict[str, Any] = {
-        str(key): OmegaConf.to_container(config[key], resolve=True) if OmegaConf.is_config(config[key]) else config[key]
+        str(key): OmegaConf.to_container(config[key], resolve=True)
+        if OmegaConf.is_config(config[key])
+        else config[key]
         for key in sorted(map(str, config))
         if key not in (*IGNORED_KEYS, "hydra")
     }
@@ -286,7 +295,9 @@ def agent_label(config: DictConfig) -> str:
 # Process id in run folders: two runs may start within a microsecond.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
 # Keys of a table in a label: ${names:${degrade},intact}
-OmegaConf.register_new_resolver("names", lambda table, none: "_".join(map(str, table)) or none, replace=True)
+OmegaConf.register_new_resolver(
+    "names", lambda table, none: "_".join(map(str, table)) or none, replace=True
+)
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)

@@ -1,7 +1,8 @@
 """The evaluation curve of a run: the returns of policies that were kept during the training.
 
-The return in training says little about a policy: its actions are sampled, and it is the mean of the episodes that
-happen to end. The kept policies act deterministically, all of them in one batch, each from the same starts (cases).
+The return in training says little about a policy: its actions are sampled, and it is the mean of
+the episodes that happen to end. The kept policies act deterministically, all of them in one batch,
+each from the same starts (cases).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -30,12 +31,15 @@ class EvaluationCurve:
 
     folder: Path  # of the run; `keep` writes `policies/FRAMES.pt`
     policy: TensorDictModuleBase  # of the learner; a copy of it drives
-    envs: Mapping[str, Callable[[int], EnvBase]]  # makes an env with all cases of a set for a number of drivers
+    envs: Mapping[
+        str, Callable[[int], EnvBase]
+    ]  # makes an env with all cases of a set for a number of drivers
     _: KW_ONLY
     # Further measures, "episode" at the end of an episode, "step" as the mean over its steps.
     watch: Watch = field(default_factory=dict)
     points: int = 16  # number of policies that are kept, besides the first one
-    batches: int = 1  # number of times that the policies kept since are driven; each takes as long as one drive
+    # number of times that the policies kept since are driven; each takes as long as one drive
+    batches: int = 1
 
     def __post_init__(self) -> None:
         measured = ["return", *(name for group in self.watch.values() for name in group)]
@@ -66,21 +70,32 @@ class EvaluationCurve:
         policies = policy_batch(self.policy, [checkpoint.load(self.file(each)) for each in frames])
         rows: list[dict[str, float]] = [{} for _ in frames]
         # The training's random numbers are left alone.
-        with torch.random.fork_rng(), tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
+        with (
+            torch.random.fork_rng(),
+            tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
+        ):
             for cases, build in self.envs.items():
-                for name, values in measures(build(len(frames)), policies, self.watch, bar.update).items():
-                    for row, value in zip(rows, values.view(len(frames), -1).double().mean(1).tolist(), strict=True):
+                for name, values in measures(
+                    build(len(frames)), policies, self.watch, bar.update
+                ).items():
+                    for row, value in zip(
+                        rows, values.view(len(frames), -1).double().mean(1).tolist(), strict=True
+                    ):
                         row[f"{cases}/{name}"] = value
         return rows
 
 
 @torch.no_grad()
 def measures(
-    env: EnvBase, policy: TensorDictModuleBase, watch: Watch | None = None, tick: Callable[[], Any] | None = None
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    watch: Watch | None = None,
+    tick: Callable[[], Any] | None = None,
 ) -> dict[str, Tensor]:
     """Run one episode on every row of an env [B] with deterministic actions, and return its measures, [B] each.
 
-    These are the `return`, the sum of the rewards of the task, and those of `watch`; `tick` is called after every step.
+    These are the `return`, the sum of the rewards of the task, and those of `watch`; `tick` is
+    called after every step.
     """
     measured = {"return": Measure("episode_reward", "last")}
     for group, reduction in (("episode", "last"), ("step", "mean")):

@@ -1,8 +1,8 @@
 """Proxies: networks that imitate guides without parameters, for methods that train their guides.
 
-A proxy is the policy of an imitation run. The configuration of that run follows from the guide, the env and the key
-`proxy`; its hash is part of the folder name, so that a proxy is trained once. A run copies its proxies into its own
-folder.
+A proxy is the policy of an imitation run. The configuration of that run follows from the guide, the
+env and the key `proxy`; its hash is part of the folder name, so that a proxy is trained once. A run
+copies its proxies into its own folder.
 """
 
 import shutil
@@ -43,7 +43,8 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
         "env": resolved["env"] | resolved["training"]["imitation_env"] | proxy["env"],
         "guide": guide,
         "label": f"proxy of {name}",
-        "evaluation": {key: resolved["evaluation"][key] for key in ("cases", "measures", "env")} | {"gif": False},
+        "evaluation": {key: resolved["evaluation"][key] for key in ("cases", "measures", "env")}
+        | {"gif": False},
         "existing": "resume",
     }
     merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)

@@ -37,7 +37,12 @@ from coil_rl.train.measures import Measure, measures_of, summarise
 from coil_rl.train.policy_batch import RecordedPolicy, is_tensors
 from coil_rl.transforms import GuideActions
 
-COLUMNS = {"driver": ("driver", ""), "advice": ("advice", ""), "actions": ("actions", ""), "case": ("case", "")}
+COLUMNS = {
+    "driver": ("driver", ""),
+    "advice": ("advice", ""),
+    "actions": ("actions", ""),
+    "case": ("case", ""),
+}
 COLUMNS |= {"reward": ("reward", ".1f")}
 MAX_CASES = 8  # in the table for people
 
@@ -55,10 +60,14 @@ class Evaluation:
 
     def drive(self, env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> EvaluationResult:
         """Evaluate a policy on an env whose rows are the cases, perhaps several times; see `evaluate_policy`."""
-        return evaluate_policy(env, policy, cases=self.cases, measures=self.measures, record=self.record, **options)
+        return evaluate_policy(
+            env, policy, cases=self.cases, measures=self.measures, record=self.record, **options
+        )
 
 
-def build_evaluation(config: DictConfig, record: Mapping[str, NestedKey] | None = None) -> Evaluation:
+def build_evaluation(
+    config: DictConfig, record: Mapping[str, NestedKey] | None = None
+) -> Evaluation:
     """Return the evaluation of a configuration, with entries to record by name; no cases are a `UserError`."""
     cases = config.evaluation.cases
     names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
@@ -71,7 +80,9 @@ def build_evaluation(config: DictConfig, record: Mapping[str, NestedKey] | None 
 def build_pictures(config: DictConfig) -> list[Picture]:
     """Return the pictures of a configuration; without any, the returns."""
     nodes = config.evaluation.pictures.items()
-    return [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node] or [Returns()]
+    return [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node] or [
+        Returns()
+    ]
 
 
 def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
@@ -80,15 +91,20 @@ def recorded(pictures: Iterable[Picture]) -> dict[str, NestedKey]:
 
 
 def evaluate_run(
-    config: DictConfig, agent: TensorDictModuleBase | None, folder: Path, seed: int, fallback: Fallback | None = None
+    config: DictConfig,
+    agent: TensorDictModuleBase | None,
+    folder: Path,
+    seed: int,
+    fallback: Fallback | None = None,
 ) -> None:
     """Evaluate and write `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
 
-    Each guide drives each case once, beside the agent where both have the same env. An agent drives it once with
-    deterministic actions, `evaluation.repeats` times with sampled ones if it samples, once with each advice of
-    `evaluation.advice` instead of its own, and once with a `fallback`.
+    Each guide drives each case once, beside the agent where both have the same env. An agent drives
+    it once with deterministic actions, `evaluation.repeats` times with sampled ones if it samples,
+    once with each advice of `evaluation.advice` instead of its own, and once with a `fallback`.
 
-    The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled actions.
+    The agent is the policy of the run, or None for the guides alone; `seed` is that of the sampled
+    actions.
     """
     pictures = build_pictures(config)
     evaluation = build_evaluation(config, recorded(pictures))
@@ -97,7 +113,9 @@ def evaluate_run(
     episodes: list[dict[str, Any]] = []
     drives: dict[str, EvaluationResult] = {}
 
-    def add(result: EvaluationResult, driver: str, advice: str = "", actions: str = "deterministic") -> None:
+    def add(
+        result: EvaluationResult, driver: str, advice: str = "", actions: str = "deterministic"
+    ) -> None:
         label = {"driver": driver, "advice": advice, "actions": actions}
         table.extend(label | row for row in summarise(result.episodes, evaluation.measures))
         episodes.extend(label | row for row in result.episodes)
@@ -109,8 +127,14 @@ def evaluate_run(
         for driver, result in drive_guides(config, config.evaluation.env, evaluation).items():
             add(result, driver)
     # The kinds of advice, each with the number of sampled episodes a case.
-    plan = [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)] if agent is not None else []
-    plan += [(advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms]
+    plan = (
+        [("", config.evaluation.repeats if hasattr(agent, "get_dist") else 0)]
+        if agent is not None
+        else []
+    )
+    plan += [
+        (advice, 0) for advice in config.evaluation.advice if plan and config.method.transforms
+    ]
     acting = RecordedPolicy(agent) if agent is not None and is_tensors(agent) else agent
     torch.manual_seed(seed)
     with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
@@ -127,26 +151,42 @@ def evaluate_run(
             policy = AgentAndGuides(env, acting, own, len(names)) if names else acting
             sampled = repeats > 0 and (rows >= count) & (rows < own)
             result = evaluation.drive(env, policy, sampled=sampled, tick=tick)
-            for name, of_guide in zip(names, result[own:].split(len(names)) if names else [], strict=True):
+            for name, of_guide in zip(
+                names, result[own:].split(len(names)) if names else [], strict=True
+            ):
                 add(of_guide, name)
             add(result[:count], config.label, advice)
             if repeats:
                 add(result[count:own], config.label, advice, "sampled")
         if fallback is not None:
-            result = evaluation.drive(build_env(config, {**config.evaluation.env, "num_envs": count}), fallback)
+            result = evaluation.drive(
+                build_env(config, {**config.evaluation.env, "num_envs": count}), fallback
+            )
             add(result, f"{config.label} or guide")
     write_csv(episodes, folder / "episodes.csv")
     for picture in pictures:
         picture.draw(drives, folder)
-    columns = {key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice}
-    columns |= {name: (measure.title, measure.format) for name, measure in evaluation.measures.items() if measure.title}
+    columns = {
+        key: value for key, value in COLUMNS.items() if key != "advice" or config.evaluation.advice
+    }
+    columns |= {
+        name: (measure.title, measure.format)
+        for name, measure in evaluation.measures.items()
+        if measure.title
+    }
     few = count <= MAX_CASES
-    page = [markdown_table(table if few else [row for row in table if row["case"] == "mean"], columns)]
+    page = [
+        markdown_table(table if few else [row for row in table if row["case"] == "mean"], columns)
+    ]
     page += [] if few else [f"Means of {count} cases; all are in evaluation.csv."]
     sees = what_guides_see(config).items()
     guides = driver_names(config.guide) if agent is not None and count > 1 else []
     page += [not_worse(drives[config.label], drives[guide], guide) for guide in guides]
-    page += [f"With fallback the guide acted in {fallback.share(result):.1%} of the steps."] if fallback else []
+    page += (
+        [f"With fallback the guide acted in {fallback.share(result):.1%} of the steps."]
+        if fallback
+        else []
+    )
     page += [f"guide.{name} sees: {what}; it may know more than the agent." for name, what in sees]
     write_text(folder / "evaluation.md", "\n\n".join(page))
     write_csv(table, folder / "evaluation.csv")
@@ -173,20 +213,25 @@ class AgentAndGuides(TensorDictModuleBase):
         super().__init__()
         cases = (env.batch_size[0] - count) // guides
         # Of the guides' action on the rows of the agent nothing is used.
-        self.guides = FollowAdvice(env, [0] * count + [guide for guide in range(guides) for _ in range(cases)])
+        self.guides = FollowAdvice(
+            env, [0] * count + [guide for guide in range(guides) for _ in range(cases)]
+        )
         self.agent, self.count = agent, count
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         advised = self.guides(tensordict.copy())["action"]
         tensordict = self.agent(tensordict)
-        return tensordict.set("action", torch.cat([tensordict["action"][: self.count], advised[self.count :]]))
+        return tensordict.set(
+            "action", torch.cat([tensordict["action"][: self.count], advised[self.count :]])
+        )
 
 
 def not_worse(agent: EvaluationResult, guide: EvaluationResult, name: str) -> str:
     """Return the sentence whether an agent is not worse than a guide in the same cases, by the t interval of the loss.
 
-    The answer is yes if the whole interval is above minus 1 % of the guide's mean reward, no if it is below.
+    The answer is yes if the whole interval is above minus 1 % of the guide's mean reward, no if it
+    is below.
     """
     pairs = zip(agent.episodes, guide.episodes, strict=True)
     _, low, high = mean_interval([mine["reward"] - other["reward"] for mine, other in pairs])
@@ -208,7 +253,11 @@ def report_outcome(folder: Path) -> float:
     """Print the evaluation of a run, and return the mean reward of its deterministic agent, or else of its guide."""
     with file_of_a_run(path := folder / "evaluation.csv", "remove the file, and evaluate again"):
         with path.open(newline="") as file:
-            rows = [row for row in csv.DictReader(file) if (row["case"], row["actions"]) == ("mean", "deterministic")]
+            rows = [
+                row
+                for row in csv.DictReader(file)
+                if (row["case"], row["actions"]) == ("mean", "deterministic")
+            ]
         last = [row for row in rows if not row["advice"]][-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
         page = (folder / "evaluation.md").read_text().rstrip()
@@ -229,10 +278,16 @@ def drive_guides(
     `overrides` are of `env`. `guides` replace those of the configuration, whose results are cached.
     """
     if not guides:
-        nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+        nodes = {
+            key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")
+        }
         if not nodes["guide"]:
             return {}
-        return dict(_drive_configured(OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), evaluation))
+        return dict(
+            _drive_configured(
+                OmegaConf.to_yaml({"env": env_node(config, overrides), **nodes}), evaluation
+            )
+        )
     env, policy = build_guided_env(config, {**overrides, "num_envs": len(evaluation.cases)}, guides)
     with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
         result = evaluation.drive(env, policy, tick=bar.update)

@@ -66,10 +66,12 @@ def evaluate_policy(
     Args:
         env: of any batch size, also of none.
         policy: writes the action.
-        sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B] for each row.
+        sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B]
+            for each row.
         measures: by name.
         record: entries after each step to keep, by name.
-        cases: names of the cases; row i is case i modulo their number. By default rows are numbered.
+        cases: names of the cases; row i is case i modulo their number. By default rows are
+            numbered.
         tick: called after every step.
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
@@ -86,7 +88,9 @@ def evaluate_policy(
     rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
     histories = {}
     for name, entries in recorded.items():
-        flat = torch.stack(entries).reshape(len(entries), len(steps), *entries[0].shape[env.batch_dims :])
+        flat = torch.stack(entries).reshape(
+            len(entries), len(steps), *entries[0].shape[env.batch_dims :]
+        )
         values = (flat.squeeze(-1) if flat.ndim > 2 else flat).cpu().double().numpy()
         histories[name] = [values[:count, row] for row, count in enumerate(steps)]
     return EvaluationResult(rows, histories, getattr(env, "rate", float("nan")))
@@ -115,10 +119,14 @@ class Totals:
         self.steps = self.steps.to(running.device) + running.long()
         for reduction, names in self.groups.items():
             group = [self.measures[name] for name in names]
-            values = torch.stack([after[m.entry].double().reshape(len(running), -1).sum(-1) for m in group])
+            values = torch.stack(
+                [after[m.entry].double().reshape(len(running), -1).sum(-1) for m in group]
+            )
             mask = running.expand_as(values)
             if any(measure.where for measure in group):
-                mask = mask & torch.stack([running if m.where is None else after[m.where].reshape(-1) for m in group])
+                mask = mask & torch.stack(
+                    [running if m.where is None else after[m.where].reshape(-1) for m in group]
+                )
             if reduction in ("any", "count", "mean_nonzero"):
                 mask = mask & (values != 0)
             extreme = reduction in ("min", "max", "last")
@@ -155,7 +163,11 @@ class Totals:
 
 
 def episodes(
-    env: EnvBase, policy: TensorDictModuleBase, *, sampled: bool | Tensor = False, tick: Callable[[], Any] | None = None
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    sampled: bool | Tensor = False,
+    tick: Callable[[], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
     """Yield the entries after each step of one episode on every row, and whether the row was still in it, [*B, 1].
 
@@ -175,10 +187,14 @@ def episodes(
             tick()
 
 
-def _act(policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor) -> TensorDictBase:
+def _act(
+    policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor
+) -> TensorDictBase:
     if isinstance(sampled, Tensor):
         drawn = _act(policy, carrier, True)["action"]
         deterministic = _act(policy, carrier, False)
-        return deterministic.set("action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"]))
+        return deterministic.set(
+            "action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"])
+        )
     with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
         return policy(carrier)

@@ -35,7 +35,9 @@ REMEDY = "put the whole file back, or train again in another folder"  # for a da
 class Learner(Protocol):
     """Update of a policy from batches."""
 
-    kind: ClassVar[str]  # "agent" learns from rewards, "imitation" from a guide's actions, "guides" trains guides too
+    kind: ClassVar[
+        str
+    ]  # "agent" learns from rewards, "imitation" from a guide's actions, "guides" trains guides too
     policy: TensorDictModuleBase  # collects the batches
 
     def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
@@ -64,23 +66,25 @@ class Probe(Protocol):
 class Experiment:
     """One training run in one folder.
 
-    Files: `metrics.csv` (a row for the state before the first update and after each update), `checkpoint.pt` (the
-    complete state), `checkpoint_previous.pt`, `policy_last.pt`, `policy_best.pt` (best evaluation; the last one without
-    evaluations) and `policies/` (the kept ones). A run that was killed at any moment and resumed in a new process ends
-    with the same files, to the bit on a CPU.
+    Files: `metrics.csv` (a row for the state before the first update and after each update),
+    `checkpoint.pt` (the complete state), `checkpoint_previous.pt`, `policy_last.pt`,
+    `policy_best.pt` (best evaluation; the last one without evaluations) and `policies/` (the kept
+    ones). A run that was killed at any moment and resumed in a new process ends with the same
+    files, to the bit on a CPU.
     """
 
     EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
 
     learner: Learner
-    # Its env must write `episode_reward` (TorchRL's RewardSum), and `task_reward` if a transform adds to the reward of
-    # the task.
+    # Its env must write `episode_reward` (TorchRL's RewardSum), and `task_reward` if a transform
+    # adds to the reward of the task.
     rollout: Rollout
     frames: int  # length of the run; the last batch may exceed it
     folder: Path  # exists
     _: KW_ONLY
     logger: Any | None = None  # any TorchRL logger, in addition to the CSV file
-    # Further entries to log, as means over finished episodes ("episode") or over all steps ("step").
+    # Further entries to log, as means over finished episodes ("episode") or over all steps
+    # ("step").
     watch: Watch = field(default_factory=dict)
     checkpoint_every: int = 10  # updates between two checkpoints
     probe: Probe | None = None
@@ -104,10 +108,18 @@ class Experiment:
                 check_same(state["identity"], self.identity, f"{newest} belongs to a run", remedy)
                 self.load_state_dict(state)
         self.rows = self.metrics.truncate(self.updates + 1 if self.updates else 0)
-        lacking = [name for name in (self.curve.names if self.curve else []) if self.rows and name not in self.rows[0]]
+        lacking = [
+            name
+            for name in (self.curve.names if self.curve else [])
+            if self.rows and name not in self.rows[0]
+        ]
         if lacking:
             raise UserError(f"{self.metrics.path} has no column {lacking[0]}; {REMEDY}")
-        where = f"after update {self.updates}" if self.updates else "from the beginning: there is no checkpoint yet"
+        where = (
+            f"after update {self.updates}"
+            if self.updates
+            else "from the beginning: there is no checkpoint yet"
+        )
         print(f"{self.folder} continues {where}", file=sys.stderr)
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
@@ -117,7 +129,11 @@ class Experiment:
         """
         updates, frames = math.ceil(self.frames / self.rollout.frames), self.rollout.frames
         with tqdm(
-            total=updates * frames, initial=self.updates * frames, unit="frame", unit_scale=True, desc="train"
+            total=updates * frames,
+            initial=self.updates * frames,
+            unit="frame",
+            unit_scale=True,
+            desc="train",
         ) as bar:
             first = self._probe(updates, {}) if self.updates == 0 else {}
             evaluated = self._newest_evaluation()
@@ -132,8 +148,14 @@ class Experiment:
                     self._log({**dict.fromkeys(row, math.nan), "frames": 0, **first})
                 self._log(row)
                 bar.update(frames)
-                returns = {"return": row["train/return"], "evaluation": evaluated, "guide": guide_return}
-                bar.set_postfix({name: f"{value:.0f}" for name, value in returns.items() if value is not None})
+                returns = {
+                    "return": row["train/return"],
+                    "evaluation": evaluated,
+                    "guide": guide_return,
+                }
+                bar.set_postfix(
+                    {name: f"{value:.0f}" for name, value in returns.items() if value is not None}
+                )
                 if self.updates % self.checkpoint_every == 0 or self.updates == updates:
                     self._save()
         policy = self.learner.policy.state_dict()
@@ -167,7 +189,9 @@ class Experiment:
             self.metrics.log(result, update * self.rollout.frames)
         judged = (row for row in self.rows if not math.isnan(row[CHOICE]))
         with whole_file(self.folder / "policy_best.pt") as unfinished:
-            shutil.copyfile(self.curve.file(int(max(judged, key=itemgetter(CHOICE))["frames"])), unfinished)
+            shutil.copyfile(
+                self.curve.file(int(max(judged, key=itemgetter(CHOICE))["frames"])), unfinished
+            )
         self.metrics.fill(results)
         return True
 
@@ -175,8 +199,12 @@ class Experiment:
         """Collect one batch, learn from it and return the row of the log."""
         with self._resume_hint():
             batch = self.rollout.collect(progress)
-        row = dict.fromkeys(self.curve.names if self.curve else [], math.nan) | self._describe(batch)
-        learned = {f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()}
+        row = dict.fromkeys(self.curve.names if self.curve else [], math.nan) | self._describe(
+            batch
+        )
+        learned = {
+            f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()
+        }
         self.updates += 1
         with self._resume_hint():
             for name, value in learned.items():
@@ -198,7 +226,9 @@ class Experiment:
         except UserError as error:
             remedy = f"correct the cause and continue with coil-train resume={self.folder}"
             kept = "the last good checkpoint is kept"
-            raise UserError(f"{error}; {kept}: {remedy}, or train again with other values") from error
+            raise UserError(
+                f"{error}; {kept}: {remedy}, or train again with other values"
+            ) from error
 
     def _save(self) -> None:
         state = self.state_dict()
@@ -214,10 +244,14 @@ class Experiment:
         row = {
             "train/return": sum(self.returns) / len(self.returns) if self.returns else math.nan,
             "train/episodes": float(done.sum()),
-            "train/reward": float(after["task_reward" if "task_reward" in after else "reward"].mean()),
+            "train/reward": float(
+                after["task_reward" if "task_reward" in after else "reward"].mean()
+            ),
         }
         for name, key in self.watch.get("episode", {}).items():
-            row[f"train/{name}"] = float(after[tuple(key)][done].float().mean()) if done.any() else math.nan
+            row[f"train/{name}"] = (
+                float(after[tuple(key)][done].float().mean()) if done.any() else math.nan
+            )
         for name, key in self.watch.get("step", {}).items():
             row[f"train/{name}"] = float(after[tuple(key)].float().mean())
         return row
@@ -249,7 +283,9 @@ def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
     """Return the entries that `Experiment` needs in a rollout, besides those of the learner."""
     watched = (tuple(key) for group in watch.values() for key in group.values())
     task = [("task_reward",)] if "task_reward" in env.observation_spec else []
-    return [("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)]
+    return [
+        ("next", *key) for key in (("done",), ("reward",), ("episode_reward",), *task, *watched)
+    ]
 
 
 def check_parameters(state: Any, update: int, name: str = "learner") -> None:
@@ -264,8 +300,8 @@ def check_parameters(state: Any, update: int, name: str = "learner") -> None:
 class Metrics:
     """Log of a run: rows in a CSV file and in any TorchRL logger.
 
-    After a resume the rows since the checkpoint are written again. They are removed from the CSV file and from
-    TensorBoard first; other loggers may show a point twice, with the same value.
+    After a resume the rows since the checkpoint are written again. They are removed from the CSV
+    file and from TensorBoard first; other loggers may show a point twice, with the same value.
     """
 
     def __init__(self, path: Path, logger: Any | None = None) -> None:
@@ -323,6 +359,8 @@ class Metrics:
         if self.logger is not None and self.tensorboard is not None:
             self.tensorboard.close()
             frames = int(rows[-1]["frames"]) if rows else 0
-            self.tensorboard = type(self.tensorboard)(self.tensorboard.log_dir, purge_step=frames + 1)
+            self.tensorboard = type(self.tensorboard)(
+                self.tensorboard.log_dir, purge_step=frames + 1
+            )
             self.logger.experiment = self.tensorboard
         return rows

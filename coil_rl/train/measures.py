@@ -18,13 +18,16 @@ REDUCTIONS = ("mean", "sum", "min", "max", "last", "any", "count", "mean_nonzero
 class Measure:
     """A measure of an episode: an entry of the env, reduced over the steps.
 
-    Two measures have a meaning in reports: `completed`, the success that drivers are ordered by first, and `crashed`,
-    the failure that is counted by seed. Another reduction, or two bounds, are a `ValueError`.
+    Two measures have a meaning in reports: `completed`, the success that drivers are ordered by
+    first, and `crashed`, the failure that is counted by seed. Another reduction, or two bounds, are
+    a `ValueError`.
     """
 
-    entry: str | tuple[str, ...]  # key of one number a row, after a step; those of several agents are summed
-    # `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`, or their mean
-    # (`mean_nonzero`). Without a number, a mean is NaN.
+    entry: (
+        str | tuple[str, ...]
+    )  # key of one number a row, after a step; those of several agents are summed
+    # `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`,
+    # or their mean (`mean_nonzero`). Without a number, a mean is NaN.
     reduction: str = "mean"
     where: str | tuple[str, ...] | None = None  # key of a flag; only the steps with it count
     at_least: float | None = None  # the measure becomes a flag: the number is at least this
@@ -39,7 +42,9 @@ class Measure:
             raise ValueError("at_least and at_most cannot both be given; give one")
 
     @classmethod
-    def of(cls, entry: str | Sequence[str], where: str | Sequence[str] | None = None, **options: Any) -> Measure:
+    def of(
+        cls, entry: str | Sequence[str], where: str | Sequence[str] | None = None, **options: Any
+    ) -> Measure:
         """Return a measure from values of a YAML file, in which keys are lists."""
         return cls(_key(entry), where=None if where is None else _key(where), **options)
 
@@ -47,7 +52,9 @@ class Measure:
         """Return the mean of several episodes without NaN; of numbers, the minimum of minima, the maximum of maxima."""
         numbers = [float(value) for value in values if not math.isnan(value)]
         is_flag = self.at_least is not None or self.at_most is not None
-        pools: dict[str, Callable[[Sequence[float]], float]] = {} if is_flag else {"min": min, "max": max}
+        pools: dict[str, Callable[[Sequence[float]], float]] = (
+            {} if is_flag else {"min": min, "max": max}
+        )
         return pools.get(self.reduction, fmean)(numbers) if numbers else math.nan
 
 
@@ -70,7 +77,9 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
     return measures
 
 
-def summarise(episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]) -> list[dict[str, Any]]:
+def summarise(
+    episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]
+) -> list[dict[str, Any]]:
     """Return the means of each case in the order of the episodes, then their mean as the case `mean`."""
     reward = {"reward": Measure("reward"), **measures}
     cases: dict[str, list[Mapping[str, Any]]] = {}
@@ -78,7 +87,9 @@ def summarise(episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Meas
         cases.setdefault(episode["case"], []).append(episode)
 
     def pool(case: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        return {"case": case} | {name: measure.pool([row[name] for row in rows]) for name, measure in reward.items()}
+        return {"case": case} | {
+            name: measure.pool([row[name] for row in rows]) for name, measure in reward.items()
+        }
 
     rows = [pool(case, group) for case, group in cases.items()]
     return [*rows, pool("mean", rows)]

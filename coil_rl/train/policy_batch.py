@@ -14,7 +14,9 @@ from coil_rl.compiled import record
 from coil_rl.train.load import memory_keys
 
 
-def policy_batch(policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> TensorDictModuleBase:
+def policy_batch(
+    policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]
+) -> TensorDictModuleBase:
     """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
     return StackedPolicies(policy, states) if is_tensors(policy) else PoliciesInTurn(policy, states)
 
@@ -28,8 +30,8 @@ def is_tensors(policy: TensorDictModuleBase) -> bool:
 class RecordedPolicy(TensorDictModuleBase):
     """A policy with fixed weights and no other state, see `is_tensors`.
 
-    Its operations are recorded at the first call for a number of rows, once for each type of exploration, and repeated
-    afterwards, which takes half of the time or less.
+    Its operations are recorded at the first call for a number of rows, once for each type of
+    exploration, and repeated afterwards, which takes half of the time or less.
     """
 
     def __init__(self, policy: TensorDictModuleBase) -> None:

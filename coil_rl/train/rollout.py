@@ -26,8 +26,9 @@ class Rollout:
         policy: writes the action; actions are sampled.
         steps: T, length of a batch.
         keys: entries to keep, those after a step as `("next", ...)`; all by default.
-        noise_correlation: of the noise of continuous actions in consecutive steps, at most 1. Each action alone has the
-            distribution that the policy gives. Korenkevych et al. 2019; Hollenstein et al. 2024 (for PPO).
+        noise_correlation: of the noise of continuous actions in consecutive steps, at most 1. Each
+            action alone has the distribution that the policy gives. Korenkevych et al. 2019;
+            Hollenstein et al. 2024 (for PPO).
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -79,7 +80,9 @@ class Rollout:
         except Exception:
             # NaN of an earlier step may be the cause.
             check_batch(self._stacked(columns), self.taken)
-            check_batch(acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0))
+            check_batch(
+                acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0)
+            )
             raise
         batch = self._stacked(columns)
         check_batch(batch, self.taken)
@@ -91,8 +94,13 @@ class Rollout:
         """Write the exploration noise of the next step, which is correlated with that of the step before."""
         if (spec := self.noise_spec) is None:
             return carrier
-        share, fresh = self.noise_correlation, torch.randn(spec.shape, dtype=spec.dtype, device=spec.device)
-        self.noise = fresh if self.noise is None else share * self.noise + (1 - share**2) ** 0.5 * fresh
+        share, fresh = (
+            self.noise_correlation,
+            torch.randn(spec.shape, dtype=spec.dtype, device=spec.device),
+        )
+        self.noise = (
+            fresh if self.noise is None else share * self.noise + (1 - share**2) ** 0.5 * fresh
+        )
         return carrier.set(NOISE, self.noise)
 
     def _stacked(self, columns: Mapping[NestedKey, list[Tensor]]) -> TensorDictBase:
@@ -121,11 +129,17 @@ class Rollout:
         carrier = state["carrier"]
         # A part that cannot go on has said so.
         continues = all(getattr(module, "continues", True) for module in self.env.modules())
-        if carrier is not None and not self.base_env.state_dict() and not self.base_env.state_spec.keys():
+        if (
+            carrier is not None
+            and not self.base_env.state_dict()
+            and not self.base_env.state_spec.keys()
+        ):
             continues, name = False, type(self.base_env).__name__
             warnings.warn(f"{name} does not save its state, so new episodes begin", stacklevel=2)
         if carrier is not None and continues:
-            self.carrier = TensorDict.from_dict(carrier, batch_size=self.env.batch_size, device=self.env.device)
+            self.carrier = TensorDict.from_dict(
+                carrier, batch_size=self.env.batch_size, device=self.env.device
+            )
         self.noise = None if state["noise"] is None else state["noise"].to(self.env.device)
         self.taken = state["taken"]
 
@@ -133,8 +147,8 @@ class Rollout:
 def check_batch(batch: TensorDictBase, steps: int = 0) -> None:
     """Raise a `UserError` for the earliest number of a batch [*B, T] that is NaN or infinite.
 
-    It has the entry, the step (from 1, after `steps` earlier ones) and the row (from 0). The check waits for the device
-    once.
+    It has the entry, the step (from 1, after `steps` earlier ones) and the row (from 0). The check
+    waits for the device once.
     """
     floats = {key: value for key, value in batch.items(True, True) if value.is_floating_point()}
     if not floats or torch.stack([value.isfinite().all() for value in floats.values()]).all():

@@ -25,13 +25,21 @@ from coil_rl.train.fallback import build_fallback
 from coil_rl.train.load import PROXIES, load_guides, weights_file
 from coil_rl.train.measures import measures_of
 from coil_rl.train.rollout import Rollout
-from coil_rl.train.run_folder import begin, flat, holds, is_evaluated, locked, report_changed_versions
+from coil_rl.train.run_folder import (
+    begin,
+    flat,
+    holds,
+    is_evaluated,
+    locked,
+    report_changed_versions,
+)
 
 
 def run(config: DictConfig, *, wait: bool = False) -> float:
     """Do a run, or resume it if `existing=resume`, and return the mean test reward of the deterministic agent.
 
-    A folder that holds another run, or that another process uses if `wait` is not set, is a `UserError`.
+    A folder that holds another run, or that another process uses if `wait` is not set, is a
+    `UserError`.
     """
     folder = Path(config.run_dir)
     with locked(folder, wait=wait):
@@ -60,7 +68,9 @@ def _finish(config: DictConfig, folder: Path, *, resumed: bool = False) -> float
         if error.errno not in NO_SPACE:
             raise
         problem = f"{error.filename or folder} cannot be written ({error.strerror})"
-        raise UserError(f"{problem}; make room, and continue with coil-train resume={folder}") from error
+        raise UserError(
+            f"{problem}; make room, and continue with coil-train resume={folder}"
+        ) from error
 
 
 def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
@@ -72,7 +82,9 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     # After the guides, which a resumed run does not drive again.
     torch.manual_seed(config.seed)
     env = build.compile_steps(config, build.build_env(config, config.training.env))
-    learner = build.build_learner(config, env, load_guides(folder, config) if improves_guides else None)
+    learner = build.build_learner(
+        config, env, load_guides(folder, config) if improves_guides else None
+    )
     keys = [*learner.keys, *watched_keys(env, config.watch)]
     experiment = Experiment(
         learner,
@@ -91,14 +103,21 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
     start = time.monotonic()
     rows = experiment.run(max(guide_returns.values(), default=None))
     if not resumed:  # the time before the interruption is unknown
-        write_text(folder / "training_time.json", json.dumps({"seconds": time.monotonic() - start}, indent=2))
+        write_text(
+            folder / "training_time.json",
+            json.dumps({"seconds": time.monotonic() - start}, indent=2),
+        )
     if improves_guides:
         draw_phases(rows, list(learner.guides), folder / "learning_curve.png", title=config.label)
     else:
-        draw_learning_curves({config.label: [rows]}, folder / "learning_curve.png", guides=guide_returns)
+        draw_learning_curves(
+            {config.label: [rows]}, folder / "learning_curve.png", guides=guide_returns
+        )
     if hasattr(learner, "export"):
         learner.export(folder)
-    learner.policy.load_state_dict(checkpoint.load(weights_file(folder, config.evaluation.policy), config.device))
+    learner.policy.load_state_dict(
+        checkpoint.load(weights_file(folder, config.evaluation.policy), config.device)
+    )
     return learner.policy
 
 
@@ -142,7 +161,9 @@ def _saved_guide_returns(config: DictConfig, file: Path) -> dict[str, float]:
     return returns
 
 
-def _guide_returns(config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None) -> dict[str, float]:
+def _guide_returns(
+    config: DictConfig, guides: Mapping[str, TensorDictModuleBase] | None = None
+) -> dict[str, float]:
     """Return the mean return of each guide in the cases of the evaluation."""
     if EVALUATION not in config.evaluation.curve.cases or not (guides or config.guide):
         return {}
@@ -160,17 +181,26 @@ def _probe(config: DictConfig, learner: Any) -> Probe | None:
     if getattr(learner, "anchor", None) is None:
         return None
     if SELECTION not in config.evaluation.curve.cases:
-        raise UserError(f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its drives; give it")
+        raise UserError(
+            f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its drives; give it"
+        )
     failure = measures_of(config.evaluation.measures).get("crashed")
     count = learner.anchor.cases or (24 if failure is None else 96)
-    return Brake(learner.anchor, learner.policy, partial(_build_cases, config, SELECTION, count=count), failure)
+    return Brake(
+        learner.anchor,
+        learner.policy,
+        partial(_build_cases, config, SELECTION, count=count),
+        failure,
+    )
 
 
 def _build_cases(config: DictConfig, cases: str, drivers: int, count: int | None = None) -> EnvBase:
     return build.build_env(config, build.cases_node(config, cases, drivers, count))
 
 
-def _curve(config: DictConfig, folder: Path, policy: TensorDictModuleBase) -> EvaluationCurve | None:
+def _curve(
+    config: DictConfig, folder: Path, policy: TensorDictModuleBase
+) -> EvaluationCurve | None:
     """Return the evaluation curve of a run; None without cases."""
     curve = config.evaluation.curve
     envs = {cases: partial(_build_cases, config, cases) for cases in curve.cases}

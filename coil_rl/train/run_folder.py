@@ -23,9 +23,17 @@ from coil_rl.train.trust import check_config, read_yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = (
-    "coil-rl", "torch", "torchrl", "tensordict", "hydra-core", "gymnasium", "stable-baselines3", "numpy", "scipy",
+    "coil-rl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "hydra-core",
+    "gymnasium",
+    "stable-baselines3",
+    "numpy",
+    "scipy",
     "matplotlib",
-)  # fmt: skip
+)
 
 
 @contextmanager
@@ -43,7 +51,9 @@ def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
             remove_unfinished(folder)
             yield
     except Timeout:
-        raise UserError(f"another process is running in {folder}; wait until it ends, or end it") from None
+        raise UserError(
+            f"another process is running in {folder}; wait until it ends, or end it"
+        ) from None
 
 
 def begin(config: DictConfig, folder: Path) -> None:
@@ -63,8 +73,9 @@ def begin(config: DictConfig, folder: Path) -> None:
 def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
     """Return the configuration of the run in a folder, with `changes`, new values of top-level keys.
 
-    `key` is the key of the calling program that names the folder, for the message. The folder may come from anybody: a
-    configuration that cannot be read or could run code is a `UserError`; `trust_packages` names packages it may use.
+    `key` is the key of the calling program that names the folder, for the message. The folder may
+    come from anybody: a configuration that cannot be read or could run code is a `UserError`;
+    `trust_packages` names packages it may use.
     """
     path = folder / "config.yaml"
     if not path.is_file():
@@ -92,24 +103,36 @@ def holds(folder: Path, config: DictConfig) -> bool:
     return True
 
 
-def check_same(saved: Mapping[str, Any], requested: Mapping[str, Any], holder: str, remedy: str) -> None:
+def check_same(
+    saved: Mapping[str, Any], requested: Mapping[str, Any], holder: str, remedy: str
+) -> None:
     """Raise a `UserError` if two results of `flat` differ; the message begins with the holder of the first one."""
     for key in dict.fromkeys([*saved, *requested]):
         if saved.get(key) != requested.get(key):
-            raise UserError(f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}")
+            raise UserError(
+                f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}"
+            )
 
 
 def flat(config: DictConfig) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys."""
     values: Any = OmegaConf.to_container(config, resolve=True)
-    return {key: value for key, value in _flat(values).items() if not {key, key.split(".")[0]} & {*IGNORED_KEYS}}
+    return {
+        key: value
+        for key, value in _flat(values).items()
+        if not {key, key.split(".")[0]} & {*IGNORED_KEYS}
+    }
 
 
 def _flat(node: Any, name: str = "") -> dict[str, Any]:
     """Return the values of a configuration by their full keys."""
     if not isinstance(node, Mapping) or not node:
         return {name: node}
-    return {key: value for k, v in node.items() for key, value in _flat(v, f"{name}.{k}" if name else str(k)).items()}
+    return {
+        key: value
+        for k, v in node.items()
+        for key, value in _flat(v, f"{name}.{k}" if name else str(k)).items()
+    }
 
 
 def is_evaluated(folder: Path) -> bool:
@@ -126,8 +149,13 @@ def report_changed_versions(folder: Path) -> None:
     present = versions()
     names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]
     if names:
-        changes = ", ".join(f"{name} {begun.get(name, 'unknown')} (here {present[name]})" for name in names)
-        print(f"{folder} was begun with {changes}; its numbers may differ from now on", file=sys.stderr)
+        changes = ", ".join(
+            f"{name} {begun.get(name, 'unknown')} (here {present[name]})" for name in names
+        )
+        print(
+            f"{folder} was begun with {changes}; its numbers may differ from now on",
+            file=sys.stderr,
+        )
 
 
 def versions() -> dict[str, str]:
@@ -139,10 +167,21 @@ def versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             result[name] = "not installed"
     # Not of a repository around this one, such as that of a project with an environment inside.
-    git = ["git", "-C", str(ROOT), "--git-dir=.git", "describe", "--always", "--dirty", "--abbrev=12"]
+    git = [
+        "git",
+        "-C",
+        str(ROOT),
+        "--git-dir=.git",
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=12",
+    ]
     result["commit"] = _output(git) or "not a git checkout"
     result["cpus"] = str(os.cpu_count())
-    result["gpu"] = _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    result["gpu"] = (
+        _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    )
     return result
 
 

@@ -1,17 +1,17 @@
 """The gate for received run folders: what a `config.yaml` that somebody else may have written can name.
 
-Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a controller, the
-`controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So each of them must be on a list of full
-names before anything is imported:
+Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a
+controller, the `controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So
+each of them must be on a list of full names before anything is imported:
 
-- what the shipped configuration names in the groups of a run, also as an alternative in a comment: a part that has its
-  YAML file is on the list;
+- what the shipped configuration names in the groups of a run, also as an alternative in a comment:
+  a part that has its YAML file is on the list;
 - the estimators of scikit-learn and the transforms and loggers of TorchRL in `conf/trusted.yaml`;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
-A constructor on the list may read a file that its arguments name, but must not write one. `docs/trust.md` has the trust
-model.
+A constructor on the list may read a file that its arguments name, but must not write one.
+`docs/trust.md` has the trust model.
 """
 
 import re
@@ -32,18 +32,36 @@ from coil_rl.train.config import TrainConfig
 
 LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
 DEEPEST = 32  # levels
-ENTRY_POINTS = "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
+ENTRY_POINTS = (
+    "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
+)
 # Their functions run any code or write any file.
 NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
-    "coil_rl", "hydra", "joblib", "numpy", "omegaconf", "pandas", "scipy", "sympy", "tensordict", "torch",
-}  # fmt: skip
+    "coil_rl",
+    "hydra",
+    "joblib",
+    "numpy",
+    "omegaconf",
+    "pandas",
+    "scipy",
+    "sympy",
+    "tensordict",
+    "torch",
+}
 
 LOGGERS = "torchrl.record.loggers."
-_TRUSTED: dict[str, Any] = yaml.safe_load((resources.files("coil_rl.conf") / "trusted.yaml").read_text("utf-8"))
-ESTIMATORS = frozenset(f"sklearn.{module}.{name}" for module, names in _TRUSTED["estimators"].items() for name in names)
-PARTS = frozenset(f"sklearn.{module}.{name}" for module, names in _TRUSTED["parts"].items() for name in names)
+_TRUSTED: dict[str, Any] = yaml.safe_load(
+    (resources.files("coil_rl.conf") / "trusted.yaml").read_text("utf-8")
+)
+ESTIMATORS = frozenset(
+    f"sklearn.{module}.{name}" for module, names in _TRUSTED["estimators"].items() for name in names
+)
+PARTS = frozenset(
+    f"sklearn.{module}.{name}" for module, names in _TRUSTED["parts"].items() for name in names
+)
 NAMED = ESTIMATORS.union(
-    (f"torchrl.envs.{name}" for name in _TRUSTED["transforms"]), (LOGGERS + name for name in _TRUSTED["loggers"])
+    (f"torchrl.envs.{name}" for name in _TRUSTED["transforms"]),
+    (LOGGERS + name for name in _TRUSTED["loggers"]),
 )
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
@@ -53,16 +71,21 @@ _own: frozenset[str] = frozenset()  # targets in the configuration of the comman
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
     """Let the run folders that this process reads from here on use parts of these packages, and of no others.
 
-    The names are top-level; a folder may call everything that is defined in these packages. The targets that `command`
-    names, the configuration that the user composed, are trusted too. A package that is never trusted is a `UserError`.
+    The names are top-level; a folder may call everything that is defined in these packages. The
+    targets that `command` names, the configuration that the user composed, are trusted too. A
+    package that is never trusted is a `UserError`.
     """
     global _packages, _own
     names = list(packages)
     for name in names:
         if not name.isidentifier():
-            raise UserError(f"trust=[{name}] must be a list of names of installed packages, such as trust=[my_package]")
+            raise UserError(
+                f"trust=[{name}] must be a list of names of installed packages, such as trust=[my_package]"
+            )
         if name in NEVER_TRUSTED:
-            raise UserError(f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part")
+            raise UserError(
+                f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part"
+            )
     container = OmegaConf.to_container(command) if command is not None else None
     _packages = frozenset(names)
     paths = (_import_path(name, key, value) for name, _, key, value in _entries(container))
@@ -72,15 +95,22 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
 def read_yaml(path: Path) -> DictConfig | ListConfig:
     """Read a YAML file that stays as small in memory as on the disk.
 
-    One that is larger or deeper than any configuration of a run, or refers to parts of itself, is a `UserError`.
+    One that is larger or deeper than any configuration of a run, or refers to parts of itself, is a
+    `UserError`.
     """
     if (size := path.stat().st_size) > LARGEST_FILE:
-        raise UserError(f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}")
+        raise UserError(
+            f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}"
+        )
     depth = 0
     for event in yaml.parse(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader):
-        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+        depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(
+            event, yaml.CollectionEndEvent
+        )
         if isinstance(event, yaml.AliasEvent):
-            raise UserError(f"{path} repeats a part of itself by *{event.anchor:.40}; write the part out")
+            raise UserError(
+                f"{path} repeats a part of itself by *{event.anchor:.40}; write the part out"
+            )
         if depth > DEEPEST:
             raise UserError(f"{path} has more than {DEEPEST} levels; no configuration of a run has")
     return OmegaConf.load(path)
@@ -92,25 +122,43 @@ def check_config(config: DictConfig, path: Path) -> None:
     Nothing is resolved, and nothing is imported but packages that the user trusts.
     """
     for name, parent, key, value in _entries(OmegaConf.to_container(config)):
-        named = key if not name.startswith("defaults[") else ""  # Hydra's list names groups by paths
+        named = (
+            key if not name.startswith("defaults[") else ""
+        )  # Hydra's list names groups by paths
         if re.search(r"[/\\]", str(value if name == "label" else named)):
-            raise UserError(f"{path}: {name:.100} must not contain / or \\, because files are named by it")
+            raise UserError(
+                f"{path}: {name:.100} must not contain / or \\, because files are named by it"
+            )
         target = _import_path(name, key, value)
         if key == "_target_" or target is not None:
             _check_target(target, name, parent, path)
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
         if (key == "memory" or str(key).endswith("__memory")) and value is not None:
-            raise UserError(f"{path}: {name:.100} names a cache, whose files can run code; set it to null")
+            raise UserError(
+                f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
+            )
         # Only the logger is saved with references, and none to itself, so that they cannot grow.
-        known = r"\$\{(?!logger\b)\w[\w.]*\}" if name.startswith("logger.") and key != "_target_" else r"(?!)"
+        known = (
+            r"\$\{(?!logger\b)\w[\w.]*\}"
+            if name.startswith("logger.") and key != "_target_"
+            else r"(?!)"
+        )
         if isinstance(value, str) and "${" in re.sub(known, "", value):
-            raise UserError(f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place")
+            raise UserError(
+                f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place"
+            )
 
 
 def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any], Any, Any]]:
     """Yield full key, parent, key and value of each entry of nested mappings and lists."""
-    parent = node if isinstance(node, Mapping) else dict(enumerate(node)) if isinstance(node, list) else {}
+    parent = (
+        node
+        if isinstance(node, Mapping)
+        else dict(enumerate(node))
+        if isinstance(node, list)
+        else {}
+    )
     for key, value in parent.items():
         full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
         yield full, parent, key, value
@@ -122,7 +170,9 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     if key == "_target_":
         return value
     # The text under `controllers` may be at any depth, because keys may contain points.
-    names_code = key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
+    names_code = (
+        key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
+    )
     return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
 
 
@@ -134,27 +184,46 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
     allowed = NAMED | _shipped_targets() | _own
     if target in allowed and not target.startswith(LOGGERS):
         return
-    if package not in NEVER_TRUSTED and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names:
-        if name.endswith(".id") and "controllers" not in name:  # a Gymnasium env, which its module registers
+    if (
+        package not in NEVER_TRUSTED
+        and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names
+    ):
+        if (
+            name.endswith(".id") and "controllers" not in name
+        ):  # a Gymnasium env, which its module registers
             return
         try:
-            origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(".")[0]
+            origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(
+                "."
+            )[0]
         except Exception as error:
-            raise UserError(f"{refusal}, which {package} does not have; check that the package is installed") from error
+            raise UserError(
+                f"{refusal}, which {package} does not have; check that the package is installed"
+            ) from error
         if origin != package:
-            raise UserError(f"{refusal}, which is defined elsewhere; name the package that defines it")
+            raise UserError(
+                f"{refusal}, which is defined elsewhere; name the package that defines it"
+            )
     elif target in allowed:
         plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
         if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
-            allowed_as = "which may only be the logger, with log_dir: ${run_dir} and a plain exp_name"
+            allowed_as = (
+                "which may only be the logger, with log_dir: ${run_dir} and a plain exp_name"
+            )
             reason = "because a run writes only into its own folder"
-            raise UserError(f"{refusal}, {allowed_as}, {reason}; trust=[torchrl] on the command line allows it")
+            raise UserError(
+                f"{refusal}, {allowed_as}, {reason}; trust=[torchrl] on the command line allows it"
+            )
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
-        raise UserError(f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}")
+        raise UserError(
+            f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}"
+        )
     else:
         remedy = f"allow it with trust=[{package:.100}] on the command line"
-        raise UserError(f"{refusal}, which could run code; if you know the folder and the package, {remedy}")
+        raise UserError(
+            f"{refusal}, which could run code; if you know the folder and the package, {remedy}"
+        )
 
 
 @cache
@@ -162,5 +231,10 @@ def _shipped_targets() -> frozenset[str]:
     conf = resources.files("coil_rl.conf")
     names = [*(field.name for field in fields(TrainConfig)), "cases", "network"]
     groups = [group for name in names if (group := conf / name).is_dir()]
-    texts = [file.read_text(encoding="utf-8") for group in groups for file in group.iterdir() if ".yaml" in file.name]
+    texts = [
+        file.read_text(encoding="utf-8")
+        for group in groups
+        for file in group.iterdir()
+        if ".yaml" in file.name
+    ]
     return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))

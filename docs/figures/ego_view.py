@@ -29,8 +29,12 @@ CURVE_POINTS = 60
 
 def output_folder(description: str | None) -> Path:
     """Return the only argument of a script, its output folder; the folder is made."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("output", type=Path, nargs="?", default=Path("outputs/figures"), help="output folder")
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "output", type=Path, nargs="?", default=Path("outputs/figures"), help="output folder"
+    )
     folder: Path = parser.parse_args().output
     folder.mkdir(parents=True, exist_ok=True)
     return folder
@@ -56,8 +60,21 @@ def make_panel(axes: Axes, sideways: float, behind: float, ahead: float) -> None
 def draw_field_of_view(axes: Axes, sight: float, half_angle: float) -> None:
     """Draw the visible sector, `sight` m deep and `half_angle` radians to either side."""
     half = math.degrees(half_angle)
-    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc=style.BACKGROUND, ec="none", alpha=0.55, zorder=1.5))
-    axes.add_patch(Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2))
+    axes.add_patch(
+        Wedge(
+            (0, 0),
+            sight,
+            90 - half,
+            90 + half,
+            fc=style.BACKGROUND,
+            ec="none",
+            alpha=0.55,
+            zorder=1.5,
+        )
+    )
+    axes.add_patch(
+        Wedge((0, 0), sight, 90 - half, 90 + half, fc="none", ec=style.QUIET, lw=0.8, zorder=2)
+    )
 
 
 def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples: Array) -> None:
@@ -79,8 +96,15 @@ def draw_plan(axes: Axes, plan: PathPlan) -> None:
     def points(places: Tensor) -> Array:
         return facing_up(rows(places)).T
 
-    axes.plot(*points(plan.path.equidistant(CURVE_POINTS)[:, :in_use, 0]), color=PATH_COLOUR, lw=1.6, zorder=5)
-    axes.plot(*points(plan.midpoints[:, :pairs, 0]), "x", color=style.INK, ms=3.6, mew=0.9, zorder=6)
+    axes.plot(
+        *points(plan.path.equidistant(CURVE_POINTS)[:, :in_use, 0]),
+        color=PATH_COLOUR,
+        lw=1.6,
+        zorder=5,
+    )
+    axes.plot(
+        *points(plan.midpoints[:, :pairs, 0]), "x", color=style.INK, ms=3.6, mew=0.9, zorder=6
+    )
     targets = points(plan.targets[:, :in_use, 0])
     axes.plot(*targets, "o", ms=4.2, mfc=PATH_COLOUR, mec=style.BACKGROUND, mew=0.6, zorder=7)
     axes.plot(*points(selected), "o", ms=9, mfc="none", mec=ADVICE_COLOUR, mew=1.6, zorder=8)
@@ -92,8 +116,20 @@ def draw_advice(axes: Axes, degrees: float, length: float) -> None:
     tip = (-length * math.sin(angle), length * math.cos(angle))
     arrow = {"arrowstyle": "-|>", "color": ADVICE_COLOUR, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tip, (0, 0), arrowprops=arrow, zorder=8.5)
-    text = "straight on" if abs(degrees) < 0.5 else f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
-    axes.text(1, 0.02, f"advice: {text}", ha="right", color=ADVICE_COLOUR, weight="bold", transform=axes.transAxes)
+    text = (
+        "straight on"
+        if abs(degrees) < 0.5
+        else f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
+    )
+    axes.text(
+        1,
+        0.02,
+        f"advice: {text}",
+        ha="right",
+        color=ADVICE_COLOUR,
+        weight="bold",
+        transform=axes.transAxes,
+    )
 
 
 def marker(symbol: str, label: str, size: float = 5.5, **options: Any) -> Line2D:
@@ -103,11 +139,28 @@ def marker(symbol: str, label: str, size: float = 5.5, **options: Any) -> Line2D
 
 def common_handles() -> list[Artist]:
     """Return the legend handles of boundaries, plan and advice."""
-    path: Any = {"color": PATH_COLOUR, "lw": 1.6, "marker": "o", "ms": 4.2, "mec": style.BACKGROUND, "mew": 0.6}
+    path: Any = {
+        "color": PATH_COLOUR,
+        "lw": 1.6,
+        "marker": "o",
+        "ms": 4.2,
+        "mec": style.BACKGROUND,
+        "mew": 0.6,
+    }
     return [
-        Line2D([], [], color=LINE_COLOURS[1], lw=1.5, marker="D", ms=4.2, label="boundary estimate, its samples"),
+        Line2D(
+            [],
+            [],
+            color=LINE_COLOURS[1],
+            lw=1.5,
+            marker="D",
+            ms=4.2,
+            label="boundary estimate, its samples",
+        ),
         marker("x", "midpoint of a pair", 4, mec=style.INK),
         Line2D([], [], label="guide's path, targets", **path),
         marker("o", "steered for", 8, mfc="none", mec=ADVICE_COLOUR, mew=1.6),
-        Line2D([], [], color=ADVICE_COLOUR, lw=1.8, marker=">", ms=4.5, markevery=[1], label="advice"),
+        Line2D(
+            [], [], color=ADVICE_COLOUR, lw=1.8, marker=">", ms=4.5, markevery=[1], label="advice"
+        ),
     ]

@@ -1,7 +1,7 @@
 """Draw the last lap of the guide and of trained agents on test tracks straightened along the middle line.
 
-Below each track is the smoothness of the steering, |a - weighted mean of the last 20 actions|. The agents of the runs
-drive once more, in their own environments; the guide is that of the first run.
+Below each track is the smoothness of the steering, |a - weighted mean of the last 20 actions|. The
+agents of the runs drive once more, in their own environments; the guide is that of the first run.
 
     python docs/figures/lines.py RUN [RUN ...] [--output FOLDER] [--tracks 3] [--policy last]
 """
@@ -70,16 +70,24 @@ class StraightTrack:
 
     def path_ratio(self, line: Array) -> float:
         """Return the driven distance per distance along the centre line."""
-        passed = np.diff(np.unwrap(self(line)[0], period=self.length)).sum() / self.length * self.track.length
+        passed = (
+            np.diff(np.unwrap(self(line)[0], period=self.length)).sum()
+            / self.length
+            * self.track.length
+        )
         return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / passed)
 
 
-def drive(runs: Sequence[Path], count: int, policy: str) -> tuple[list[Track], dict[str, EvaluationResult]]:
+def drive(
+    runs: Sequence[Path], count: int, policy: str
+) -> tuple[list[Track], dict[str, EvaluationResult]]:
     """Return the first test tracks of the first run, and the drives of its guide and of every agent there."""
     configs = [read_config(run, "run", {"device": "cpu"}) for run in runs]
     tracks: list[Track] = build(configs[0].track.test, "track.test")[:count]
     record = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
-    evaluation = replace(build_evaluation(configs[0]), cases=[track.name for track in tracks], record=record)
+    evaluation = replace(
+        build_evaluation(configs[0]), cases=[track.name for track in tracks], record=record
+    )
     drives = drive_guides(configs[0], configs[0].evaluation.env, evaluation)
     for run, config in zip(runs, configs, strict=True):
         env = build_env(config, {**config.evaluation.env, "num_envs": len(tracks)})
@@ -110,24 +118,47 @@ def draw_map(axes: Axes, straight: StraightTrack) -> None:
 def draw_straight(axes: Axes, straight: StraightTrack) -> None:
     """Draw the cones of a straightened track and the insides of its turns."""
     for kind, edge in ((LEFT, HALF_WIDTH), (RIGHT, -HALF_WIDTH)):
-        axes.fill_between(straight.along, 0, edge, where=straight.kinds == kind, color=INSIDE_COLOUR, lw=0, zorder=1)
+        axes.fill_between(
+            straight.along,
+            0,
+            edge,
+            where=straight.kinds == kind,
+            color=INSIDE_COLOUR,
+            lw=0,
+            zorder=1,
+        )
     axes.axhline(0, color=style.KERB, lw=0.6, zorder=2)
-    for cones, colour in ((straight.track.left, style.LEFT_CONE), (straight.track.right, style.RIGHT_CONE)):
+    for cones, colour in (
+        (straight.track.left, style.LEFT_CONE),
+        (straight.track.right, style.RIGHT_CONE),
+    ):
         axes.plot(*straight(cones), "o", mfc=colour, zorder=3, **CONE)
     axes.set(xlim=(0, straight.length), ylim=(-HALF_WIDTH, HALF_WIDTH), yticks=(-1, 0, 1))
     axes.set_ylabel("left (m)", size=8)
 
 
-def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, EvaluationResult]) -> None:
+def draw(
+    path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, EvaluationResult]
+) -> None:
     """Draw all tracks and drives."""
     strokes = style.strokes(drives)
-    handles = [Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=name) for name, s in strokes.items()]
+    handles = [
+        Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=name)
+        for name, s in strokes.items()
+    ]
     cones = zip(SIDES, (style.LEFT_CONE, style.RIGHT_CONE), strict=True)
-    handles += [marker("o", f"{side} cones", 5, mfc=colour, mec=style.INK) for side, colour in cones]
-    handles += [Patch(fc=INSIDE_COLOUR, label="inside of a turn"), marker("X", "crash", 5, color=style.INK)]
+    handles += [
+        marker("o", f"{side} cones", 5, mfc=colour, mec=style.INK) for side, colour in cones
+    ]
+    handles += [
+        Patch(fc=INSIDE_COLOUR, label="inside of a turn"),
+        marker("X", "crash", 5, color=style.INK),
+    ]
     with picture(path, "Driven lines on test tracks", handles, 0.75 + 2.3 * len(tracks)) as figure:
         ratios = [1.8, 0.8] * len(tracks)
-        grid = figure.add_gridspec(2 * len(tracks), 2, width_ratios=(1.0, 3.2), height_ratios=ratios)
+        grid = figure.add_gridspec(
+            2 * len(tracks), 2, width_ratios=(1.0, 3.2), height_ratios=ratios
+        )
         for index, straight in enumerate(tracks):
             draw_map(figure.add_subplot(grid[2 * index : 2 * index + 2, 0]), straight)
             above = figure.add_subplot(grid[2 * index, 1])
@@ -140,7 +171,15 @@ def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, Evalu
                 above.plot(along, left, lw=1.2, zorder=4, **stroke)
                 below.plot(along, rough, lw=1.0, **stroke)
                 if result.episodes[index]["crashed"]:
-                    above.plot(along[-1], left[-1], "X", ms=7, mfc=stroke["color"], mec=style.BACKGROUND, zorder=5)
+                    above.plot(
+                        along[-1],
+                        left[-1],
+                        "X",
+                        ms=7,
+                        mfc=stroke["color"],
+                        mec=style.BACKGROUND,
+                        zorder=5,
+                    )
             for axes in (above, below):
                 lighten(axes)
                 axes.tick_params(length=0, labelsize=7, labelbottom=axes is below)
@@ -151,9 +190,13 @@ def draw(path: Path, tracks: Sequence[StraightTrack], drives: Mapping[str, Evalu
 
 def main() -> None:
     """Draw lines.png and print the measures of each drive."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("runs", type=Path, nargs="+", help="folders of finished runs")
-    parser.add_argument("--output", type=Path, default=Path("outputs/figures"), help="output folder")
+    parser.add_argument(
+        "--output", type=Path, default=Path("outputs/figures"), help="output folder"
+    )
     parser.add_argument("--tracks", type=int, default=3, help="number of test tracks")
     parser.add_argument("--policy", choices=("last", "best"), default="last")
     options = parser.parse_args()
@@ -162,14 +205,23 @@ def main() -> None:
     straight = [StraightTrack(track) for track in tracks]
     draw(options.output / "lines.png", straight, drives)
     rows = [
-        {"driver": name, **episode, "path": of_track.path_ratio(line_of(result, index)) if episode["laps"] else None}
+        {
+            "driver": name,
+            **episode,
+            "path": of_track.path_ratio(line_of(result, index)) if episode["laps"] else None,
+        }
         for name, result in drives.items()
         for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True))
     ]
     columns = {
-        "driver": ("driver", ""), "case": ("track", ""), "reward": ("reward", ".1f"), "lap_time": ("lap (s)", ".2f"),
-        "smoothness": ("smoothness", ".3f"), "path": ("path / centre line", ".3f"), "crashed": ("crashed", ""),
-    }  # fmt: skip
+        "driver": ("driver", ""),
+        "case": ("track", ""),
+        "reward": ("reward", ".1f"),
+        "lap_time": ("lap (s)", ".2f"),
+        "smoothness": ("smoothness", ".3f"),
+        "path": ("path / centre line", ".3f"),
+        "crashed": ("crashed", ""),
+    }
     print(f"{markdown_table(rows, columns)}\n{options.output / 'lines.png'}")
 
 

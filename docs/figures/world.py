@@ -1,9 +1,10 @@
 """Draw the view of a car in the cone world, and its guide's plan, at four moments of the guide's drive.
 
-The car faces up in each panel. Cones within 7 m and 60 degrees of the heading are in sight. A smoothing spline through
-the cones of a side estimates that boundary; five samples of each are the observation (distance and bearing). With fewer
-than two cones in sight, the last samples are remembered as places in the world. The guide pairs left and right cones
-into midpoints, fits a smoother spline through them and steers for a target on it.
+The car faces up in each panel. Cones within 7 m and 60 degrees of the heading are in sight. A
+smoothing spline through the cones of a side estimates that boundary; five samples of each are the
+observation (distance and bearing). With fewer than two cones in sight, the last samples are
+remembered as places in the world. The guide pairs left and right cones into midpoints, fits a
+smoother spline through them and steers for a target on it.
 
     python docs/figures/world.py [OUTPUT FOLDER]
 """
@@ -45,12 +46,19 @@ def draw_moments(panels: list[Axes]) -> None:
         state = guide(state)
         if step in moments:
             axes = panels[list(MOMENTS).index(moments[step])]
-            axes.set_title(f"{moments[step]}, after {step / env.rate:.2f} s", size=9, loc="left", color=style.QUIET)
+            axes.set_title(
+                f"{moments[step]}, after {step / env.rate:.2f} s",
+                size=9,
+                loc="left",
+                color=style.QUIET,
+            )
             draw_moment(axes, track, env, guide, state)
         state = step_mdp(env.step(state))
 
 
-def draw_moment(axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide, state: TensorDictBase) -> None:
+def draw_moment(
+    axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide, state: TensorDictBase
+) -> None:
     """Draw the track, the view and the guide's plan of the car."""
     frame = Frame(env.pose.double())
     cones, count = state["cones"], state["cone_count"]
@@ -61,7 +69,9 @@ def draw_moment(axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide,
     ego_view.make_panel(axes, sideways=6.7, behind=1.3, ahead=7.6)
     # The inner ring becomes a hole if the two run in opposite directions.
     rings = [local(track.boundary("left", 0.1)), local(track.boundary("right", 0.1))[::-1]]
-    surface = Outline.make_compound_path(*(Outline(np.vstack([ring, ring[:1]]), closed=True) for ring in rings))
+    surface = Outline.make_compound_path(
+        *(Outline(np.vstack([ring, ring[:1]]), closed=True) for ring in rings)
+    )
     axes.add_patch(PathPatch(surface, fc=style.ASPHALT, ec=style.KERB, lw=0.6, zorder=1))
     ego_view.draw_field_of_view(axes, SIGHT, HALF_FIELD_OF_VIEW)
     boundary = env.fit(cones.permute(3, 2, 1, 0), count.t())
@@ -69,7 +79,13 @@ def draw_moment(axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide,
     for side, name in enumerate(SIDES):
         visible = facing_up(rows(cones[0, side, : count[0, side]].t()))
         axes.plot(
-            *local(getattr(track, name)).T, "o", ms=5, mfc=style.BACKGROUND, mec=CONE_COLOURS[side], mew=1.1, zorder=3
+            *local(getattr(track, name)).T,
+            "o",
+            ms=5,
+            mfc=style.BACKGROUND,
+            mec=CONE_COLOURS[side],
+            mew=1.1,
+            zorder=3,
         )
         axes.plot(*visible.T, "o", ms=7.5, mfc=CONE_COLOURS[side], zorder=4, **EDGE)
         if env.sampled[side, 0] > 0:
@@ -83,12 +99,24 @@ def draw_moment(axes: Axes, track: Track, env: ConeTrackEnv, guide: SplineGuide,
 def number_samples(axes: Axes, samples: Array, side: int) -> None:
     """Write the numbers of the first and the last sample of a side outside of the boundary."""
     along = np.gradient(samples, axis=0)
-    outward = np.stack([-along[:, 1], along[:, 0]], 1) * (1, -1)[side] / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    outward = (
+        np.stack([-along[:, 1], along[:, 0]], 1)
+        * (1, -1)[side]
+        / np.maximum(np.hypot(*along.T), 1e-9)[:, None]
+    )
     for index in (0, SAMPLES - 1):
         axes.annotate(
-            str(SAMPLES * side + index + 1), samples[index], 8 * outward[index], textcoords="offset points",
-            ha="center", va="center", size=7.5, color=LINE_COLOURS[side], annotation_clip=True, zorder=10,
-        )  # fmt: skip
+            str(SAMPLES * side + index + 1),
+            samples[index],
+            8 * outward[index],
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            size=7.5,
+            color=LINE_COLOURS[side],
+            annotation_clip=True,
+            zorder=10,
+        )
 
 
 def main() -> None:
@@ -102,7 +130,9 @@ def main() -> None:
         marker("D", "remembered sample", 4.2, mfc=style.BACKGROUND, mec=LINE_COLOURS[0]),
         *ego_view.common_handles(),
     ]
-    with picture(path, f"A car's view and its guide's advice ({TRACK})", handles, height=6.25) as figure:
+    with picture(
+        path, f"A car's view and its guide's advice ({TRACK})", handles, height=6.25
+    ) as figure:
         draw_moments(list(figure.subplots(2, 2).flat))
     print(path)
 

@@ -25,10 +25,19 @@ CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
 
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
-    b"version https://git-lfs": ("a Git LFS pointer, not the recording", "fetch it with git lfs pull"),
-    b"#ROSBAG V": ("a ROS 1 bag", "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap"),
+    b"version https://git-lfs": (
+        "a Git LFS pointer, not the recording",
+        "fetch it with git lfs pull",
+    ),
+    b"#ROSBAG V": (
+        "a ROS 1 bag",
+        "convert it: rosbags-convert --src FILE --dst OTHER --dst-storage mcap",
+    ),
     b"SQLite format 3\0": ("the SQLite storage of a ROS 2 bag", f"convert its folder: {CONVERT}"),
-    b"\x28\xb5\x2f\xfd": ("compressed as a whole with zstd", "unpack it: zstd -d FILE -o OTHER.mcap"),
+    b"\x28\xb5\x2f\xfd": (
+        "compressed as a whole with zstd",
+        "unpack it: zstd -d FILE -o OTHER.mcap",
+    ),
     b"\x1f\x8b": ("compressed as a whole with gzip", "unpack it first"),
     b"\x04\x22\x4d\x18": ("compressed as a whole with lz4", "unpack it first"),
     b"PK\x03\x04": ("a zip archive", "unpack it first"),
@@ -47,7 +56,9 @@ class Channel(NamedTuple):
     encoding: str = "cdr"
     language: str = "ros2msg"
     definition: bytes = b""
-    metadata: tuple[tuple[str, str], ...] = ()  # keys and values, such as the quality of service that ROS 2 offers
+    metadata: tuple[
+        tuple[str, str], ...
+    ] = ()  # keys and values, such as the quality of service that ROS 2 offers
 
 
 class RawMessage(NamedTuple):
@@ -69,15 +80,16 @@ class Contents:
     attachments: dict[str, records.Attachment] = field(default_factory=dict)  # by name
     cut_off: bool = False  # whether a file ends early
     damage: list[str] = field(default_factory=list)  # the damaged places that were skipped
-    # Number of messages that damage made unreadable, by topic; a topic is missing if the number is unknown.
+    # Number of messages that damage made unreadable, by topic; a topic is missing if the number is
+    # unknown.
     lost: dict[str, int] = field(default_factory=dict)
 
 
 def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
     """Read a recording from start to end, with its checksums verified.
 
-    One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of file, or damage
-    outside of the chunks, is a `RecordingError`.
+    One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of
+    file, or damage outside of the chunks, is a `RecordingError`.
 
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
@@ -104,8 +116,8 @@ def digest(path: str | os.PathLike[str]) -> str:
 class RecordingWriter:
     """Collects messages and writes them as an MCAP file, ordered by time, at the end of a `with` block.
 
-    Nothing is written if the block raises. The file appears complete or not at all, and replaces an existing one. Equal
-    messages make equal bytes. See `read_recording` for an example.
+    Nothing is written if the block raises. The file appears complete or not at all, and replaces an
+    existing one. Equal messages make equal bytes. See `read_recording` for an example.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -127,10 +139,13 @@ class RecordingWriter:
         """Add a metadata record."""
         self._metadata[name] = dict(sorted(entries.items()))
 
-    def attach(self, name: str, media_type: str, data: bytes, times: tuple[int, int] | None = None) -> None:
+    def attach(
+        self, name: str, media_type: str, data: bytes, times: tuple[int, int] | None = None
+    ) -> None:
         """Add an attachment, such as a configuration.
 
-        `times` are those of creation and of logging in ns, by default both the time of the first message.
+        `times` are those of creation and of logging in ns, by default both the time of the first
+        message.
         """
         self._attachments[name] = media_type, data, times
 
@@ -167,8 +182,12 @@ class RecordingWriter:
                 schemas[schema] = writer.register_schema(*schema)
             about = channel.encoding, schemas.get(schema, 0), dict(channel.metadata)
             channels[channel] = writer.register_channel(channel.topic, *about)
-        for message in sorted(self._messages, key=lambda message: (message.log_time, message.channel)):
-            writer.add_message(channels[message.channel], message.log_time, message.data, message.publish_time)
+        for message in sorted(
+            self._messages, key=lambda message: (message.log_time, message.channel)
+        ):
+            writer.add_message(
+                channels[message.channel], message.log_time, message.data, message.publish_time
+            )
         writer.finish()
 
 
@@ -177,18 +196,30 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
     size, complete = _check_format(file)
     selected: dict[int, tuple[Channel, list[RawMessage]]] = {}
     schemas: dict[int, records.Schema] = {}
-    before, damage = {topic: len(messages) for topic, messages in contents.messages.items()}, len(contents.damage)
+    before, damage = (
+        {topic: len(messages) for topic, messages in contents.messages.items()},
+        len(contents.damage),
+    )
     with file.open("rb") as stream:
         for record in _records(file, stream, size, complete, contents):
             if type(record) is records.Message:
                 if record.channel_id in selected:
                     channel, messages = selected[record.channel_id]
-                    messages.append(RawMessage(channel, record.log_time, record.publish_time, record.data))
+                    messages.append(
+                        RawMessage(channel, record.log_time, record.publish_time, record.data)
+                    )
             elif type(record) is records.Schema:
                 schemas[record.id] = record
             elif type(record) is records.Channel:
-                kind = schemas.get(record.schema_id) or records.Schema(id=0, name="", encoding="", data=b"")
-                about = record.message_encoding, kind.encoding, kind.data, tuple(record.metadata.items())
+                kind = schemas.get(record.schema_id) or records.Schema(
+                    id=0, name="", encoding="", data=b""
+                )
+                about = (
+                    record.message_encoding,
+                    kind.encoding,
+                    kind.data,
+                    tuple(record.metadata.items()),
+                )
                 channel = Channel(record.topic, kind.name, *about)
                 contents.channels.append(channel)
                 if topics is None or channel.topic in topics:
@@ -201,22 +232,36 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
     if summary.statistics:
         written = summary.statistics.channel_message_counts
         for topic, messages in contents.messages.items():
-            total = sum(written.get(number, 0) for number, each in summary.channels.items() if each.topic == topic)
+            total = sum(
+                written.get(number, 0)
+                for number, each in summary.channels.items()
+                if each.topic == topic
+            )
             read = len(messages) - before.get(topic, 0)
             contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
 
 
-def _records(file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents) -> Iterator[Any]:
+def _records(
+    file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents
+) -> Iterator[Any]:
     """Yield the records of a file, of its chunks too; skip damaged chunks, and note them and an early end."""
-    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size).records
+    reader = StreamReader(
+        stream, emit_chunks=True, validate_crcs=True, record_size_limit=size
+    ).records
     while True:
         start, record = stream.tell(), None
         try:
             record = next(reader, None)
             if record is None:
                 return
-            parts = breakup_chunk(record, validate_crc=True) if type(record) is records.Chunk else [record]
-        except Exception as error:  # damaged bytes raise almost any exception in the libraries below
+            parts = (
+                breakup_chunk(record, validate_crc=True)
+                if type(record) is records.Chunk
+                else [record]
+            )
+        except (
+            Exception
+        ) as error:  # damaged bytes raise almost any exception in the libraries below
             end = stream.tell()
             if not complete and (end >= size or isinstance(error, RecordLengthLimitExceeded)):
                 contents.cut_off = True
@@ -233,12 +278,16 @@ def _records(file: Path, stream: BinaryIO, size: int, complete: bool, contents: 
                 reason = " ".join(str(error).split()) or type(error).__name__
                 save = "save what is left with: mcap recover FILE -o OTHER.mcap"
                 remedy = f"copy it again from where it was recorded, or {save}"
-                raise RecordingError(f"{file} is damaged before byte {end} ({reason}); {remedy}.") from None
+                raise RecordingError(
+                    f"{file} is damaged before byte {end} ({reason}); {remedy}."
+                ) from None
             contents.damage.append(f"byte {start}")
             if not following:
                 return
             stream.seek(min(following))
-            reader = StreamReader(stream, skip_magic=True, emit_chunks=True, record_size_limit=size).records
+            reader = StreamReader(
+                stream, skip_magic=True, emit_chunks=True, record_size_limit=size
+            ).records
             # The damage may hide the channels of the messages that follow.
             parts = [*summary.schemas.values(), *summary.channels.values()]
         yield from parts
@@ -262,7 +311,9 @@ def _check_format(file: Path) -> tuple[int, bool]:
             stream.seek(max(0, size - len(MAGIC)))
             complete = stream.read() == MAGIC and size > len(MAGIC)
     except OSError as error:
-        raise RecordingError(f"{file} cannot be read ({error.strerror}); give the path of an MCAP file.") from None
+        raise RecordingError(
+            f"{file} cannot be read ({error.strerror}); give the path of an MCAP file."
+        ) from None
     if not start:
         raise RecordingError(f"{file} is empty; copy it again from where it was recorded.")
     if MAGIC.startswith(start[: len(MAGIC)]):
@@ -270,7 +321,9 @@ def _check_format(file: Path) -> tuple[int, bool]:
     for magic, (description, remedy) in _OTHER_FORMATS.items():
         if start.startswith(magic):
             raise RecordingError(f"{file} is {description}; {remedy}.")
-    raise RecordingError(f"{file} is not an MCAP file: it begins with {start[:8].hex(' ')}; give one that is.")
+    raise RecordingError(
+        f"{file} is not an MCAP file: it begins with {start[:8].hex(' ')}; give one that is."
+    )
 
 
 def _files(path: Path) -> Iterator[Path]:
@@ -282,17 +335,23 @@ def _files(path: Path) -> Iterator[Path]:
     try:
         text = metadata.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
-        raise RecordingError(f"{path} is a folder without a readable metadata.yaml; {reindex}") from None
+        raise RecordingError(
+            f"{path} is a folder without a readable metadata.yaml; {reindex}"
+        ) from None
     # The file is written by a program, so two of its lines are found without a YAML parser.
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
     listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
     if storage and storage[1] != "mcap":
-        raise RecordingError(f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}.")
+        raise RecordingError(
+            f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}."
+        )
     if not listed:
         raise RecordingError(f"{metadata} lists no files; {reindex}")
     for line in listed[1].splitlines():
         # Older versions of ROS put the folder's own name before the file's.
         file = path / Path(line.strip().removeprefix("-").strip(" \"'")).name
         if not file.is_file():
-            raise RecordingError(f"{metadata} lists {file.name}, which is missing; copy all its files.")
+            raise RecordingError(
+                f"{metadata} lists {file.name}, which is missing; copy all its files."
+            )
         yield file

@@ -10,7 +10,11 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-SCAN, ODOMETRY, TWIST = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist"
+SCAN, ODOMETRY, TWIST = (
+    "sensor_msgs/msg/LaserScan",
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/Twist",
+)
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
@@ -30,16 +34,19 @@ def definition(message_type: str) -> bytes:
 def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
     """Return a message of a type such as "geometry_msgs/msg/Twist" as little-endian CDR.
 
-    A field is a number, text, sequence or nested mapping, zero or empty if missing. An unknown one is a `ValueError`.
+    A field is a number, text, sequence or nested mapping, zero or empty if missing. An unknown one
+    is a `ValueError`.
     """
-    return bytes(ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True))
+    return bytes(
+        ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True)
+    )
 
 
 def decode(data: bytes, message_type: str, language: str = "ros2msg", text: bytes = b"") -> Any:
     """Return a message in CDR of either byte order, with its fields as attributes.
 
-    The definition stored with the message is used, or the standard one if that text cannot be parsed. Bytes that are
-    not a message of this type are a `SerdeError`.
+    The definition stored with the message is used, or the standard one if that text cannot be
+    parsed. Bytes that are not a message of this type are a `SerdeError`.
     """
     return _types_of(message_type, language, text).deserialize_cdr(data, message_type)
 
@@ -64,7 +71,11 @@ def stamp_of(message: Any) -> int:
 def pose_of(message: Any) -> tuple[float, float, float]:
     """Return the pose of an Odometry message in the plane: m, m, radians."""
     position, q = message.pose.pose.position, message.pose.pose.orientation
-    return position.x, position.y, math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z))
+    return (
+        position.x,
+        position.y,
+        math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y * q.y + q.z * q.z)),
+    )
 
 
 def twist_of(message: Any) -> tuple[float, float]:
@@ -80,7 +91,11 @@ def _types_of(message_type: str, language: str, text: bytes) -> Typestore:
         return ros_types()
     try:
         parse_idl = language == "ros2idl"
-        parsed = get_types_from_idl(text.decode()) if parse_idl else get_types_from_msg(text.decode(), message_type)
+        parsed = (
+            get_types_from_idl(text.decode())
+            if parse_idl
+            else get_types_from_msg(text.decode(), message_type)
+        )
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(message_type)
@@ -91,14 +106,18 @@ def _types_of(message_type: str, language: str, text: bytes) -> Typestore:
 
 def _fields_of(message_type: str) -> dict[str, Any]:
     if message_type not in ros_types().fielddefs:
-        raise ValueError(f"{message_type!r} is not a standard ROS 2 message type; give one such as {SCAN}")
+        raise ValueError(
+            f"{message_type!r} is not a standard ROS 2 message type; give one such as {SCAN}"
+        )
     return dict(ros_types().fielddefs[message_type][1])
 
 
 def _message(message_type: str, fields: Mapping[str, Any]) -> Any:
     kinds = _fields_of(message_type)
     if unknown := set(fields) - set(kinds):
-        raise ValueError(f"{message_type} has no field {sorted(unknown)}; it has {', '.join(kinds)}")
+        raise ValueError(
+            f"{message_type} has no field {sorted(unknown)}; it has {', '.join(kinds)}"
+        )
     message_class: Any = ros_types().types[message_type]
     return message_class(**{name: _value(kind, fields.get(name)) for name, kind in kinds.items()})
 

@@ -13,7 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coil_rl.envs.recordings.mcap_files import Contents, RecordingError, read_messages
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, TWIST_STAMPED, decode, pose_of, stamp_of, twist_of
+from coil_rl.envs.recordings.messages import (
+    ODOMETRY,
+    SCAN,
+    TWIST,
+    TWIST_STAMPED,
+    decode,
+    pose_of,
+    stamp_of,
+    twist_of,
+)
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 LARGEST = 1e7  # of poses, commands and angles
@@ -21,7 +30,9 @@ REMEDY = "record it again, or correct the program that sent it"
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
-Scanner = tuple[str, float, float, str]  # frame, smallest and greatest range, name of the program that sent its scans
+Scanner = tuple[
+    str, float, float, str
+]  # frame, smallest and greatest range, name of the program that sent its scans
 
 
 @dataclass(frozen=True)
@@ -31,17 +42,23 @@ class Recording:
     path: Path  # of the file or folder
     log_time: Times  # [N] ns, ascending
     stamp: Times  # [N] ns, start of each scan by the scanner's clock
-    ranges: NDArray[np.float32]  # [N, P] m; inf if not finite or outside the scanner's range, and for padding
+    ranges: NDArray[
+        np.float32
+    ]  # [N, P] m; inf if not finite or outside the scanner's range, and for padding
     points: NDArray[np.int64]  # [N] number of ranges of each scan
     angle_min: Floats  # [N] radians, bearing of the first range
     angle_increment: Floats  # [N] radians, step of the bearing, negative for clockwise rotation
     # Poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
     odometry: tuple[Floats, Times, Times] | None = None
-    commands: tuple[Floats, Times] | None = None  # [M, 2] m/s, radians/s, with their log times [M] ns; None without
+    commands: tuple[Floats, Times] | None = (
+        None  # [M, 2] m/s, radians/s, with their log times [M] ns; None without
+    )
     frame: str = "laser"  # of the scanner
     stamped_commands: bool = False  # whether the commands are TwistStamped messages
     notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # metadata records by name
-    remarks: Sequence[str] = ()  # what the file has and the arrays lack: "is cut off: 160 scans can be read"
+    remarks: Sequence[
+        str
+    ] = ()  # what the file has and the arrays lack: "is cut off: 160 scans can be read"
 
     @property
     def simulated(self) -> bool:
@@ -57,19 +74,26 @@ class Recording:
     def angles(self, scan: int | slice) -> Floats:
         """Return the bearings of a scan's ranges, [P] radians, or of several scans, [N, P]."""
         increment = self.angle_increment[scan][..., None]
-        return np.asarray(self.angle_min[scan][..., None] + increment * np.arange(self.ranges.shape[1]))
+        return np.asarray(
+            self.angle_min[scan][..., None] + increment * np.arange(self.ranges.shape[1])
+        )
 
     def poses(self) -> Floats:
         """Return the pose at the start of each scan, [N, 3] m, m, radians.
 
-        Interpolated from the odometry; without odometry integrated from the commands; zeros without either.
+        Interpolated from the odometry; without odometry integrated from the commands; zeros without
+        either.
         """
         if self.odometry is not None:
             pose, log_time, stamp = self.odometry
             stamped = _ascending(self.stamp) and _ascending(stamp)
             scan_time, pose_time = (self.stamp, stamp) if stamped else (self.log_time, log_time)
-            # Relative times, as floating point would round absolute nanoseconds to a quarter of a microsecond.
-            at, times = (scan_time - pose_time[0]).astype(float), (pose_time - pose_time[0]).astype(float)
+            # Relative times, as floating point would round absolute nanoseconds to a quarter of a
+            # microsecond.
+            at, times = (
+                (scan_time - pose_time[0]).astype(float),
+                (pose_time - pose_time[0]).astype(float),
+            )
             columns = [pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2])]
             return np.stack([np.interp(at, times, column) for column in columns], axis=1)
         if self.commands is not None:
@@ -79,10 +103,11 @@ class Recording:
     def commands_of_scans(self, nominal_speed: float) -> Floats:
         """Return the command of each scan, [N, 2] m/s, radians/s; NaN before the first command.
 
-        It is the last command before the next scan: a controller needs time for a scan, and a program that sends
-        commands at a higher rate repeats the old one meanwhile. The speed is the command's own, with which its turn
-        rate means a steering angle; if no command has one, that of the odometry, and without it the nominal one, m/s. A
-        recording without commands is a `ValueError`.
+        It is the last command before the next scan: a controller needs time for a scan, and a
+        program that sends commands at a higher rate repeats the old one meanwhile. The speed is the
+        command's own, with which its turn rate means a steering angle; if no command has one, that
+        of the odometry, and without it the nominal one, m/s. A recording without commands is a
+        `ValueError`.
         """
         if self.commands is None:
             raise ValueError(f"{self.path} has no commands; check that commands is not None")
@@ -92,8 +117,13 @@ class Recording:
         if not commands[:, 0].any():
             rows[:, 0] = nominal_speed
             if self.odometry is not None:  # from each scan to the next one
-                path, time = np.hypot(*np.diff(self.poses()[:, :2], axis=0).T), np.diff(self.seconds)
-                rows[:, 0] = np.append(np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0)
+                path, time = (
+                    np.hypot(*np.diff(self.poses()[:, :2], axis=0).T),
+                    np.diff(self.seconds),
+                )
+                rows[:, 0] = np.append(
+                    np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0
+                )
         return rows
 
 
@@ -108,8 +138,8 @@ def read_recording(
 ) -> Recording:
     """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
 
-    A warning names what is left out: scans that are lost, odometry or commands of other types, other scanners. What
-    cannot be read is a `RecordingError`, in one sentence with its remedy.
+    A warning names what is left out: scans that are lost, odometry or commands of other types,
+    other scanners. What cannot be read is a `RecordingError`, in one sentence with its remedy.
 
     Args:
         path: of the file or folder.
@@ -117,7 +147,8 @@ def read_recording(
         odometry: its topic, or None; ignored if the recording does not have it.
         command: likewise, for the commands, Twist or TwistStamped.
         frame: of the scanner, if several send scans on one topic; None for the first one.
-        strict: raise for a recording that is cut off or damaged, instead of a warning with the number of scans.
+        strict: raise for a recording that is cut off or damaged, instead of a warning with the
+            number of scans.
 
     Example:
         >>> import tempfile
@@ -131,23 +162,37 @@ def read_recording(
     """
     path = Path(path)
     types: dict[str, tuple[str, ...]] = {scan: (SCAN,)}
-    types |= ({odometry: (ODOMETRY,)} if odometry else {}) | ({command: (TWIST, TWIST_STAMPED)} if command else {})
+    types |= ({odometry: (ODOMETRY,)} if odometry else {}) | (
+        {command: (TWIST, TWIST_STAMPED)} if command else {}
+    )
     if len(types) < 1 + bool(odometry) + bool(command):
-        raise RecordingError(f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics.")
+        raise RecordingError(
+            f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics."
+        )
     contents = read_messages(path, types)
     scans, lost = len(contents.messages[scan]), contents.lost.get(scan, "an unknown number")
     remarks = [f"is cut off: {scans} scans can be read"] if contents.cut_off else []
     if contents.damage:
-        remarks.append(f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost")
-    remarks += [remark for topic in types if (remark := _ignore_other_types(path, topic, types[topic], contents, scan))]
+        remarks.append(
+            f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost"
+        )
+    remarks += [
+        remark
+        for topic in types
+        if (remark := _ignore_other_types(path, topic, types[topic], contents, scan))
+    ]
     if not contents.messages[scan]:
         raise _no_scans(path, scan, contents)
     if strict and (contents.cut_off or contents.damage):
-        raise RecordingError(f"{path} {remarks[0]}; copy it again from where it was recorded, or set strict=false.")
+        raise RecordingError(
+            f"{path} {remarks[0]}; copy it again from where it was recorded, or set strict=false."
+        )
 
     extra: dict[str, Any] = {"notes": contents.notes, "remarks": remarks}
     if odometry and contents.messages[odometry]:
-        time, rows = _decoded(path, odometry, contents, lambda message: (stamp_of(message), pose_of(message)))
+        time, rows = _decoded(
+            path, odometry, contents, lambda message: (stamp_of(message), pose_of(message))
+        )
         poses = np.array([pose for _, pose in rows])
         _check_finite(path, odometry, time, poses, "the pose")
         extra["odometry"] = poses, time, np.array([stamp for stamp, _ in rows])
@@ -155,14 +200,18 @@ def read_recording(
         time, twists = _decoded(path, command, contents, twist_of)
         _check_finite(path, command, time, np.array(twists), "the command")
         extra["commands"] = np.array(twists), time
-        extra["stamped_commands"] = contents.messages[command][0].channel.message_type == TWIST_STAMPED
+        extra["stamped_commands"] = (
+            contents.messages[command][0].channel.message_type == TWIST_STAMPED
+        )
     fields = _scans(path, scan, contents, frame, remarks)
     for remark in remarks:
         warnings.warn(f"{path} {remark}", stacklevel=2)
     return Recording(path=path, **fields, **extra)
 
 
-def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remarks: list[str]) -> dict[str, Any]:
+def _scans(
+    path: Path, topic: str, contents: Contents, frame: str | None, remarks: list[str]
+) -> dict[str, Any]:
     """Return the fields of a `Recording` that come from the scans; add a remark if other scanners are left out."""
 
     def fields(message: Any) -> tuple[Any, ...]:
@@ -176,7 +225,9 @@ def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remark
     angles = np.array([row[2] for row in messages])
     _check_finite(path, topic, log_time, angles, "the angle of its first range, or between ranges,")
     # Recordings that were converted from ROS 1 name the program that sent a message.
-    senders = (dict(message.channel.metadata).get("callerid", "") for message in contents.messages[topic])
+    senders = (
+        dict(message.channel.metadata).get("callerid", "") for message in contents.messages[topic]
+    )
     scanners = [(*row[1], sender) for row, sender in zip(messages, senders, strict=True)]
     chosen = _choose_scanner(path, topic, scanners, frame, remarks)
     kept = [row for row, scanner in enumerate(scanners) if scanner == chosen]
@@ -191,9 +242,14 @@ def _scans(path: Path, topic: str, contents: Contents, frame: str | None, remark
     range_min, range_max = np.float32(chosen[1]), np.float32(chosen[2])
     ranges[~((ranges >= range_min) & (ranges <= range_max))] = np.inf
     return {
-        "log_time": log_time[kept], "stamp": np.array(stamps), "ranges": ranges, "points": points,
-        "angle_min": angles[kept, 0], "angle_increment": angles[kept, 1], "frame": chosen[0],
-    }  # fmt: skip
+        "log_time": log_time[kept],
+        "stamp": np.array(stamps),
+        "ranges": ranges,
+        "points": points,
+        "angle_min": angles[kept, 0],
+        "angle_increment": angles[kept, 1],
+        "frame": chosen[0],
+    }
 
 
 def _choose_scanner(
@@ -204,7 +260,9 @@ def _choose_scanner(
     candidates = [scanner for scanner in scans if frame in (None, scanner[0])]
     if not candidates:
         frames = " or ".join(dict.fromkeys(scanner[0] for scanner in scans))
-        raise RecordingError(f"{path}, topic {topic} has no scan with the frame {frame}; give frame={frames}.")
+        raise RecordingError(
+            f"{path}, topic {topic} has no scan with the frame {frame}; give frame={frames}."
+        )
     if len(candidates) > 1:
         names = ", ".join(
             f"{' of '.join(filter(None, (name, sender))) or 'no frame'} ({count} scans to {high:g} m)"
@@ -213,7 +271,9 @@ def _choose_scanner(
         )
         same = len({scanner[0] for scanner in candidates}) < len(candidates)
         remedy = "record each on a topic of its own" if same else "choose with frame=NAME"
-        remarks.append(f"has several scanners on topic {topic}, of which the first is read: {names}; {remedy}")
+        remarks.append(
+            f"has several scanners on topic {topic}, of which the first is read: {names}; {remedy}"
+        )
     return candidates[0]
 
 
@@ -227,7 +287,9 @@ def _integrate_commands(commands: Floats, command_time: Times, time: Times) -> F
     # The chord of an arc has the direction of the arc's middle.
     direction = heading + turn_rate * step / 2
     chord = speed * step * np.sinc(turn_rate * step / (2 * np.pi))
-    x, y = (np.cumsum(part) - part for part in (chord * np.cos(direction), chord * np.sin(direction)))
+    x, y = (
+        np.cumsum(part) - part for part in (chord * np.cos(direction), chord * np.sin(direction))
+    )
     return np.stack([x, y, heading], axis=1)[np.searchsorted(moments, time)]
 
 
@@ -242,47 +304,69 @@ def _decoded(
     rows = []
     for index, (channel, log_time, _, data) in enumerate(contents.messages[topic]):
         try:
-            rows.append(fields(decode(data, channel.message_type, channel.language, channel.definition)))
+            rows.append(
+                fields(decode(data, channel.message_type, channel.language, channel.definition))
+            )
         except Exception as error:  # bytes and definition may be anything
             problem = f"it is not a valid {channel.message_type} ({' '.join(str(error).split())})"
             raise _message_error(path, topic, index, log_time, problem) from None
     return np.array([message.log_time for message in contents.messages[topic]]), rows
 
 
-def _ignore_other_types(path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str) -> str | None:
+def _ignore_other_types(
+    path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str
+) -> str | None:
     """Remove the messages of other types or encodings of a topic; return a remark on them, if there are any.
 
     Only such messages on the topic of the scans are a `RecordingError`.
     """
     channels = [channel for channel in contents.channels if channel.topic == topic]
-    others = [channel for channel in channels if channel.message_type not in types or channel.encoding != "cdr"]
+    others = [
+        channel
+        for channel in channels
+        if channel.message_type not in types or channel.encoding != "cdr"
+    ]
     if not others:
         return None
-    contents.messages[topic] = [message for message in contents.messages[topic] if message.channel not in others]
+    contents.messages[topic] = [
+        message for message in contents.messages[topic] if message.channel not in others
+    ]
     given = f"{others[0].message_type or 'no type'} in {others[0].encoding or 'no encoding'}"
     problem = f"has messages of {given} on topic {topic}, not of {' or '.join(types)} in cdr"
     found = _topics(contents, types) if len(others) == len(channels) else ""
     remedy = f"; give the topic of such messages, here {found}" if found else ""
     if topic == scan and len(others) == len(channels):
-        raise RecordingError(f"{path} {problem}{remedy or f'; record the scans as {SCAN} with ROS 2'}.")
+        raise RecordingError(
+            f"{path} {problem}{remedy or f'; record the scans as {SCAN} with ROS 2'}."
+        )
     return f"{problem}, and they are ignored{remedy}"
 
 
 def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
     if contents.cut_off or contents.damage:
         loss = "cut off" if contents.cut_off else "damaged"
-        return RecordingError(f"{path} is {loss} before its first scan; copy it again from where it was recorded.")
+        return RecordingError(
+            f"{path} is {loss} before its first scan; copy it again from where it was recorded."
+        )
     if any(channel.topic == topic for channel in contents.channels):
-        return RecordingError(f"{path}, topic {topic} has no message; check that the scanner ran, and record it again.")
+        return RecordingError(
+            f"{path}, topic {topic} has no message; check that the scanner ran, and record it again."
+        )
     if others := _topics(contents, (SCAN,)):
-        return RecordingError(f"{path} has no topic {topic}; give the topic of the LiDAR, here {others}.")
+        return RecordingError(
+            f"{path} has no topic {topic}; give the topic of the LiDAR, here {others}."
+        )
     topics = ", ".join(sorted({channel.topic for channel in contents.channels})) or "none"
-    return RecordingError(f"{path} has no scans of a LiDAR ({SCAN} in cdr), its topics are: {topics}; record one too.")
+    return RecordingError(
+        f"{path} has no scans of a LiDAR ({SCAN} in cdr), its topics are: {topics}; record one too."
+    )
 
 
 def _topics(contents: Contents, types: Sequence[str]) -> str:
     channels = (channel for channel in contents.channels if channel.encoding == "cdr")
-    return " or ".join(sorted({channel.topic for channel in channels if channel.message_type in types}))
+    return " or ".join(
+        sorted({channel.topic for channel in channels if channel.message_type in types})
+    )
 
 
 def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str) -> None:
@@ -290,8 +374,12 @@ def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str
     wrong = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
     if len(wrong):
         index = int(wrong[0])
-        raise _message_error(path, topic, index, time[index], f"{name} is not a number below {LARGEST:g}")
+        raise _message_error(
+            path, topic, index, time[index], f"{name} is not a number below {LARGEST:g}"
+        )
 
 
 def _message_error(path: Path, topic: str, index: int, time: int, problem: str) -> RecordingError:
-    return RecordingError(f"{path}, topic {topic}, message {index} at {time / 1e9:.3f} s: {problem}; {REMEDY}.")
+    return RecordingError(
+        f"{path}, topic {topic}, message {index} at {time / 1e9:.3f} s: {problem}; {REMEDY}."
+    )

@@ -26,22 +26,25 @@ AnyPath = str | os.PathLike[str]
 class McapReplayEnv(EnvBase):
     """Recordings side by side, each replayed from its first to its last scan whatever the agent does.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of `ConeTrackEnv`:
-    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
-    `reward`, `done`, `terminated`, `truncated` [B, 1]; `omega` [B, 1] radians/s, the turn rate of the robot at that
-    steering; and under `info`: `scan` (its index), `time` (s since the first scan), `pose` [B, 3] (m, m, radians,
-    relative to the first scan), `valid` [B, 2] (whether each side is valid in this scan), `smoothness` |a - a_avg| and
-    `reward`. The only term of the reward is `smooth`, as a replay cannot show the effect of other actions.
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of
+    `ConeTrackEnv`: `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world,
+    `cone_count` [B, 2], `steering` [B, 1], `reward`, `done`, `terminated`, `truncated` [B, 1];
+    `omega` [B, 1] radians/s, the turn rate of the robot at that steering; and under `info`: `scan`
+    (its index), `time` (s since the first scan), `pose` [B, 3] (m, m, radians, relative to the
+    first scan), `valid` [B, 2] (whether each side is valid in this scan), `smoothness` |a - a_avg|
+    and `reward`. The only term of the reward is `smooth`, as a replay cannot show the effect of
+    other actions.
 
-    A step takes the action for the current scan and moves on to the next scan, so a recording of N scans takes N
-    actions; then the episode is truncated, and the last scan is repeated. A recording that cannot be used is a
-    `RecordingError`, a value outside its range a `ValueError`.
+    A step takes the action for the current scan and moves on to the next scan, so a recording of N
+    scans takes N actions; then the episode is truncated, and the last scan is repeated. A recording
+    that cannot be used is a `RecordingError`, a value outside its range a `ValueError`.
 
     Args:
         recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
-        perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to cones [N, 2, K, 2] in
-            the car's frame, m in the scale of the cone world, left side first, nearest first; and their number [N, 2].
-            Called once for all scans of a recording with equal bearings.
+        perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to
+            cones [N, 2, K, 2] in the car's frame, m in the scale of the cone world, left side
+            first, nearest first; and their number [N, 2]. Called once for all scans of a recording
+            with equal bearings.
         scan, odometry, command, frame, strict: as in `read_recording`.
         spline, smoothing, kept_cones, max_steering: as in `ConeTrackEnv`.
         smooth: weight of the reward per unit of |a - mean of the last 20 actions|.
@@ -70,23 +73,42 @@ class McapReplayEnv(EnvBase):
         max_steering: float = 80.0,
         device: torch.device | str = "cpu",
     ) -> None:
-        check_range(0, above=True, kept_cones=kept_cones, sight=sight, speed=speed, car_length=car_length)
+        check_range(
+            0, above=True, kept_cones=kept_cones, sight=sight, speed=speed, car_length=car_length
+        )
         check_range(0, 90, above=True, max_steering=max_steering)
         check_range(-1e6, 1e6, smooth=smooth)
-        sources = [recordings] if isinstance(recordings, (str, os.PathLike, Recording)) else list(recordings)
+        sources = (
+            [recordings]
+            if isinstance(recordings, (str, os.PathLike, Recording))
+            else list(recordings)
+        )
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
-        read = partial(read_recording, scan=scan, odometry=odometry, command=command, frame=frame, strict=strict)
-        self.recordings = [source if isinstance(source, Recording) else read(source) for source in sources]
+        read = partial(
+            read_recording,
+            scan=scan,
+            odometry=odometry,
+            command=command,
+            frame=frame,
+            strict=strict,
+        )
+        self.recordings = [
+            source if isinstance(source, Recording) else read(source) for source in sources
+        ]
         super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         # All scans are perceived here and stored end to end, [T] scans per buffer.
         self.perception = perception
-        cones, count = zip(*(_perceive(each, perception, kept_cones) for each in self.recordings), strict=True)
+        cones, count = zip(
+            *(_perceive(each, perception, kept_cones) for each in self.recordings), strict=True
+        )
         self.cones, self.count = _joined(cones), _joined(count)
-        self.pose = _joined([_from_start(each.poses()).astype(np.float32) for each in self.recordings])
+        self.pose = _joined(
+            [_from_start(each.poses()).astype(np.float32) for each in self.recordings]
+        )
         self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
         length = torch.tensor([len(each.ranges) for each in self.recordings])
         self.length: Tensor = nn.Buffer(length, persistent=False)
@@ -106,7 +128,10 @@ class McapReplayEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
-        self.steps, self.history = self.steps.masked_fill(mask, 0), self.history.masked_fill(mask, 0)
+        self.steps, self.history = (
+            self.steps.masked_fill(mask, 0),
+            self.history.masked_fill(mask, 0),
+        )
         self.memory.reset(mask)
         # Rows that are not reset perceive their scan again, which does not change their memory.
         return self._tensordict(self._perceive(), torch.zeros_like(self.history[0]))
@@ -119,7 +144,11 @@ class McapReplayEnv(EnvBase):
         out = self._tensordict(self._perceive(), roughness)
         out["reward"] = out["info", "reward", "smooth"]
         done = (self.steps >= self.length).unsqueeze(-1)
-        out["done"], out["truncated"], out["terminated"] = done, done.clone(), torch.zeros_like(done)
+        out["done"], out["truncated"], out["terminated"] = (
+            done,
+            done.clone(),
+            torch.zeros_like(done),
+        )
         return out
 
     def _current(self) -> Tensor:
@@ -142,10 +171,15 @@ class McapReplayEnv(EnvBase):
             "pose": self.pose.index_select(0, current),
             "valid": view["valid"],
             "smoothness": roughness.unsqueeze(-1),
-            "reward": TensorDict({"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size),
+            "reward": TensorDict(
+                {"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size
+            ),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {"steering": steering, "info": TensorDict(info, self.batch_size, device=self.device)}
+        entries |= {
+            "steering": steering,
+            "info": TensorDict(info, self.batch_size, device=self.device),
+        }
         entries["omega"] = (steering * self.max_steering).sin() * (self.speed / self.car_length)
         return TensorDict(entries, self.batch_size, device=self.device)
 
@@ -166,17 +200,30 @@ def _perceive(
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2]."""
     scans = len(recording.ranges)
-    all_cones, all_counts = np.zeros((scans, 2, kept_cones, 2), np.float32), np.zeros((scans, 2), np.int64)
+    all_cones, all_counts = (
+        np.zeros((scans, 2, kept_cones, 2), np.float32),
+        np.zeros((scans, 2), np.int64),
+    )
     layouts = np.stack([recording.points, recording.angle_min, recording.angle_increment], axis=1)
     for layout in np.unique(layouts, axis=0):
         rows = np.flatnonzero((layouts == layout).all(axis=1))
         points = int(layout[0])
-        cones, count = map(np.asarray, perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]))
+        cones, count = map(
+            np.asarray,
+            perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]),
+        )
         expected = (len(rows), 2, 2)
-        if cones.ndim != 4 or cones.shape[:2] + cones.shape[3:] != expected or count.shape != expected[:2]:
+        if (
+            cones.ndim != 4
+            or cones.shape[:2] + cones.shape[3:] != expected
+            or count.shape != expected[:2]
+        ):
             given = f"cones {cones.shape} and counts {count.shape} for {len(rows)} scans"
             needed = f"[{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
             raise ValueError(f"perception returned {given}; it must return {needed}")
         nearest = min(kept_cones, cones.shape[2])
-        all_cones[rows, :, :nearest], all_counts[rows] = cones[:, :, :nearest], np.minimum(count, nearest)
+        all_cones[rows, :, :nearest], all_counts[rows] = (
+            cones[:, :, :nearest],
+            np.minimum(count, nearest),
+        )
     return all_cones, all_counts

@@ -1,9 +1,10 @@
 """Clusters of LiDAR points: exact single linkage over all scans of a recording, and three features per cluster.
 
-Points closer than a gap are linked, directly or through other points. Neighbours in bearing are linked first, which
-leaves a few runs per scan. An object in front splits the surface behind it into several runs, so pairs of runs are
-tested too: points closer than the gap differ by at most arcsin(gap / distance) in bearing. The result equals the
-connected components of the full distance matrix.
+Points closer than a gap are linked, directly or through other points. Neighbours in bearing are
+linked first, which leaves a few runs per scan. An object in front splits the surface behind it into
+several runs, so pairs of runs are tested too: points closer than the gap differ by at most
+arcsin(gap / distance) in bearing. The result equals the connected components of the full distance
+matrix.
 """
 
 from dataclasses import dataclass
@@ -40,30 +41,37 @@ class Clusters:
     scan: Integers  # index of the scan
     size: Integers  # number of points
     centroid: Array  # [C, 2] m, mean point
-    # [C, 3] m: width (distance from the first to the last point by bearing), depth (greatest minus least range) and
-    # girth (sum of the distances between neighbours by bearing).
+    # [C, 3] m: width (distance from the first to the last point by bearing), depth (greatest minus
+    # least range) and girth (sum of the distances between neighbours by bearing).
     features: Array
 
 
-def points_of(ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float) -> Points:
+def points_of(
+    ranges: NDArray[np.floating], angles: NDArray[np.floating], range_min: float, range_max: float
+) -> Points:
     """Return the points between two ranges in m of scans [N, P] m; NaN and infinity are no points.
 
-    The beams have the bearings `angles` radians, [P] or, where each scan has its own, [N, P], in any order. Shapes that
-    do not match, or a bearing that is not finite, are a `ValueError`.
+    The beams have the bearings `angles` radians, [P] or, where each scan has its own, [N, P], in
+    any order. Shapes that do not match, or a bearing that is not finite, are a `ValueError`.
     """
     ranges, angles = np.asarray(ranges), np.asarray(angles, dtype=np.float64)
     if ranges.ndim != 2 or angles.shape not in (ranges.shape, ranges.shape[1:]):
         shapes = f"ranges {list(ranges.shape)} and angles {list(angles.shape)}"
         raise ValueError(f"{shapes} must be [N, P] and [P] or [N, P], N scans of P beams")
     if not np.isfinite(angles).all():
-        raise ValueError("angles contains a value that is not finite; give the bearing of each beam in radians")
+        raise ValueError(
+            "angles contains a value that is not finite; give the bearing of each beam in radians"
+        )
     bearings = np.mod(angles, TWO_PI)
     order = np.broadcast_to(np.argsort(bearings, kind="stable"), ranges.shape)
-    scan, index = np.nonzero(np.take_along_axis((ranges >= range_min) & (ranges <= range_max), order, axis=1))
+    scan, index = np.nonzero(
+        np.take_along_axis((ranges >= range_min) & (ranges <= range_max), order, axis=1)
+    )
     beam = order[scan, index]
     distance = ranges[scan, beam].astype(np.float64)
     bearing, cos, sin = (
-        np.broadcast_to(values, ranges.shape)[scan, beam] for values in (bearings, np.cos(bearings), np.sin(bearings))
+        np.broadcast_to(values, ranges.shape)[scan, beam]
+        for values in (bearings, np.cos(bearings), np.sin(bearings))
     )
     return Points(len(ranges), scan, beam, bearing, distance, distance * cos, distance * sin)
 
@@ -82,13 +90,20 @@ def single_linkage(points: Points, gap: float = GAP) -> Integers:
     run = np.concatenate([[0], np.cumsum(breaks)])
     run_end = np.append(np.flatnonzero(breaks) + 1, len(index))[run]
 
-    # Half a circle is enough, as each pair is within it in one of the two directions. 1e-9 covers rounding.
+    # Half a circle is enough, as each pair is within it in one of the two directions. 1e-9 covers
+    # rounding.
     with np.errstate(divide="ignore"):
-        reach = np.where(points.distance > gap, np.arcsin(np.minimum(1, gap / points.distance)), np.pi) + 1e-9
+        reach = (
+            np.where(points.distance > gap, np.arcsin(np.minimum(1, gap / points.distance)), np.pi)
+            + 1e-9
+        )
     last_bearing, offset = points.bearing + reach, points.scan * (2 * TWO_PI)
     wraps = last_bearing >= TWO_PI
-    last = np.searchsorted(offset + points.bearing, offset + last_bearing - TWO_PI * wraps, side="right")
-    # The candidates of a point are those behind its run and within reach; indices past the scan's end wrap around.
+    last = np.searchsorted(
+        offset + points.bearing, offset + last_bearing - TWO_PI * wraps, side="right"
+    )
+    # The candidates of a point are those behind its run and within reach; indices past the scan's
+    # end wrap around.
     count = np.maximum(np.minimum(last + wraps * (end - start), index + end - start) - run_end, 0)
     first = np.repeat(index, count)
     second = np.arange(len(first)) + np.repeat(run_end - np.cumsum(count) + count, count)

@@ -1,9 +1,10 @@
 """Drives of simulated robots: scripted drives with the true cone of each range, and recordings of drives as MCAP.
 
-In a recording, a scan is stamped with the time of its first measurement and logged at the time of its last one. As
-with rplidar_ros, the first measurement is the last range of the message (see `SimulatedLidar`). A command follows each
-scan and takes effect during the next one. The odometry has the pose at the start of each scan and at the end. The
-metadata record `track` has the cones and the start, in the odometry's frame.
+In a recording, a scan is stamped with the time of its first measurement and logged at the time of
+its last one. As with rplidar_ros, the first measurement is the last range of the message (see
+`SimulatedLidar`). A command follows each scan and takes effect during the next one. The odometry
+has the pose at the start of each scan and at the end. The metadata record `track` has the cones and
+the start, in the odometry's frame.
 """
 
 import math
@@ -22,7 +23,15 @@ from coil_rl.envs.limits import check_choice
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, header, twist
 from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError
-from coil_rl.envs.robot.course import THICK, THIN, cones_of, middle_line, noted_track, robot_track, track_notes
+from coil_rl.envs.robot.course import (
+    THICK,
+    THIN,
+    cones_of,
+    middle_line,
+    noted_track,
+    robot_track,
+    track_notes,
+)
 from coil_rl.envs.robot.env import SimulatedRobotEnv
 from coil_rl.envs.robot.lidar import RANGE_MAX, RANGE_MIN, SimulatedLidar, cast_beams
 from coil_rl.envs.track import Track, TrackError
@@ -50,7 +59,8 @@ class SimulatedDrive:
     poses: Tensor  # [3, T, P] sensor pose at the time of each beam (m, m, radians), NaN for padding
     cones: Tensor  # [2, M] m, centres
     radius: Tensor  # [M] m, of the cones
-    visibility: Tensor  # [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams
+    # [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams
+    visibility: Tensor
 
     @property
     def thick(self) -> Tensor:
@@ -87,14 +97,16 @@ def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None
     visibility = _visibility(poses, lidar.angles, cones, radius, hit)
     hit = torch.where(outlier, -1, hit)
     name = f"{sides}_{seed}"
-    return SimulatedDrive(name, track, sides, seconds, lidar.angles, ranges, hit, poses, cones, radius, visibility)
+    return SimulatedDrive(
+        name, track, sides, seconds, lidar.angles, ranges, hit, poses, cones, radius, visibility
+    )
 
 
 def labelled_drive(recording: Recording) -> SimulatedDrive:
     """Return a recorded drive, simulated or real, with the ground truth that follows from its odometry and track.
 
-    The last scan is left out, as the pose at its end is unknown. A recording without a track, odometry or a second scan
-    is a `RecordingError`.
+    The last scan is left out, as the pose at its end is unknown. A recording without a track,
+    odometry or a second scan is a `RecordingError`.
     """
     path, scans = recording.path, recording.ranges
     if "track" not in recording.notes or recording.odometry is None or len(scans) < 2:
@@ -115,7 +127,9 @@ def labelled_drive(recording: Recording) -> SimulatedDrive:
     seconds = torch.from_numpy(recording.seconds[:-1])
     visibility = _visibility(poses, angles, cones, radius, hit)
     hit = torch.where(ranges.isfinite() & ((ranges - true).abs() > MAX_RANGE_ERROR), -1, hit)
-    return SimulatedDrive(path.stem, track, "both", seconds, angles, ranges, hit, poses, cones, radius, visibility)
+    return SimulatedDrive(
+        path.stem, track, "both", seconds, angles, ranges, hit, poses, cones, radius, visibility
+    )
 
 
 def track_of(recording: Recording) -> Track:
@@ -138,7 +152,8 @@ def record_labelling_drives(
 ) -> dict[Sides, list[str]]:
     """Record drives to train a cone classifier, `pairs` past each side, and `both` drives past both sides to test it.
 
-    The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is called after each drive.
+    The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is
+    called after each drive.
     """
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}
     for sides, files in paths.items():
@@ -152,18 +167,23 @@ def record_labelling_drives(
 
 @torch.no_grad()
 def record_drives(
-    env: EnvBase, policy: TensorDictModuleBase, paths: Sequence[Path], about: Mapping[str, str] | None = None,
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    paths: Sequence[Path],
+    about: Mapping[str, str] | None = None,
     tick: Callable[[], Any] | None = None,
-) -> None:  # fmt: skip
+) -> None:
     """Run a policy on B simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
 
-    The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically. The entries of
-    `about`, such as the name of the policy, are noted in each file. `tick` is called after every step. Another kind of
-    env, or another number of paths, is a `ValueError`.
+    The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically.
+    The entries of `about`, such as the name of the policy, are noted in each file. `tick` is called
+    after every step. Another kind of env, or another number of paths, is a `ValueError`.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, SimulatedRobotEnv):
-        raise ValueError(f"env is a {type(base).__name__}; give a SimulatedRobotEnv, which has scans to record")
+        raise ValueError(
+            f"env is a {type(base).__name__}; give a SimulatedRobotEnv, which has scans to record"
+        )
     robots = env.batch_size[0]
     if len(paths) != robots:
         raise ValueError(f"{len(paths)} paths for {robots} robots; give one file for each")
@@ -177,13 +197,23 @@ def record_drives(
             scan, pose = base.scan, state["info", "pose"]
             step = env.step(policy(state))
             # The action that reached the robot: a transform may have changed the policy's.
-            rows.append((running, scan, start, step["next", "steering"].squeeze(-1), step["next", "info", "pose"]))
+            rows.append(
+                (
+                    running,
+                    scan,
+                    start,
+                    step["next", "steering"].squeeze(-1),
+                    step["next", "info", "pose"],
+                )
+            )
             # The robot stands during the first scan, so the second one starts at the same pose.
             start, running = pose, running & ~step["next", "done"].squeeze(-1)
             state = step_mdp(step)
             if tick is not None:
                 tick()
-    rows_of, scans, starts, actions, ends = (torch.stack(column) for column in zip(*rows, strict=True))
+    rows_of, scans, starts, actions, ends = (
+        torch.stack(column) for column in zip(*rows, strict=True)
+    )
     speed = base.step_length * base.lidar.rate
     turn_rate = (actions * base.max_steering).sin() * (speed / base.car_length)
     for robot, path in enumerate(paths):
@@ -201,22 +231,36 @@ def _notes(drive: Mapping[str, str], track: Track | None) -> dict[str, dict[str,
 
 
 def _write(
-    path: Path, rate: float, angles: Tensor, ranges: Tensor, poses: Tensor, commands: Tensor | None,
+    path: Path,
+    rate: float,
+    angles: Tensor,
+    ranges: Tensor,
+    poses: Tensor,
+    commands: Tensor | None,
     notes: Mapping[str, Mapping[str, str]],
-) -> None:  # fmt: skip
+) -> None:
     """Write scans [T, P] m, the poses at their starts and after [T or more, 3], and the commands after them [T, 2]."""
     times = [round(scan / rate * 1e9) for scan in range(max(len(ranges) + 1, len(poses)))]
     beams, angle_min = len(angles), float(angles[0])
     increment = 2 * math.pi / beams
     scanner = {
-        "angle_min": angle_min, "angle_max": angle_min + increment * (beams - 1), "angle_increment": increment,
-        "time_increment": 1 / rate / beams, "scan_time": 1 / rate, "range_min": RANGE_MIN, "range_max": RANGE_MAX,
-    }  # fmt: skip
+        "angle_min": angle_min,
+        "angle_max": angle_min + increment * (beams - 1),
+        "angle_increment": increment,
+        "time_increment": 1 / rate / beams,
+        "scan_time": 1 / rate,
+        "range_min": RANGE_MIN,
+        "range_max": RANGE_MAX,
+    }
     with RecordingWriter(path) as writer:
         for name, entries in notes.items():
             writer.describe(name, entries)
-        for index, (start, end, scan) in enumerate(zip(times, times[1:], ranges.numpy(), strict=False)):
-            writer.add("/scan", SCAN, end, {"header": header(start, "laser"), "ranges": scan, **scanner})
+        for index, (start, end, scan) in enumerate(
+            zip(times, times[1:], ranges.numpy(), strict=False)
+        ):
+            writer.add(
+                "/scan", SCAN, end, {"header": header(start, "laser"), "ranges": scan, **scanner}
+            )
             if commands is not None:
                 writer.add("/cmd_vel", TWIST, end, twist(*commands[index].tolist()))
         for time, (x, y, heading) in zip(times, poses.tolist(), strict=False):
@@ -226,8 +270,13 @@ def _write(
             writer.add("/odom", ODOMETRY, time, fields)
 
 
-def _visibility(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor) -> Tensor:
+def _visibility(
+    poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor
+) -> Tensor:
     """Return the share of the beams towards each cone that hit it [T, M]; `hit` [T, P] is the cone of each beam."""
-    alone = [cast_beams(poses, angles, cones[:, [m]], radius[[m]])[0].isfinite().sum(-1) for m in range(len(radius))]
+    alone = [
+        cast_beams(poses, angles, cones[:, [m]], radius[[m]])[0].isfinite().sum(-1)
+        for m in range(len(radius))
+    ]
     hits = torch.stack([(hit == m).sum(-1) for m in range(len(radius))], -1)
     return hits / torch.stack(alone, -1).clamp(min=1)

@@ -1,8 +1,9 @@
 """Simulation of the paper's robot (section 4.2): a small car with a LiDAR between thin and thick cones.
 
-It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone: cones hide one
-another, are misclassified or missed. The entries have the keys and the scale of the cone world, so guides and policies
-of that world run unchanged. The numbers come from data sheets, not from a real robot.
+It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone:
+cones hide one another, are misclassified or missed. The entries have the keys and the scale of the
+cone world, so guides and policies of that world run unchanged. The numbers come from data sheets,
+not from a real robot.
 """
 
 import math
@@ -17,10 +18,23 @@ from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
-from coil_rl.envs.reward import HISTORY, TERMS, Outcome, RewardWeights, check_weights, recent_mean, weighted_terms
+from coil_rl.envs.reward import (
+    HISTORY,
+    TERMS,
+    Outcome,
+    RewardWeights,
+    check_weights,
+    recent_mean,
+    weighted_terms,
+)
 from coil_rl.envs.robot.course import RobotCourse, robot_track
 from coil_rl.envs.robot.lidar import SimulatedLidar, cast_beams, move_along_arc
-from coil_rl.envs.robot.perception import BoundaryMemory, Perception, declare_specs, simulated_cone_classifier
+from coil_rl.envs.robot.perception import (
+    BoundaryMemory,
+    Perception,
+    declare_specs,
+    simulated_cone_classifier,
+)
 from coil_rl.envs.track import NEVER, Track, places
 
 FINISH_RADIUS = 0.15  # m, covers the width between the cones
@@ -29,18 +43,20 @@ FINISH_RADIUS = 0.15  # m, covers the width between the cones
 class SimulatedRobotEnv(SeededEnv):
     """Simulated robots on tracks between cones, independent of one another.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of `ConeTrackEnv`:
-    `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world, `cone_count` [B, 2], `steering` [B, 1],
-    `reward`, `done`, `terminated`, `truncated` [B, 1], and under `info` the same entries in the robot's own metres, and
-    `valid` [B, 2], whether each side is valid in this scan. The reward is that of the cone world without the term for
-    new cones, as the robot cannot distinguish new cones from known ones. A robot crashes if its outline touches a cone
-    or its centre reaches a boundary. All state is in buffers; `scan` [B, P] m is the last scan, infinite without a
-    return. A value outside its range is a `ValueError`.
+    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of
+    `ConeTrackEnv`: `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world,
+    `cone_count` [B, 2], `steering` [B, 1], `reward`, `done`, `terminated`, `truncated` [B, 1], and
+    under `info` the same entries in the robot's own metres, and `valid` [B, 2], whether each side
+    is valid in this scan. The reward is that of the cone world without the term for new cones, as
+    the robot cannot distinguish new cones from known ones. A robot crashes if its outline touches a
+    cone or its centre reaches a boundary. All state is in buffers; `scan` [B, P] m is the last
+    scan, infinite without a return. A value outside its range is a `ValueError`.
 
     Args:
         tracks: in the robot's own metres; None for `robot_track()`.
         num_envs: B.
-        starts, assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in `ConeTrackEnv`.
+        starts, assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in
+            `ConeTrackEnv`.
         perception: None for `Perception` with the shipped classifier.
         lidar: None for an RPLIDAR A1M8; one control step per scan.
         speed: m/s.
@@ -90,15 +106,26 @@ class SimulatedRobotEnv(SeededEnv):
         self.laps, self.max_steps = laps, round(time_limit * self.rate)
         self.step_length, self.car_length = speed / self.rate, car_length
         self.max_steering = math.radians(max_steering)
-        self.weights = {key: torch.tensor(float(x)) for key, x in RewardWeights(**(reward or {}))._asdict().items()}
+        self.weights = {
+            key: torch.tensor(float(x))
+            for key, x in RewardWeights(**(reward or {}))._asdict().items()
+        }
         sight = self.perception.range_max * self.perception.scale
         self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
         index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
-        self.start_track, self.start_pose, self.staggered = index, poses.T.float(), starts is not None
-        self.start_lap = torch.where(driven.isnan(), NEVER, -driven / self.step_length).round().long()
-        self.finish = torch.tensor(np.stack([track.finish for track in self.tracks], axis=1)).float()
+        self.start_track, self.start_pose, self.staggered = (
+            index,
+            poses.T.float(),
+            starts is not None,
+        )
+        self.start_lap = (
+            torch.where(driven.isnan(), NEVER, -driven / self.step_length).round().long()
+        )
+        self.finish = torch.tensor(
+            np.stack([track.finish for track in self.tracks], axis=1)
+        ).float()
         self.place: Tensor = nn.Buffer(torch.arange(num_envs) % len(index))
         self.track: Tensor = nn.Buffer(self.start_track[self.place])
         self.pose: Tensor = nn.Buffer(torch.zeros(3, num_envs))
@@ -114,7 +141,8 @@ class SimulatedRobotEnv(SeededEnv):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         steps = torch.zeros(self.batch_size, dtype=torch.int64)
-        # All robots draw and measure, reset or not: the order of random numbers must not depend on the data.
+        # All robots draw and measure, reset or not: the order of random numbers must not depend on
+        # the data.
         if self.assignment == "random":
             drawn = torch.randint(len(self.start_track), self.batch_size, generator=self.generator)
             if mask is None and self.staggered:
@@ -122,8 +150,16 @@ class SimulatedRobotEnv(SeededEnv):
             self.place = drawn if mask is None else torch.where(mask.view(-1), drawn, self.place)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
         place = self.place
-        start = {"track": self.start_track[place], "pose": self.start_pose[:, place], "steps": steps}
-        start |= {"lap_start": steps + self.start_lap[place], "history": torch.zeros(()), "lap": torch.tensor(0)}
+        start = {
+            "track": self.start_track[place],
+            "pose": self.start_pose[:, place],
+            "steps": steps,
+        }
+        start |= {
+            "lap_start": steps + self.start_lap[place],
+            "history": torch.zeros(()),
+            "lap": torch.tensor(0),
+        }
         for name, value in start.items():
             setattr(self, name, torch.where(mask, value, getattr(self, name)))
         begun = self.lap_start > NEVER
@@ -131,12 +167,15 @@ class SimulatedRobotEnv(SeededEnv):
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
         self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
         self.memory.reset(mask)
-        # Robots that are not reset perceive their last scan again, which does not change their memory.
+        # Robots that are not reset perceive their last scan again, which does not change their
+        # memory.
         view = self._perceive()
         zero = torch.zeros(self.batch_size)
         terms = dict.fromkeys(TERMS, zero)
         flags = {"crashed": zero.bool(), "completed": zero.bool()}
-        return self._tensordict(view, terms, lap_time=zero, **flags, clearance=zero, smoothness=zero)
+        return self._tensordict(
+            view, terms, lap_time=zero, **flags, clearance=zero, smoothness=zero
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
@@ -144,8 +183,13 @@ class SimulatedRobotEnv(SeededEnv):
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.steps = self.steps + 1
         # Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way.
-        turn, phase = (action * self.max_steering).sin() * (self.step_length / self.car_length), self.lidar.phase
-        poses = move_along_arc(self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase)
+        turn, phase = (
+            (action * self.max_steering).sin() * (self.step_length / self.car_length),
+            self.lidar.phase,
+        )
+        poses = move_along_arc(
+            self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase
+        )
         self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
         self.scan = self._measure(poses)
         view = self._perceive()
@@ -154,25 +198,37 @@ class SimulatedRobotEnv(SeededEnv):
         clearance, to_boundaries = self.course.clearance(self.track, self.pose)
         crashed = clearance <= 0
         no_cone, alive = torch.zeros_like(action), (~crashed).float()
-        outcome = Outcome(action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive)
+        outcome = Outcome(
+            action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive
+        )
         terms = weighted_terms(outcome, self.weights)
         completed = (self.lap >= self.laps) & ~crashed
         terminated = crashed | completed
         truncated = (self.steps >= self.max_steps) & ~terminated
         flags = {"crashed": crashed, "completed": completed}
-        out = self._tensordict(view, terms, lap_time=lap_time, **flags, clearance=clearance, smoothness=roughness)
+        out = self._tensordict(
+            view, terms, lap_time=lap_time, **flags, clearance=clearance, smoothness=roughness
+        )
         out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
         return out
 
     def _measure(self, poses: Tensor) -> Tensor:
-        true, _ = cast_beams(poses, self.lidar.angles, self.course.cones[:, self.track], self.course.radius[self.track])
+        true, _ = cast_beams(
+            poses,
+            self.lidar.angles,
+            self.course.cones[:, self.track],
+            self.course.radius[self.track],
+        )
         return self.lidar.measure(true, self.generator)[0]
 
     def _perceive(self) -> dict[str, Tensor]:
         """Return the cones in the last scan, and the observation with the memory updated by them."""
-        cones, count = (torch.from_numpy(x) for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy()))
+        cones, count = (
+            torch.from_numpy(x)
+            for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy())
+        )
         cones = cones.float()
         observation, valid = self.memory(cones, count)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
@@ -191,11 +247,20 @@ class SimulatedRobotEnv(SeededEnv):
         """Return whether each robot is in the finish circle, [B]."""
         return (self.pose[:2] - self.finish[:, self.track]).norm(dim=0) < FINISH_RADIUS
 
-    def _tensordict(self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor) -> TensorDict:
+    def _tensordict(
+        self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor
+    ) -> TensorDict:
         columns = {"track": self.track, "lap": self.lap, **values}
         reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
         info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
-        info |= {"pose": self.pose.t(), "valid": view["valid"], "reward": TensorDict(reward, self.batch_size)}
+        info |= {
+            "pose": self.pose.t(),
+            "valid": view["valid"],
+            "reward": TensorDict(reward, self.batch_size),
+        }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {"steering": self.history[0].unsqueeze(-1), "info": TensorDict(info, self.batch_size)}
+        entries |= {
+            "steering": self.history[0].unsqueeze(-1),
+            "info": TensorDict(info, self.batch_size),
+        }
         return TensorDict(entries, self.batch_size, device=self.device)

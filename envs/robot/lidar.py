@@ -1,7 +1,8 @@
 """Simulated LiDAR: the distance along each beam of a rotating, moving sensor to the nearest of several upright cones.
 
-The defaults are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per second). A cone is a disc in the plane of
-the beams. A nearer cone hides a farther one, and the robot moves during a scan.
+The defaults are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per second). A cone is a
+disc in the plane of the beams. A nearer cone hides a farther one, and the robot moves during a
+scan.
 """
 
 import math
@@ -23,7 +24,9 @@ class SimulatedLidar:
     beams: int = 360  # P, points per scan
     rate: float = 5.5  # scans per second
     noise: float = 0.0007  # m, standard deviation of a range at distance 0
-    noise_growth: float = 0.001  # 1/m, increase of the standard deviation per square metre of distance
+    noise_growth: float = (
+        0.001  # 1/m, increase of the standard deviation per square metre of distance
+    )
     quantum: float = 0.00025  # m, resolution of the ranges
     no_return: float = 0.02  # share of beams without a return
     outliers: float = 0.005  # share of beams with a random range
@@ -32,11 +35,15 @@ class SimulatedLidar:
         check_range(0, above=True, beams=self.beams, rate=self.rate, quantum=self.quantum)
         check_range(0, noise=self.noise, noise_growth=self.noise_growth)
         if min(self.no_return, self.outliers) < 0 or self.no_return + self.outliers > 1:
-            raise ValueError(f"no_return={self.no_return} and outliers={self.outliers} must be shares of all beams")
+            raise ValueError(
+                f"no_return={self.no_return} and outliers={self.outliers} must be shares of all beams"
+            )
         beams = self.beams
-        # As in rplidar_ros, a scan starts and ends behind the robot. The sensor turns clockwise but bearings ascend, so
-        # the last beam is measured first.
-        self.angles = (torch.arange(1, beams + 1, dtype=torch.float64) * (2 * math.pi / beams) - math.pi).float()
+        # As in rplidar_ros, a scan starts and ends behind the robot. The sensor turns clockwise but
+        # bearings ascend, so the last beam is measured first.
+        self.angles = (
+            torch.arange(1, beams + 1, dtype=torch.float64) * (2 * math.pi / beams) - math.pi
+        ).float()
         # Time of each beam as a share of the scan.
         self.phase = torch.arange(beams - 1, -1, -1) / beams
 
@@ -47,7 +54,9 @@ class SimulatedLidar:
         """
         noise = torch.randn(true.shape, generator=generator)
         chance, uniform = torch.rand(2, *true.shape, generator=generator)
-        ranges = true + noise * (self.noise + self.noise_growth * true.clamp(max=RANGE_MAX).square())
+        ranges = true + noise * (
+            self.noise + self.noise_growth * true.clamp(max=RANGE_MAX).square()
+        )
         outlier = chance < self.outliers
         ranges = torch.where(outlier, RANGE_MIN + (RANGE_MAX - RANGE_MIN) * uniform, ranges)
         ranges = (ranges / self.quantum).round() * self.quantum
@@ -55,7 +64,9 @@ class SimulatedLidar:
         return torch.where(lost, torch.inf, ranges), outlier
 
 
-def cast_beams(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+def cast_beams(
+    poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the true distance along each beam to the first surface [B, P] m, and the index of the cone it hits [B, P].
 
     Without a cone the distance is infinite and the index -1.
@@ -68,7 +79,10 @@ def cast_beams(poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor) -> 
     """
     direction = poses[2] + angles
     cos, sin = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
-    x, y = (centre.unsqueeze(-2) - sensor.unsqueeze(-1) for centre, sensor in zip(cones, poses[:2], strict=True))
+    x, y = (
+        centre.unsqueeze(-2) - sensor.unsqueeze(-1)
+        for centre, sensor in zip(cones, poses[:2], strict=True)
+    )
     along = x * cos + y * sin
     across = y * cos - x * sin
     half_chord_squared = radius.square().unsqueeze(-2) - across.square()

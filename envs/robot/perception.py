@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SCANS_PER_BATCH = 512  # keeps the points in the cache
-MIN_DISTANCE = 0.5  # m, least plausible distance of a boundary sample, in the scale of the cone world
+MIN_DISTANCE = (
+    0.5  # m, least plausible distance of a boundary sample, in the scale of the cone world
+)
 MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of view
 
 
@@ -31,12 +33,14 @@ MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of
 class ConeClassifier:
     """Support vector machines that tell thin cones, thick cones and other clusters apart.
 
-    The kernel is radial, on standardised features. `coil_rl.robot` trains the machines with scikit-learn; the decision
-    in NumPy is many times faster for a few clusters. F features are standardised by `mean` and `scale` [F] and compared
-    with the support vectors [S, F] by the kernel exp(-gamma |a - b|^2). The `weights` [2, S] and the `intercept` [2] of
-    the two machines turn the kernel into decision values: the first is positive for thick cones and negative for thin
-    ones; the second is negative for clusters unlike those of the training. Shapes that do not match, a value that is
-    not finite, and a `scale` or `gamma` that is not positive are a `ValueError`.
+    The kernel is radial, on standardised features. `coil_rl.robot` trains the machines with
+    scikit-learn; the decision in NumPy is many times faster for a few clusters. F features are
+    standardised by `mean` and `scale` [F] and compared with the support vectors [S, F] by the
+    kernel exp(-gamma |a - b|^2). The `weights` [2, S] and the `intercept` [2] of the two machines
+    turn the kernel into decision values: the first is positive for thick cones and negative for
+    thin ones; the second is negative for clusters unlike those of the training. Shapes that do not
+    match, a value that is not finite, and a `scale` or `gamma` that is not positive are a
+    `ValueError`.
 
     Example:
         >>> from coil_rl.envs import simulated_cone_classifier
@@ -55,20 +59,33 @@ class ConeClassifier:
         for field in fields(self):
             value = np.array(getattr(self, field.name), dtype=np.float64)
             if not np.isfinite(value).all():
-                raise ValueError(f"{field.name} of a cone classifier contains a value that is not finite")
+                raise ValueError(
+                    f"{field.name} of a cone classifier contains a value that is not finite"
+                )
             object.__setattr__(self, field.name, value)
         shapes = [list(getattr(self, field.name).shape) for field in fields(self)]
         vectors, features = len(np.atleast_1d(self.support)), len(np.atleast_1d(self.mean))
         if shapes != [[features], [features], [vectors, features], [2, vectors], [2], []]:
-            raise ValueError(f"shapes {shapes} of a cone classifier must be [F], [F], [S, F], [2, S], [2], []")
+            raise ValueError(
+                f"shapes {shapes} of a cone classifier must be [F], [F], [S, F], [2, S], [2], []"
+            )
         if not (self.scale > 0).all() or not self.gamma > 0:
             raise ValueError("scale and gamma of a cone classifier must be more than 0")
 
     def decision(self, features: NDArray[np.floating]) -> Array:
         """Return the decision values of both machines [C, 2] for features [C, F]."""
-        x = (np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean) / self.scale
-        squared_distance = (x * x).sum(1)[:, None] + (self.support * self.support).sum(1) - 2 * (x @ self.support.T)
-        return np.asarray(np.exp(-self.gamma * squared_distance) @ self.weights.T + self.intercept, dtype=np.float64)
+        x = (
+            np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean
+        ) / self.scale
+        squared_distance = (
+            (x * x).sum(1)[:, None]
+            + (self.support * self.support).sum(1)
+            - 2 * (x @ self.support.T)
+        )
+        return np.asarray(
+            np.exp(-self.gamma * squared_distance) @ self.weights.T + self.intercept,
+            dtype=np.float64,
+        )
 
     def classify(self, features: NDArray[np.floating]) -> Integers:
         """Return the class of each cluster: 0 for a thin cone, 1 for a thick one, -1 for no cone; [C, F] to [C]."""
@@ -78,7 +95,9 @@ class ConeClassifier:
 
 def simulated_cone_classifier() -> ConeClassifier:
     """Return the shipped classifier, trained on simulated scans (`SimulatedLidar`)."""
-    text = (resources.files("coil_rl.envs.robot") / "simulated_cones.json").read_text(encoding="utf-8")
+    text = (resources.files("coil_rl.envs.robot") / "simulated_cones.json").read_text(
+        encoding="utf-8"
+    )
     return ConeClassifier(**json.loads(text))
 
 
@@ -86,8 +105,8 @@ def simulated_cone_classifier() -> ConeClassifier:
 class Perception:
     """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep the cones in range.
 
-    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of its points. A value
-    outside its range is a `ValueError`.
+    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of
+    its points. A value outside its range is a `ValueError`.
 
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
@@ -105,28 +124,42 @@ class Perception:
     bearing_max: float = 60.0  # degrees to either side of the heading
     scale: float = 7.0  # factor from the robot's metres to those of the cone world
     laser_yaw: float = 0.0  # degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise
-    margin: float = 0.15  # m, points this far beyond `range_max` are clustered too, so that cones there are complete
+    # m, points this far beyond `range_max` are clustered too, so that cones there are complete
+    margin: float = 0.15
     gap: float = GAP  # m, points closer than this are linked
     kept_cones: int = 16  # K, the nearest cones kept per side
 
     def __post_init__(self) -> None:
-        check_range(0, above=True, range_max=self.range_max, scale=self.scale, gap=self.gap, kept_cones=self.kept_cones)
+        check_range(
+            0,
+            above=True,
+            range_max=self.range_max,
+            scale=self.scale,
+            gap=self.gap,
+            kept_cones=self.kept_cones,
+        )
         if not 0 < self.range_min < self.range_max:
-            raise ValueError(f"range_min={self.range_min} must be above 0, the code for no return, and below range_max")
+            raise ValueError(
+                f"range_min={self.range_min} must be above 0, the code for no return, and below range_max"
+            )
         check_range(0, margin=self.margin)
         check_range(0, 180, above=True, bearing_max=self.bearing_max)
         check_range(-360, 360, laser_yaw=self.laser_yaw)
 
-    def __call__(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
+    def __call__(
+        self, ranges: NDArray[np.floating], angles: NDArray[np.floating]
+    ) -> tuple[Array, Integers]:
         """Return the cones in view of scans [N, P] m, whose beams have the bearings [P] radians in the LiDAR's frame.
 
         Returns:
-            Cones [N, 2, K, 2] m times `scale` in the car's frame (x forward, y left), left side first, nearest first,
-            padded with zeros; and their number [N, 2].
+            Cones [N, 2, K, 2] m times `scale` in the car's frame (x forward, y left), left side
+            first, nearest first, padded with zeros; and their number [N, 2].
         """
         ranges = np.asarray(ranges)
         starts = range(0, len(ranges) or 1, SCANS_PER_BATCH)
-        cones, count = zip(*(self._cones(ranges[i : i + SCANS_PER_BATCH], angles) for i in starts), strict=True)
+        cones, count = zip(
+            *(self._cones(ranges[i : i + SCANS_PER_BATCH], angles) for i in starts), strict=True
+        )
         return np.concatenate(cones), np.concatenate(count)
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
@@ -138,7 +171,9 @@ class Perception:
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
         """Return whether the centroid of each cluster is in range and bearing, [C]."""
         x, y = clusters.centroid.T
-        return (np.hypot(x, y) <= self.range_max) & (np.abs(np.arctan2(y, x)) <= math.radians(self.bearing_max))
+        return (np.hypot(x, y) <= self.range_max) & (
+            np.abs(np.arctan2(y, x)) <= math.radians(self.bearing_max)
+        )
 
     def rejected(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> float:
         """Return the share of the clusters in sight that are no cones, 0 without any; arguments as in `points_of`."""
@@ -146,7 +181,9 @@ class Perception:
         kinds = self.classifier.classify(clusters.features[self.in_sight(clusters)])
         return float((kinds < 0).mean()) if len(kinds) else 0.0
 
-    def _cones(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> tuple[Array, Integers]:
+    def _cones(
+        self, ranges: NDArray[np.floating], angles: NDArray[np.floating]
+    ) -> tuple[Array, Integers]:
         clusters = self.clusters(ranges, angles)
         visible = np.flatnonzero(self.in_sight(clusters))
         kind = self.classifier.classify(clusters.features[visible])
@@ -159,20 +196,27 @@ class Perception:
         near = rank < self.kept_cones
         cones = np.zeros((2 * len(ranges), self.kept_cones, 2))
         cones[row[near], rank[near]] = position[near] * self.scale
-        return cones.reshape(-1, 2, self.kept_cones, 2), np.minimum(count, self.kept_cones).reshape(-1, 2)
+        return cones.reshape(-1, 2, self.kept_cones, 2), np.minimum(count, self.kept_cones).reshape(
+            -1, 2
+        )
 
 
 class BoundaryMemory(nn.Module):
     """The observation of a robot without a pose: the boundaries in view, or the last valid ones (paper A.3).
 
-    A side is valid if it has at least two cones and each of the five boundary samples is at a plausible distance.
-    Errors of perception last several scans, as a cone stays in the shadow of another one; an invalid side keeps its
-    last valid numbers. The state is in buffers of B rows, the `batch`. `spline` and `smoothing` are those of the
-    boundary estimate, as in `ConeTrackEnv`; `sight` is the range of view in m in the scale of the cone world.
+    A side is valid if it has at least two cones and each of the five boundary samples is at a
+    plausible distance. Errors of perception last several scans, as a cone stays in the shadow of
+    another one; an invalid side keeps its last valid numbers. The state is in buffers of B rows,
+    the `batch`. `spline` and `smoothing` are those of the boundary estimate, as in `ConeTrackEnv`;
+    `sight` is the range of view in m in the scale of the cone world.
     """
 
     def __init__(
-        self, batch: int, spline: Literal["cubic", "quadratic"] = "cubic", smoothing: float = 0.1, sight: float = SIGHT
+        self,
+        batch: int,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        sight: float = SIGHT,
     ) -> None:
         super().__init__()
         self.fit = spline_fit(spline, smoothing)
@@ -183,7 +227,8 @@ class BoundaryMemory(nn.Module):
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
         """Update the memory with the cones in view and their number, as `Perception` returns them.
 
-        Returns the observation [B, 20], zeros for a side that was never valid, and which sides are valid now [B, 2].
+        Returns the observation [B, 20], zeros for a side that was never valid, and which sides are
+        valid now [B, 2].
         """
         return self.remember(*self.estimate(cones, count))
 
@@ -216,4 +261,6 @@ def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
     env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=torch.float32)
     env.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
     flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-    env.done_spec = Composite(dict.fromkeys(("done", "terminated", "truncated"), flag), shape=batch, device=device)
+    env.done_spec = Composite(
+        dict.fromkeys(("done", "terminated", "truncated"), flag), shape=batch, device=device
+    )

@@ -42,12 +42,20 @@ def test_stopwatch_counts_the_outer_of_two_methods():
 @pytest.mark.slow
 def test_quick_run_measures_everything(tmp_path, capsys):
     parts = [name for name in PARTS if name != "compiled"]
-    arguments = ["track=generated", "track.train.count=1", "--quick", "--output", str(tmp_path / "run")]
+    arguments = [
+        "track=generated",
+        "track.train.count=1",
+        "--quick",
+        "--output",
+        str(tmp_path / "run"),
+    ]
     main(arguments)
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     assert set(results) == {"versions", "settings", "goals", *parts}
     for row in results["shares"]:
-        assert sum(row[key] for key in ("env", "guide", "policy", "update", "framework")) == pytest.approx(1)
+        assert sum(
+            row[key] for key in ("env", "guide", "policy", "update", "framework")
+        ) == pytest.approx(1)
     assert all(172 < row["state per car (B)"] < 2000 for row in results["processes"])
     assert (tmp_path / "run" / "benchmark.md").read_text() in capsys.readouterr().out
     with pytest.raises(SystemExit):
@@ -56,7 +64,13 @@ def test_quick_run_measures_everything(tmp_path, capsys):
 
 
 def test_other_learners_are_measured_without_yardsticks(tmp_path):
-    overrides = ["track=generated", "track.train.count=1", "learner=dqn", "learner.starts=300", "learner.ratio=1"]
+    overrides = [
+        "track=generated",
+        "track.train.count=1",
+        "learner=dqn",
+        "learner.starts=300",
+        "learner.ratio=1",
+    ]
     main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     (row,) = results["training"]
@@ -64,7 +78,9 @@ def test_other_learners_are_measured_without_yardsticks(tmp_path):
     assert "not measured" in results["sb3"][0]
 
 
-@pytest.mark.parametrize("override", ["method=rfc has no effect", "learner.gamma='x' must be a valid number"])
+@pytest.mark.parametrize(
+    "override", ["method=rfc has no effect", "learner.gamma='x' must be a valid number"]
+)
 def test_mistake_is_one_sentence_and_leaves_no_folder(tmp_path, capsys, override):
     with pytest.raises(SystemExit) as end:
         main([override.split()[0].replace("'", ""), "--quick", "--output", str(tmp_path / "run")])

@@ -12,9 +12,21 @@ from coil_rl.guides import SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.transforms import GuideActions
 
-OPTIONS = {"epochs": 2, "minibatches": 4, "learning_rate": 1e-3, "gamma": 0.98, "gae_lambda": 0.9, "clip": 0.2,
-           "hidden": [64, 64], "action_scale": 0.5, "action_gain": 0.01, "entropy": 0.0, "critic": 0.5,
-           "max_grad_norm": 0.5, "seed": 0}  # fmt: skip
+OPTIONS = {
+    "epochs": 2,
+    "minibatches": 4,
+    "learning_rate": 1e-3,
+    "gamma": 0.98,
+    "gae_lambda": 0.9,
+    "clip": 0.2,
+    "hidden": [64, 64],
+    "action_scale": 0.5,
+    "action_gain": 0.01,
+    "entropy": 0.0,
+    "critic": 0.5,
+    "max_grad_norm": 0.5,
+    "seed": 0,
+}
 CARS, STEPS = 12, 60
 
 
@@ -24,7 +36,11 @@ def linears(module):
 
 def layers_of(plain, ours):
     """Pairs of corresponding layers."""
-    return zip(linears(plain.actor) + linears(plain.critic), linears(ours.policy) + linears(ours.critic), strict=True)
+    return zip(
+        linears(plain.actor) + linears(plain.critic),
+        linears(ours.policy) + linears(ours.critic),
+        strict=True,
+    )
 
 
 def log_scale(policy):
@@ -43,7 +59,9 @@ def made(request, ring):
     plain = PlainPPO(env, guide, STEPS, **OPTIONS)
     bare = ConeTrackEnv(shipped_tracks("train"), CARS)
     advised = bare if guide is None else TransformedEnv(bare, GuideActions({"guide": guide}))
-    ours = PPO(advised, ["observation"] if guide is None else ["observation", "guide_action"], **OPTIONS)
+    ours = PPO(
+        advised, ["observation"] if guide is None else ["observation", "guide_action"], **OPTIONS
+    )
     for one, other in layers_of(plain, ours):
         one.load_state_dict(other.state_dict())
     plain.log_scale.data.copy_(log_scale(ours.policy))
@@ -55,11 +73,18 @@ def as_tensordict(batch: Batch) -> TensorDict:
 
     def observed(both):
         parts = {"observation": both[..., :20]}
-        return parts | ({"guide_action": both[..., 20:].unsqueeze(-1)} if both.shape[-1] > 20 else {})
+        return parts | (
+            {"guide_action": both[..., 20:].unsqueeze(-1)} if both.shape[-1] > 20 else {}
+        )
 
     after = {"reward": batch.reward, "terminated": batch.terminated, "done": batch.done}
-    rows = observed(batch.observation) | {"action": batch.raw.tanh(), "action_log_prob": batch.log_prob}
-    rows["next"] = observed(batch.after) | {key: value.unsqueeze(-1) for key, value in after.items()}
+    rows = observed(batch.observation) | {
+        "action": batch.raw.tanh(),
+        "action_log_prob": batch.log_prob,
+    }
+    rows["next"] = observed(batch.after) | {
+        key: value.unsqueeze(-1) for key, value in after.items()
+    }
     return TensorDict(rows, [STEPS, CARS]).transpose(0, 1).contiguous()
 
 

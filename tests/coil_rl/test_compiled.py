@@ -69,7 +69,10 @@ def test_constant_that_shares_memory_with_an_argument_is_refused():
 
 
 def test_code_is_compiled_again_for_another_number_of_threads(monkeypatch):
-    graph, sizes = compiled.record(walk, (torch.ones(4), torch.ones(4))), (torch.ones(4), torch.ones(4))
+    graph, sizes = (
+        compiled.record(walk, (torch.ones(4), torch.ones(4))),
+        (torch.ones(4), torch.ones(4)),
+    )
     one = compiled.fingerprint(graph, sizes)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
     assert compiled.fingerprint(graph, sizes) != one
@@ -78,13 +81,18 @@ def test_code_is_compiled_again_for_another_number_of_threads(monkeypatch):
 def test_place_that_cannot_be_made_is_named(monkeypatch, tmp_path):
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    with pytest.raises(UserError, match=r"file/coil-rl cannot be made for compiled code \(Not a directory\); set XDG_"):
+    with pytest.raises(
+        UserError,
+        match=r"file/coil-rl cannot be made for compiled code \(Not a directory\); set XDG_",
+    ):
         Compiled(lambda x: [x.sin()])(torch.ones(3))
 
 
 def test_missing_compiler_is_named(monkeypatch, tmp_path):
     monkeypatch.setenv("CXX", "missing")
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(UserError, match=r"without a C\+\+ compiler; install one, or take compile=false"):
+    with pytest.raises(
+        UserError, match=r"without a C\+\+ compiler; install one, or take compile=false"
+    ):
         Compiled(lambda x: [x.sin()])(torch.ones(3))
     assert not list((tmp_path / "coil-rl").iterdir())

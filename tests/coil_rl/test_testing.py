@@ -102,26 +102,52 @@ def test_guides_with_a_memory_pass():
     check_guide(Guide(), cones())
     check_guide(PerRow(OneNumber, ["steering"]), cones())
     check_guide(SplineGuide(), cones())
-    lean = TensorDictModule(lambda x: (x[..., 2] > 0).long(), in_keys=["observation"], out_keys=["action"])
+    lean = TensorDictModule(
+        lambda x: (x[..., 2] > 0).long(), in_keys=["observation"], out_keys=["action"]
+    )
     check_guide(lean, worlds.carts().base_env)
-    turn = TensorDictModule(lambda x: -x.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"])
+    turn = TensorDictModule(
+        lambda x: -x.unsqueeze(-1).clamp(-2, 2), in_keys=["thdot"], out_keys=["action"]
+    )
     check_guide(turn, PendulumEnv())
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: with_action(lambda total: total.squeeze(-1)), r"has the shape \[3\], but must have \[3, 1\]"),
-        (lambda: with_action(lambda total: (total * 0).long()), "is of torch.int64, but the env's of torch.float32"),
-        (lambda: with_action(lambda total: total + 1.5), "lies outside the bounds of the env's action"),
-        (lambda: with_action(lambda total: total / total.abs().clamp(max=0)), "holds a number that is not finite"),
+        (
+            lambda: with_action(lambda total: total.squeeze(-1)),
+            r"has the shape \[3\], but must have \[3, 1\]",
+        ),
+        (
+            lambda: with_action(lambda total: (total * 0).long()),
+            "is of torch.int64, but the env's of torch.float32",
+        ),
+        (
+            lambda: with_action(lambda total: total + 1.5),
+            "lies outside the bounds of the env's action",
+        ),
+        (
+            lambda: with_action(lambda total: total / total.abs().clamp(max=0)),
+            "holds a number that is not finite",
+        ),
         (RandomGuide, "another one for the same history"),
         (Hidden, "another one for the same history; it draws, or remembers earlier episodes"),
         (RowsInside, "fails after a single row was reset, so it may remember in itself"),
         (lambda: PerRow(NeverReset, ["steering"]), "another one for the same history"),
         (ForgetsAlone, "after the reset of a row depends on what was before it"),
     ],
-    ids=["shape", "dtype", "bounds", "nan", "random", "hidden memory", "rows inside", "no reset", "whole batch"],
+    ids=[
+        "shape",
+        "dtype",
+        "bounds",
+        "nan",
+        "random",
+        "hidden memory",
+        "rows inside",
+        "no reset",
+        "whole batch",
+    ],
 )
 def test_defect_of_a_guide_is_found(make, message):
     with pytest.raises(ValueError, match=message):
@@ -144,7 +170,9 @@ def test_reset_that_touches_other_rows_is_found():
 
 
 def test_guide_with_a_memory_needs_an_env():
-    with pytest.raises(ValueError, match="depends on earlier steps: give check_guide an env in place of data"):
+    with pytest.raises(
+        ValueError, match="depends on earlier steps: give check_guide an env in place of data"
+    ):
         check_guide(Guide(), cones().reset())
 
 

@@ -8,8 +8,14 @@ from run_folders import make_untrained_run
 
 
 def run(script, *arguments):
-    command = [sys.executable, str(ROOT / "docs" / "figures" / f"{script}.py"), *map(str, arguments)]
-    done = subprocess.run(command, env=environment(ROOT), cwd=ROOT, capture_output=True, text=True, check=False)
+    command = [
+        sys.executable,
+        str(ROOT / "docs" / "figures" / f"{script}.py"),
+        *map(str, arguments),
+    ]
+    done = subprocess.run(
+        command, env=environment(ROOT), cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -23,7 +29,12 @@ def test_the_script_draws_its_figure(script, tmp_path):
 
 @pytest.mark.slow
 def test_lines_draws_the_agents_of_runs_and_the_guide(tmp_path):
-    runs = [make_untrained_run(tmp_path / label, f"method={label}", *LAP) for label in ("ppo", "coil")]
-    rows = [line.split("|")[1].strip() for line in run("lines", *runs, "--output", tmp_path).splitlines()[2:-1]]
+    runs = [
+        make_untrained_run(tmp_path / label, f"method={label}", *LAP) for label in ("ppo", "coil")
+    ]
+    rows = [
+        line.split("|")[1].strip()
+        for line in run("lines", *runs, "--output", tmp_path).splitlines()[2:-1]
+    ]
     assert rows == ["guide", "ppo", "coil"]
     assert (tmp_path / "lines.png").exists()

@@ -30,11 +30,20 @@ OTHER = [command for page, command in COMMANDS if command is not FIRST[page]]
 def table(page, *headings):
     """Return the cells of the rows of the tables of a page whose first columns have some headings."""
     head = r" \| ".join(headings)
-    tables = re.findall(rf"^\| {head} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE)
-    return [[cell.strip() for cell in row.strip("|").split("|")] for rows in tables for row in rows.splitlines()]
+    tables = re.findall(
+        rf"^\| {head} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE
+    )
+    return [
+        [cell.strip() for cell in row.strip("|").split("|")]
+        for rows in tables
+        for row in rows.splitlines()
+    ]
 
 
-INDEX = {re.search(r"`(\w+)`", name)[1]: cells for name, *cells in table(FOLDER / "README.md", "method", "idea")}
+INDEX = {
+    re.search(r"`(\w+)`", name)[1]: cells
+    for name, *cells in table(FOLDER / "README.md", "method", "idea")
+}
 
 
 def composed(command):

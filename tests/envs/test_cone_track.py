@@ -19,9 +19,15 @@ from coil_rl.train.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
 AUTHORS: dict[str, Any] = {
-    "rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2, "sight": 7.03125,
-    "hold_boundary": True, "late_observation": True, "finish_in_sight": True,
-}  # fmt: skip
+    "rate": 60.0,
+    "spline": "quadratic",
+    "cone_bonus": "every_sighting",
+    "held_steps": 2,
+    "sight": 7.03125,
+    "hold_boundary": True,
+    "late_observation": True,
+    "finish_in_sight": True,
+}
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +45,9 @@ def steering(steps: int, cars: int, seed: int) -> Tensor:
     return torch.stack(actions[1:])
 
 
-def advance(env: ConeTrackEnv, state: TensorDictBase, action: Tensor) -> tuple[TensorDictBase, TensorDictBase]:
+def advance(
+    env: ConeTrackEnv, state: TensorDictBase, action: Tensor
+) -> tuple[TensorDictBase, TensorDictBase]:
     """Step and reset finished cars; return the output of the step and the next state."""
     state["action"] = action.to(env.dtype_)
     emitted, state = env.step_and_maybe_reset(state)
@@ -56,10 +64,16 @@ def drive(env: ConeTrackEnv, actions: Tensor) -> list[TensorDictBase]:
 
 
 def buffers(env: ConeTrackEnv) -> dict[str, Tensor]:
-    return {name: value.clone() for name, value in env.state_dict().items() if not name.endswith("_extra_state")}
+    return {
+        name: value.clone()
+        for name, value in env.state_dict().items()
+        if not name.endswith("_extra_state")
+    }
 
 
-@pytest.mark.parametrize("options", [{}, {"assignment": "cyclic"}, {"dtype": torch.float64}, {"info": False}, AUTHORS])
+@pytest.mark.parametrize(
+    "options", [{}, {"assignment": "cyclic"}, {"dtype": torch.float64}, {"info": False}, AUTHORS]
+)
 def test_env_contract_holds(rings: list[Track], options: dict[str, Any]) -> None:
     check_env(ConeTrackEnv(rings, 3, **options))
 
@@ -112,7 +126,8 @@ def test_env_is_batch_invariant(tracks: list[Track]) -> None:
     assert resets > cars / 2
     for car, single in alone.items():
         assert all(
-            torch.equal(value, buffers(env)[name][..., car : car + 1]) for name, value in buffers(single).items()
+            torch.equal(value, buffers(env)[name][..., car : car + 1])
+            for name, value in buffers(single).items()
         )
 
 
@@ -201,7 +216,14 @@ def test_time_limit_truncates(rings: list[Track]) -> None:
 
 
 def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
-    weights = {"finish": 3.0, "second": -0.1, "cone": 0.5, "smooth": -7.0, "alive": 0.25, "crash": -9.0}
+    weights = {
+        "finish": 3.0,
+        "second": -0.1,
+        "cone": 0.5,
+        "smooth": -7.0,
+        "alive": 0.25,
+        "crash": -9.0,
+    }
     env = ConeTrackEnv([ring], 8, rate=8, laps=1, reward=weights)
     guide = SplineGuide()
     state = env.reset()
@@ -210,9 +232,15 @@ def test_reward_is_the_sum_of_its_weighted_terms(ring: Track) -> None:
         emitted, state = advance(env, state, guide(state)["action"] + 0.2 * action)
         terms, alive = emitted["info", "reward"], ~emitted["info", "crashed"]
         lap_time = emitted["info", "lap_time"]
-        assert torch.allclose(emitted["reward"], sum(terms[term] for term in TERMS), rtol=0, atol=1e-6)
-        assert torch.allclose(terms["smooth"], -7 * emitted["info", "smoothness"] * alive, rtol=0, atol=1e-6)
-        assert torch.allclose(terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * alive, rtol=0, atol=1e-5)
+        assert torch.allclose(
+            emitted["reward"], sum(terms[term] for term in TERMS), rtol=0, atol=1e-6
+        )
+        assert torch.allclose(
+            terms["smooth"], -7 * emitted["info", "smoothness"] * alive, rtol=0, atol=1e-6
+        )
+        assert torch.allclose(
+            terms["finish"], (3 - 0.1 * lap_time) * (lap_time > 0) * alive, rtol=0, atol=1e-5
+        )
         assert torch.equal(terms["alive"], 0.25 * alive)
         assert torch.equal(terms["crash"], -9.0 * ~alive)
         finished += int((lap_time > 0).sum())
@@ -237,7 +265,10 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
     ("wrong", "message"),
     [
         ({"spline": "linear"}, "spline='linear' must be one of cubic, quadratic"),
-        ({"cone_bonus": "never"}, "cone_bonus='never' must be one of first_sighting, every_sighting"),
+        (
+            {"cone_bonus": "never"},
+            "cone_bonus='never' must be one of first_sighting, every_sighting",
+        ),
         ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, cyclic"),
         *(
             ({name: value}, f"{name}={value} must be more than 0")
@@ -260,7 +291,10 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
         ({"time_limit": 0.01}, "time_limit=0.01 must be at least one step"),
         ({"max_steering": 91}, "max_steering=91 must be more than 0 and at most 90"),
         ({"reward": {"finish": 1e300}}, "reward.finish=1e[+]300 must be between -1e6 and 1e6"),
-        ({"reward": {"cone": 1.0, "speed": 1.0}}, r"reward has no weight \['speed'\]; it has finish, second, crash"),
+        (
+            {"reward": {"cone": 1.0, "speed": 1.0}},
+            r"reward has no weight \['speed'\]; it has finish, second, crash",
+        ),
         ({"smoothing": -0.1}, "smoothing=-0.1 must be"),
         ({"tracks": []}, "at least one track"),
     ],
@@ -272,7 +306,10 @@ def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict, message
 
 def test_actions_are_clamped(rings: list[Track]) -> None:
     wild = torch.tensor([[[5.0], [-3.0], [0.5], [1.0001]], [[-9.0], [2.0], [0.1], [-1.5]]])
-    outputs = [drive(ConeTrackEnv(rings, 4, assignment="cyclic"), actions) for actions in (wild, wild.clamp(-1, 1))]
+    outputs = [
+        drive(ConeTrackEnv(rings, 4, assignment="cyclic"), actions)
+        for actions in (wild, wild.clamp(-1, 1))
+    ]
     assert all((ours == theirs).all() for ours, theirs in zip(*outputs, strict=True))
 
 
@@ -305,7 +342,9 @@ def test_a_hundred_million_random_steps_are_finite_in_constant_memory() -> None:
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
-    envs = [ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")]
+    envs = [
+        ConeTrackEnv(tracks, 32, assignment="cyclic", device=device) for device in ("cpu", "cuda")
+    ]
     check_env(envs[1])
     actions = steering(30, 32, seed=13)
     for ours, theirs in zip(*(drive(env, actions) for env in envs), strict=True):
@@ -317,7 +356,9 @@ def test_env_agrees_on_a_gpu(tracks: list[Track]) -> None:
 def test_lap_that_begins_anywhere_counts_as_driven_from_the_finish(rings):
     world = {"assignment": "cyclic", "laps": 1, "rate": 12}
     envs = ConeTrackEnv(rings, 3, **world), ConeTrackEnv(rings, 12, starts=12, **world)
-    whole, parts = (evaluate_policy(env, SplineGuide(), measures=driving_measures()).episodes for env in envs)
+    whole, parts = (
+        evaluate_policy(env, SplineGuide(), measures=driving_measures()).episodes for env in envs
+    )
     for car, part in enumerate(parts):
         assert part["completed"]
         assert part["steps"] < whole[car % 3]["steps"]
@@ -335,14 +376,20 @@ def test_staggered_episodes_end_at_different_times(rings):
 @pytest.mark.slow
 def test_compiled_steps_are_the_steps(rings, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    envs = [TransformedEnv(ConeTrackEnv(rings, 6), GuideActions({"spline": SplineGuide()})) for _ in "ab"]
+    envs = [
+        TransformedEnv(ConeTrackEnv(rings, 6), GuideActions({"spline": SplineGuide()}))
+        for _ in "ab"
+    ]
     for module in envs[1].modules():
         getattr(module, "compile_steps", lambda _: None)(Compiled)
     carriers = [env.reset() for env in envs]
     for count in range(60):
         action = torch.linspace(-1, 1, 6).unsqueeze(-1) * (count / 60)
         steps, carriers = zip(
-            *(env.step_and_maybe_reset(c.set("action", action)) for env, c in zip(envs, carriers, strict=True)),
+            *(
+                env.step_and_maybe_reset(c.set("action", action))
+                for env, c in zip(envs, carriers, strict=True)
+            ),
             strict=True,
         )
         torch.testing.assert_close(steps[1]["next"], steps[0]["next"], rtol=1e-3, atol=1e-4)

@@ -41,8 +41,9 @@ PRESETS = {
 CLOSE = 1e-6
 # The env interpolates the distance to a boundary on a grid of 10 cm.
 FIELD = 3e-3
-# The oracle merges coincident midpoints to one point of weight two; the env keeps two points that its floor on chord
-# lengths, about 6 um, separates. The tridiagonal solve loses precision there, the parabola moves by some of the floor.
+# The oracle merges coincident midpoints to one point of weight two; the env keeps two points that
+# its floor on chord lengths, about 6 um, separates. The tridiagonal solve loses precision there,
+# the parabola moves by some of the floor.
 COINCIDENT = {"cubic": 1e-3, "quadratic": 5e-5}
 
 
@@ -70,12 +71,20 @@ def drive(
             if driver == "random":
                 state["action"] = torch.tensor(noise).unsqueeze(-1).to(dtype)
             elif driver == "disturbed":
-                state["action"] = (advice + 0.5 * torch.tensor(noise).unsqueeze(-1)).clamp(-1, 1).to(dtype)
+                state["action"] = (
+                    (advice + 0.5 * torch.tensor(noise).unsqueeze(-1)).clamp(-1, 1).to(dtype)
+                )
             after = env.step(state)["next"]
             over |= after["done"]
             row = {"advice": advice, "action": state["action"]}
-            row |= {key: after[key] for key in ("observation", "steering", "reward", "terminated", "truncated")}
-            row |= {key: after["info", key] for key in ("lap", "lap_time", "crashed", "clearance", "smoothness")}
+            row |= {
+                key: after[key]
+                for key in ("observation", "steering", "reward", "terminated", "truncated")
+            }
+            row |= {
+                key: after["info", key]
+                for key in ("lap", "lap_time", "crashed", "clearance", "smoothness")
+            }
             row |= {key: after["info", "reward", key] for key in TERMS}
             rows.append({key: value.numpy().copy() for key, value in row.items()})
             state = env.step_mdp(state)
@@ -99,30 +108,46 @@ def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> O
     """Compare one car's episode, trace [steps, ...], with the oracle's; return the oracle's last outcome."""
     advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
     expected = {
-        key: np.array([getattr(outcome, key) for outcome in outcomes]) for key in Outcome._fields if key != "terms"
+        key: np.array([getattr(outcome, key) for outcome in outcomes])
+        for key in Outcome._fields
+        if key != "terms"
     }
     expected |= {term: np.array([outcome.terms[term] for outcome in outcomes]) for term in TERMS}
     expected["reward"] = np.array([outcome.reward for outcome in outcomes])
 
-    # Within the error of the distance field, a car may crash in one of the two only; later steps are not compared.
+    # Within the error of the distance field, a car may crash in one of the two only; later steps
+    # are not compared.
     together = len(outcomes)
     for k in np.flatnonzero(trace["crashed"][:together, 0] != expected["crashed"])[:1]:
         assert abs(expected["clearance"][k]) < FIELD, (
             f"step {k}: one crashes, {expected['clearance'][k]} m from a crash"
         )
         together = k
-    ours = {key: value[:together, 0] if key != "observation" else value[:together] for key, value in trace.items()}
+    ours = {
+        key: value[:together, 0] if key != "observation" else value[:together]
+        for key, value in trace.items()
+    }
     expected = {key: value[:together] for key, value in expected.items()}
 
-    tolerance = np.where(np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE)[:together]
+    tolerance = np.where(
+        np.array(gaps) < 1e-3, COINCIDENT[preset.guide.get("spline", "cubic")], CLOSE
+    )[:together]
     difference = np.abs(ours["advice"] - np.array(advice)[:together])
-    assert (difference <= tolerance).all(), f"advice differs by {difference.max()} at step {difference.argmax()}"
+    assert (difference <= tolerance).all(), (
+        f"advice differs by {difference.max()} at step {difference.argmax()}"
+    )
     for key in ("observation", "reward", "lap_time", "smoothness", *TERMS):
-        np.testing.assert_allclose(ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}")
+        np.testing.assert_allclose(
+            ours[key], expected[key], rtol=0, atol=CLOSE, err_msg=f"{key}, track {track.name}"
+        )
     for key in ("lap", "crashed", "terminated", "truncated"):
-        np.testing.assert_array_equal(ours[key], expected[key], err_msg=f"{key}, track {track.name}")
+        np.testing.assert_array_equal(
+            ours[key], expected[key], err_msg=f"{key}, track {track.name}"
+        )
     near = expected["clearance"] < 1
-    np.testing.assert_allclose(ours["clearance"][near], expected["clearance"][near], rtol=0, atol=FIELD)
+    np.testing.assert_allclose(
+        ours["clearance"][near], expected["clearance"][near], rtol=0, atol=FIELD
+    )
     held = np.where(np.arange(together) < preset.env.get("held_steps", 0), 0, ours["action"])
     np.testing.assert_array_equal(ours["steering"], held)
     return outcomes[-1]
@@ -152,7 +177,10 @@ def test_env_agrees_with_the_oracle_under_other_steering(preset: str, driver: st
 def test_guide_agrees_with_the_oracle_for_coincident_midpoints(levels: list[Track]) -> None:
     # The authors' cones are on a grid, so different pairs have the same midpoint.
     trace = drive(levels[:1], PRESETS["paper"], "guide", 60)
-    assert min(gap for _, gap, _ in retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0])) < 1e-9
+    assert (
+        min(gap for _, gap, _ in retrace(levels[0], PRESETS["paper"], trace["action"][:, 0, 0]))
+        < 1e-9
+    )
     assert_agreement(levels[0], PRESETS["paper"], column(trace, 0))
 
 
@@ -170,9 +198,14 @@ def test_float32_reward_agrees_with_the_oracle(ring: Track) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("driver", ["guide", "disturbed", "random"])
-def test_env_agrees_with_the_oracle_on_every_track(preset: str, driver: str, levels: list[Track]) -> None:
+def test_env_agrees_with_the_oracle_on_every_track(
+    preset: str, driver: str, levels: list[Track]
+) -> None:
     tracks = [*shipped_tracks("all"), *random_tracks(4, seed=11), *levels]
     trace = drive(tracks, PRESETS[preset], driver, 12_000, seed=2)
-    ends = [assert_agreement(track, PRESETS[preset], column(trace, car)) for car, track in enumerate(tracks)]
+    ends = [
+        assert_agreement(track, PRESETS[preset], column(trace, car))
+        for car, track in enumerate(tracks)
+    ]
     if driver == "guide":
         assert all(end.lap == 2 and not end.crashed for end in ends)

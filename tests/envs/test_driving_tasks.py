@@ -20,7 +20,9 @@ TASKS = {
 EQUAL: dict[str, dict[str, float]] = {"a": {}, "b": {}, "c": {}}
 
 
-def drive(env: ConeTrackEnv, steps: int, state: TensorDictBase | None = None, seed: int = 1) -> list[TensorDictBase]:
+def drive(
+    env: ConeTrackEnv, steps: int, state: TensorDictBase | None = None, seed: int = 1
+) -> list[TensorDictBase]:
     """Return the output of each step under smooth random steering, with resets."""
     draw = torch.Generator().manual_seed(seed)
     state = env.reset() if state is None else state
@@ -58,7 +60,9 @@ def test_env_contract_holds(rings: list[Track], kwargs: dict[str, Any]) -> None:
         ("smooth", "left", 0),
     ],
 )
-def test_lateral_position_is_rewarded_by_the_task(ring: Track, task: str, term: str, reward: float) -> None:
+def test_lateral_position_is_rewarded_by_the_task(
+    ring: Track, task: str, term: str, reward: float
+) -> None:
     after = one_step(ring, -0.5, 0.2, only=task)
     # The boundaries are splines through cones, nearly circles.
     assert after["info", "reward", term].item() == pytest.approx(reward, abs=0.01)
@@ -68,10 +72,15 @@ def test_lateral_position_is_rewarded_by_the_task(ring: Track, task: str, term: 
 
 def test_tasks_override_only_the_weights_they_set(ring: Track) -> None:
     common = {"alive": 0.5, "left": 0.1, "cone": 0.0}
-    rewards = {task: one_step(ring, 0.4, 0.2, only=task, reward=common)["info", "reward"] for task in TASKS}
+    rewards = {
+        task: one_step(ring, 0.4, 0.2, only=task, reward=common)["info", "reward"] for task in TASKS
+    }
     assert {task: reward["alive"].item() for task, reward in rewards.items()} == {
-        "centred": 0.5, "corners": 0.5, "left": 0.25, "smooth": 0.5,
-    }  # fmt: skip
+        "centred": 0.5,
+        "corners": 0.5,
+        "left": 0.25,
+        "smooth": 0.5,
+    }
     assert rewards["left"]["left"].item() == pytest.approx(5 * rewards["smooth"]["left"].item())
     assert rewards["smooth"]["smooth"].item() == pytest.approx(-5 * 0.2)
     assert rewards["left"]["smooth"].item() == pytest.approx(-0.1 * 0.2)
@@ -81,12 +90,17 @@ def test_crash_replaces_all_other_reward_terms(ring: Track) -> None:
     after = one_step(ring, 0.95, 0.2, only="left")
     assert after["terminated"].all()
     assert after["reward"].item() == -100
-    assert all(value.item() == 0 for term, value in after["info", "reward"].items() if term != "crash")
+    assert all(
+        value.item() == 0 for term, value in after["info", "reward"].items() if term != "crash"
+    )
 
 
 def test_tasks_without_weights_equal_the_cone_world(rings: list[Track]) -> None:
     shared: dict[str, Any] = {"num_envs": 6, "assignment": "cyclic", "laps": 1, "rate": 8}
-    envs = [ConeTrackEnv(rings, **shared), DrivingTasksEnv(rings, **shared, tasks=EQUAL, duration=1.0)]
+    envs = [
+        ConeTrackEnv(rings, **shared),
+        DrivingTasksEnv(rings, **shared, tasks=EQUAL, duration=1.0),
+    ]
     states = [env.reset() for env in envs]
     guide, finished, crashed = SplineGuide(), 0, 0
     for _ in range(155):
@@ -137,7 +151,9 @@ def sequence(env: DrivingTasksEnv) -> Tensor:
 
 
 def test_seed_determines_the_tasks(rings: list[Track]) -> None:
-    first, again, other = (sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=k)) for k in (7, 7, 8))
+    first, again, other = (
+        sequence(DrivingTasksEnv(rings, 8, tasks=TASKS, duration=0.3, seed=k)) for k in (7, 7, 8)
+    )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
 
@@ -161,14 +177,20 @@ def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
     assert any(step["next", "done"].any() for step in trace)
     restored = DrivingTasksEnv(rings, 16, tasks=TASKS, duration=0.5, seed=99)
     restored.load_state_dict(saved)
-    assert all((ours == step).all() for ours, step in zip(drive(restored, 80, state.clone()), trace, strict=True))
+    assert all(
+        (ours == step).all()
+        for ours, step in zip(drive(restored, 80, state.clone()), trace, strict=True)
+    )
 
 
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
         ({"tasks": {}}, "tasks is empty; give at least one"),
-        ({"tasks": {"fast": {"speed": 1.0}}}, r"tasks.fast has no weight \['speed'\]; it has finish, .*, inside"),
+        (
+            {"tasks": {"fast": {"speed": 1.0}}},
+            r"tasks.fast has no weight \['speed'\]; it has finish, .*, inside",
+        ),
         ({"tasks": {"fast": {"second": math.nan}}}, "tasks.fast.second=nan must be between"),
         ({"reward": {"speed": 1.0}}, r"reward has no weight \['speed'\]"),
         ({"only": "right"}, "only='right' must be one of centred, corners, left, smooth"),
@@ -177,14 +199,19 @@ def test_restored_env_continues_bit_for_bit(rings: list[Track]) -> None:
         ({"rate": 0}, "rate=0 must be more than 0"),
     ],
 )
-def test_invalid_arguments_are_rejected(rings: list[Track], wrong: dict[str, Any], message: str) -> None:
+def test_invalid_arguments_are_rejected(
+    rings: list[Track], wrong: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         DrivingTasksEnv(rings, 2, **({"tasks": TASKS} | wrong))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_tasks_agree_on_a_gpu(rings: list[Track]) -> None:
-    envs = [DrivingTasksEnv(rings, 32, tasks=TASKS, duration=0.2, device=device) for device in ("cpu", "cuda")]
+    envs = [
+        DrivingTasksEnv(rings, 32, tasks=TASKS, duration=0.2, device=device)
+        for device in ("cpu", "cuda")
+    ]
     check_env(envs[1])
     for env in envs:
         env.set_seed(5)

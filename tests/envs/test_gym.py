@@ -21,13 +21,17 @@ def test_gymnasium_check_env_passes():
 
 
 def test_stable_baselines3_checks_and_trains_the_env():
-    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed")
+    checker = pytest.importorskip(
+        "stable_baselines3.common.env_checker", reason="stable-baselines3 is not installed"
+    )
     env = gymnasium.make(gym.ID, advice=SplineGuide())
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         checker.check_env(env.unwrapped)
     sb3 = importlib.import_module("stable_baselines3")
-    model = sb3.PPO("MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu").learn(64)
+    model = sb3.PPO(
+        "MlpPolicy", env, n_steps=64, batch_size=32, n_epochs=1, seed=0, device="cpu"
+    ).learn(64)
     assert model.num_timesteps == 64
 
 
@@ -36,8 +40,12 @@ def episode(env, seed, steps=40):
     rng = np.random.default_rng(0)
     rows = [observation]
     for _ in range(steps):
-        observation, reward, *_ = env.step(rng.uniform(-1, 1, env.action_space.shape).astype(np.float32))
-        rows.append(np.concatenate([observation, np.reshape(reward, (*observation.shape[:-1], 1))], -1))
+        observation, reward, *_ = env.step(
+            rng.uniform(-1, 1, env.action_space.shape).astype(np.float32)
+        )
+        rows.append(
+            np.concatenate([observation, np.reshape(reward, (*observation.shape[:-1], 1))], -1)
+        )
     return info["track"], rows
 
 
@@ -73,7 +81,11 @@ def test_vector_env_agrees_with_the_batched_env():
         np.testing.assert_array_equal(observation[:, :20], state["observation"])
         np.testing.assert_array_equal(observation[:, 20:], guide(state.copy())["action"])
         after = step["next"]
-        for array, key in [(reward, "reward"), (terminated, "terminated"), (truncated, "truncated")]:
+        for array, key in [
+            (reward, "reward"),
+            (terminated, "terminated"),
+            (truncated, "truncated"),
+        ]:
             np.testing.assert_array_equal(array, after[key].squeeze(-1))
         np.testing.assert_array_equal(info["track"], state["info", "track"].squeeze(-1))
     assert envs.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
@@ -113,7 +125,12 @@ def test_time_limit_truncates_and_crash_terminates(ring: Track):
     env.reset(seed=0)
     while not (step := env.step(straight))[2]:
         pass
-    assert (step[1], step[3], step[4]["crashed"], step[4]["reward"]["crash"]) == (-100, False, True, -100)
+    assert (step[1], step[3], step[4]["crashed"], step[4]["reward"]["crash"]) == (
+        -100,
+        False,
+        True,
+        -100,
+    )
 
 
 def test_returned_arrays_are_copies_and_info_is_optional():

@@ -28,7 +28,9 @@ class Echo(gymnasium.Env):
                 "real": spaces.Box(-np.inf, np.inf, (3,), np.float64),
                 "image": spaces.Box(0, 255, (4, 5, 3), np.uint8),
                 "place": spaces.Discrete(LIMIT + 1, start=10),
-                "inner": spaces.Dict({"pair": spaces.MultiDiscrete([2, 3]), "bits": spaces.MultiBinary(3)}),
+                "inner": spaces.Dict(
+                    {"pair": spaces.MultiDiscrete([2, 3]), "bits": spaces.MultiBinary(3)}
+                ),
                 "both": spaces.Tuple([spaces.Discrete(2), spaces.Box(0, 1, (), np.float32)]),
                 "mission": spaces.Text(8),
             }
@@ -55,7 +57,13 @@ class Echo(gymnasium.Env):
         assert self.time < LIMIT, "stepped after its end"
         assert self.action_space.contains(np.asarray(action)), action
         self.time, self.last = self.time + 1, action
-        return self.observe(), 1.0, self.time == LIMIT, False, {"success": self.time > 3, "words": "x"}
+        return (
+            self.observe(),
+            1.0,
+            self.time == LIMIT,
+            False,
+            {"success": self.time > 3, "words": "x"},
+        )
 
     def render(self):
         return np.full((2, 2, 3), self.time, np.uint8)
@@ -148,7 +156,9 @@ def test_env_that_keeps_something_at_a_reset_is_noticed():
     env = build("Echo-v0", options={"leak": 0.5})
     drive(env, 2 * LIMIT + 2)
     other = build("Echo-v0", options={"leak": 0.5})
-    with pytest.warns(UserWarning, match=r"cannot go on with its running episodes to the bit.*fresh=true") as caught:
+    with pytest.warns(
+        UserWarning, match=r"cannot go on with its running episodes to the bit.*fresh=true"
+    ) as caught:
         other.load_state_dict(reloaded(env.state_dict()))
     assert len(caught) == 1
     assert not other.continues
@@ -227,12 +237,18 @@ def test_spaces_become_entries():
 def test_actions_of_a_space_reach_the_env(space, spec, shape):
     # `Echo` verifies that what arrives is in its space.
     env = GymnasiumEnv("Echo-v0", 2, options={"action_space": space})
-    assert env.action_spec.dtype == spec if isinstance(spec, torch.dtype) else isinstance(env.action_spec, spec)
+    assert (
+        env.action_spec.dtype == spec
+        if isinstance(spec, torch.dtype)
+        else isinstance(env.action_spec, spec)
+    )
     assert env.action_spec.shape == (2, *shape)
     carrier = env.reset()
     action = env.rand_action()["action"]
     given = action.double().reshape(2, -1).sum(-1) + float(np.sum(getattr(space, "start", 0)))
-    torch.testing.assert_close(env.step(carrier.set("action", action))["next", "real"][:, 2].double(), given)
+    torch.testing.assert_close(
+        env.step(carrier.set("action", action))["next", "real"][:, 2].double(), given
+    )
 
 
 def test_finished_row_stays_as_it_is():
@@ -256,7 +272,8 @@ def test_time_limit_truncates():
 
 def test_wrappers_are_applied_in_order():
     double, shift = (
-        partial(gymnasium.wrappers.TransformReward, func=func) for func in (lambda r: 2 * r, lambda r: r + 3)
+        partial(gymnasium.wrappers.TransformReward, func=func)
+        for func in (lambda r: 2 * r, lambda r: r + 3)
     )
     after = drive(build("Echo-v0", wrappers=[double, shift]), 1)[0][0]
     assert after["reward"].tolist() == [[5.0]] * 3
@@ -268,7 +285,9 @@ def test_controllers_act_beside_their_envs():
     carrier = env.reset()
     for steps in range(LIMIT - 1):
         assert carrier["controller", "count"].tolist() == [[steps + 1.0] * 2] * 3
-        assert carrier["controller", "fast"].tolist() == [[steps * 10 + 10.0] * 2] * 3  # out of bounds, as given
+        assert (
+            carrier["controller", "fast"].tolist() == [[steps * 10 + 10.0] * 2] * 3
+        )  # out of bounds, as given
         assert torch.equal(carrier["controller", "real"], carrier["real"][:, :2])
         step, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
         assert torch.equal(step["next", "controller", "count"], carrier["controller", "count"])
@@ -289,7 +308,9 @@ def test_heuristic_of_gymnasium_lands():
 
 
 def test_discrete_controller_gives_indices():
-    env = GymnasiumEnv("Echo-v0", 2, options={"action_space": spaces.Discrete(12)}, controllers={"a": act})
+    env = GymnasiumEnv(
+        "Echo-v0", 2, options={"action_space": spaces.Discrete(12)}, controllers={"a": act}
+    )
     assert env.reset()["controller", "a"].tolist() == [11, 11]
     assert drive(env, 4)[0][-1]["controller", "a"].tolist() == [1, 1]
 
@@ -332,10 +353,26 @@ def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):
         ("CartPole-v1", {"num_envs": 0}, "num_envs=0 must be at least 1"),
         ("CartPole-v1", {"max_steps": 0}, "max_steps=0 must be at least 1"),
         ("CartPole-v1", {"cases": 3}, "cases=3 needs first_seed"),
-        ("CartPole-v1", {"controllers": {"pid": "math:PID"}}, "controller pid: 'math:PID' cannot be imported"),
-        ("CartPole-v1", {"controllers": {"pid": "builtins:str"}}, r"controller pid: str needs a method act\(obs"),
-        ("CartPole-v1", {"controllers": {"pid": "fractions:Fraction"}}, "controller pid cannot be made with its env"),
-        ("Echo-v0", {"options": {"action_space": spaces.Text(3)}}, "the action of Echo-v0 is a Text space"),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "math:PID"}},
+            "controller pid: 'math:PID' cannot be imported",
+        ),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "builtins:str"}},
+            r"controller pid: str needs a method act\(obs",
+        ),
+        (
+            "CartPole-v1",
+            {"controllers": {"pid": "fractions:Fraction"}},
+            "controller pid cannot be made with its env",
+        ),
+        (
+            "Echo-v0",
+            {"options": {"action_space": spaces.Text(3)}},
+            "the action of Echo-v0 is a Text space",
+        ),
     ],
 )
 def test_mistake_is_one_sentence(id, arguments, message):
@@ -348,7 +385,9 @@ def test_mistake_is_one_sentence(id, arguments, message):
 def test_reserved_entry_is_refused(key):
     def rename(env):
         space = spaces.Dict({key: env.observation_space})
-        return gymnasium.wrappers.TransformObservation(env, lambda observation: {key: observation}, space)
+        return gymnasium.wrappers.TransformObservation(
+            env, lambda observation: {key: observation}, space
+        )
 
     with pytest.raises(ValueError, match=f"has an entry '{key}'"):
         GymnasiumEnv("CartPole-v1", wrappers=[rename])

@@ -10,7 +10,13 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from coil_rl.envs import ConeTrackEnv, random_track
-from coil_rl.envs.level_files import load_track, load_tracks, save_track, shipped_track, shipped_tracks
+from coil_rl.envs.level_files import (
+    load_track,
+    load_tracks,
+    save_track,
+    shipped_track,
+    shipped_tracks,
+)
 from coil_rl.envs.track import Track, TrackError
 
 TURN = np.linspace(0, 2 * np.pi, 32, endpoint=False)
@@ -20,7 +26,9 @@ HEADER = ",Cone_Type,Cone_X,Cone_Y"
 
 def write_level(path, left=9 * CIRCLE, right=11 * CIRCLE):
     sides = [("LEFT", x, -y) for x, y in left] + [("RIGHT", x, -y) for x, y in right]
-    path.write_text("\n".join([HEADER, *(f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides))]))
+    path.write_text(
+        "\n".join([HEADER, *(f"{i},{kind},{x},{y}" for i, (kind, x, y) in enumerate(sides))])
+    )
     return path
 
 
@@ -67,9 +75,18 @@ def test_start_is_three_numbers_with_the_heading_in_degrees(tmp_path):
     [
         (b"", "is empty"),
         (b"\xff\xfe\x00\x81", "is not a text file"),
-        (b",Cone_Type,X,Y\n", "has no column Cone_X; the columns of its first line are ['', 'Cone_Type', 'X', 'Y']."),
-        (f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2".encode(), "line 4: Cone_Type is 'BLUE'; it must be LEFT or RIGHT."),
-        (f"{HEADER}\n0,LEFT,1,two".encode(), "line 2: Cone_X, Cone_Y are ['1', 'two']; they must be finite numbers"),
+        (
+            b",Cone_Type,X,Y\n",
+            "has no column Cone_X; the columns of its first line are ['', 'Cone_Type', 'X', 'Y'].",
+        ),
+        (
+            f"{HEADER}\n0,LEFT,1,2\n\n1,BLUE,1,2".encode(),
+            "line 4: Cone_Type is 'BLUE'; it must be LEFT or RIGHT.",
+        ),
+        (
+            f"{HEADER}\n0,LEFT,1,two".encode(),
+            "line 2: Cone_X, Cone_Y are ['1', 'two']; they must be finite numbers",
+        ),
         (f"{HEADER}\n0,LEFT,1,-inf".encode(), "['1', '-inf']"),
         (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
         (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
@@ -93,14 +110,24 @@ def ring(count, radius):
     ("left", "right", "words"),
     [
         (9 * CIRCLE + [3, 0], 11 * CIRCLE, "The two sides cross"),
-        (ring(1001, 9), ring(32, 11), "left side of track 'level' has 1001 cones, of shape [1001, 2]; give 4 to 1000"),
-        (ring(32, 9000), ring(32, 9002), "left side of track 'level' is too large; the limits are 500 m across"),
+        (
+            ring(1001, 9),
+            ring(32, 11),
+            "left side of track 'level' has 1001 cones, of shape [1001, 2]; give 4 to 1000",
+        ),
+        (
+            ring(32, 9000),
+            ring(32, 9002),
+            "left side of track 'level' is too large; the limits are 500 m across",
+        ),
         ([(200.0 * (k % 2), k / 9) for k in range(900)], ring(32, 11), "is too large"),
         ([(x * 1e-5, 0.0) for x in range(999)] + [(300.0, 9.0)], ring(32, 11), ""),
         ([(7.0 * (k * k % 97), 5.0 * (k * 31 % 89)) for k in range(19)], ring(32, 11), ""),
     ],
 )
-def test_invalid_cones_are_rejected_by_file_name_without_filling_the_memory(tmp_path, left, right, words):
+def test_invalid_cones_are_rejected_by_file_name_without_filling_the_memory(
+    tmp_path, left, right, words
+):
     path = write_level(tmp_path / "level.csv", left, right)
     assert f"{path}: " in (message := error_of(load_track, path))
     assert words in message
@@ -115,7 +142,9 @@ def test_paths_without_a_level_are_rejected_by_name(tmp_path, monkeypatch, path)
     os.symlink("loop", "loop")
     for load in (load_track, load_tracks):
         assert path in error_of(load, path)
-    assert "none.csv cannot be read (No such file or directory)" in error_of(load_tracks, "none.csv")
+    assert "none.csv cannot be read (No such file or directory)" in error_of(
+        load_tracks, "none.csv"
+    )
     (tmp_path / "notes.txt").write_text("no level")
     assert "holds no level files" in error_of(load_tracks, tmp_path)
     (tmp_path / "bad.csv").mkdir()
@@ -153,8 +182,27 @@ def test_the_authors_level_files_are_read(levels):
 
 # Mutated files
 
-SHARED = {"suppress_health_check": [HealthCheck.function_scoped_fixture], "phases": [Phase.explicit, Phase.generate]}
-CELLS = ["", "nan", "inf", "-inf", "1e309", "1e300", "-0", "9999", "0,5", "1e-300", "LEFT", "RIGHT", "left ", "B", "\0"]
+SHARED = {
+    "suppress_health_check": [HealthCheck.function_scoped_fixture],
+    "phases": [Phase.explicit, Phase.generate],
+}
+CELLS = [
+    "",
+    "nan",
+    "inf",
+    "-inf",
+    "1e309",
+    "1e300",
+    "-0",
+    "9999",
+    "0,5",
+    "1e-300",
+    "LEFT",
+    "RIGHT",
+    "left ",
+    "B",
+    "\0",
+]
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +234,9 @@ def mutations(draw, lines):
             lines[1:] = lines[:0:-1]
     data = "\n".join(lines).encode(draw(st.sampled_from(["utf-8"] * 4 + ["utf-16"])), "replace")
     at = draw(st.integers(0, len(data)))
-    return data[:at] + draw(st.sampled_from([b"", b"", b"", b"\xff", b"\0", b'"', b"\r"])) + data[at:]
+    return (
+        data[:at] + draw(st.sampled_from([b"", b"", b"", b"\xff", b"\0", b'"', b"\r"])) + data[at:]
+    )
 
 
 def assert_read_or_rejected(data, lines, path, drive):
@@ -202,7 +252,9 @@ def assert_read_or_rejected(data, lines, path, drive):
     assert 0 < track.length < 10_000
     if drive:
         steps = ConeTrackEnv([track], num_envs=4).rollout(5, break_when_any_done=False)
-        assert all(torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones"))
+        assert all(
+            torch.isfinite(steps["next", key]).all() for key in ("observation", "reward", "cones")
+        )
 
 
 @settings(max_examples=100, **SHARED)

@@ -40,7 +40,9 @@ def separated(seed: int, n: int) -> np.ndarray:
     return step.cumsum(1)
 
 
-def padded(rows: list[np.ndarray], slots: int = SLOTS, garbage: float = 7.0) -> tuple[Tensor, Tensor]:
+def padded(
+    rows: list[np.ndarray], slots: int = SLOTS, garbage: float = 7.0
+) -> tuple[Tensor, Tensor]:
     points = torch.full((rows[0].shape[0], slots, len(rows)), garbage, dtype=torch.float64)
     for i, row in enumerate(rows):
         points[:, : row.shape[1], i] = torch.from_numpy(row)
@@ -69,7 +71,9 @@ def test_smoothing_spline_agrees_with_scipy(seed: int, n: int, smoothing: float)
 
 @pytest.mark.parametrize("n", [2, 3, 4])
 @pytest.mark.parametrize("smoothing", [0.01, 1.0])
-def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(n: int, smoothing: float) -> None:
+def test_smoothing_spline_of_few_points_minimises_the_penalised_squares(
+    n: int, smoothing: float
+) -> None:
     row = separated(n, n)
     h = np.diff(chord(row))
     second = np.zeros((n - 2, n))
@@ -92,7 +96,11 @@ def test_parabola_agrees_with_numpy(seed: int, n: int) -> None:
     u = chord(row)
     where = np.linspace(0, u[-1], 41)
     parabola = np.stack([np.polyval(np.polyfit(u, axis, min(2, n - 1)), where) for axis in row])
-    sampled = least_squares_parabola(*padded([row])).along(torch.from_numpy(where / u[-1])[:, None])[..., 0].numpy()
+    sampled = (
+        least_squares_parabola(*padded([row]))
+        .along(torch.from_numpy(where / u[-1])[:, None])[..., 0]
+        .numpy()
+    )
     assert sampled == pytest.approx(parabola, abs=1e-9)
 
 
@@ -105,8 +113,11 @@ def test_float32_is_close_to_float64(fit) -> None:
 
 @pytest.mark.parametrize("gap", [0.0, 1e-4, 1e-2])
 @pytest.mark.parametrize("smoothing", [0.1, 10.0])
-def test_nearly_coincident_points_count_as_one_of_double_weight(gap: float, smoothing: float) -> None:
-    # Midpoints of neighbouring cone pairs are this close; the normal equations lose most digits here.
+def test_nearly_coincident_points_count_as_one_of_double_weight(
+    gap: float, smoothing: float
+) -> None:
+    # Midpoints of neighbouring cone pairs are this close; the normal equations lose most digits
+    # here.
     row = separated(1, 8)
     row = np.insert(row, 4, row[:, 3] + [gap, 0], axis=1)
     points, count = padded([row])
@@ -153,7 +164,9 @@ def test_padding_does_not_change_results(fit, dtype: torch.dtype) -> None:
 
 @steady
 @given(seeds, st.integers(2, SLOTS), st.floats(-3, 3), st.floats(-100, 100))
-def test_splines_are_equivariant_to_rigid_motions_and_reversal(seed: int, n: int, angle: float, shift: float) -> None:
+def test_splines_are_equivariant_to_rigid_motions_and_reversal(
+    seed: int, n: int, angle: float, shift: float
+) -> None:
     row = separated(seed, n)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     for fit in FITS.values():
@@ -165,14 +178,20 @@ def test_splines_are_equivariant_to_rigid_motions_and_reversal(seed: int, n: int
 
 @every_fit
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_results_do_not_depend_on_the_other_rows_or_the_batch_shape(fit, dtype: torch.dtype) -> None:
+def test_results_do_not_depend_on_the_other_rows_or_the_batch_shape(
+    fit, dtype: torch.dtype
+) -> None:
     points, count = random_batch(dtype, batch=24)
     whole = tensors(fit(points, count))
     for rows in (slice(0, 1), slice(5, 6), slice(3, 20)):
-        for a, b in zip(whole, tensors(fit(points[..., rows].contiguous(), count[rows])), strict=True):
+        for a, b in zip(
+            whole, tensors(fit(points[..., rows].contiguous(), count[rows])), strict=True
+        ):
             assert torch.equal(a[..., rows], b)
     for shape in ((2, 12), (2, 3, 4)):
-        for a, b in zip(whole, tensors(fit(points.view(2, SLOTS, *shape), count.view(shape))), strict=True):
+        for a, b in zip(
+            whole, tensors(fit(points.view(2, SLOTS, *shape), count.view(shape))), strict=True
+        ):
             assert torch.equal(a, b.flatten(-len(shape)))
     assert fit(points[..., :0], count[:0]).equidistant(5).shape == (2, 5, 0)
 
@@ -198,8 +217,14 @@ degenerate = st.one_of(
 
 
 @steady
-@given(degenerate, st.sampled_from([0.0, 1e-4, 0.1, 10.0, 1e3]), st.sampled_from([torch.float32, torch.float64]))
-def test_results_and_gradients_are_finite_for_any_points(row: np.ndarray, smoothing: float, dtype) -> None:
+@given(
+    degenerate,
+    st.sampled_from([0.0, 1e-4, 0.1, 10.0, 1e3]),
+    st.sampled_from([torch.float32, torch.float64]),
+)
+def test_results_and_gradients_are_finite_for_any_points(
+    row: np.ndarray, smoothing: float, dtype
+) -> None:
     points = torch.from_numpy(row).to(dtype)[..., None].repeat(1, 1, SLOTS + 1)
     count = torch.arange(SLOTS + 1)
     for fit in (lambda *a: smoothing_spline(*a, smoothing), least_squares_parabola):

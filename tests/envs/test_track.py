@@ -56,7 +56,9 @@ def test_boundary_of_a_circle_is_that_circle():
     gaps = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
     assert gaps.max() < 0.101
     assert gaps.min() > 0.09
-    to_cones = np.linalg.norm(track.boundary("right", 0.01)[:, None] - track.right, axis=2).min(axis=0)
+    to_cones = np.linalg.norm(track.boundary("right", 0.01)[:, None] - track.right, axis=2).min(
+        axis=0
+    )
     assert to_cones.max() < 0.01
 
 
@@ -65,7 +67,9 @@ def test_middle_line_is_half_way_and_resampled_evenly():
     np.testing.assert_allclose(np.linalg.norm(middle, axis=1), 10, atol=1e-3)
     even = resample(middle, 0.5)
     assert len(even) == round(20 * np.pi / 0.5)
-    np.testing.assert_allclose(np.linalg.norm(np.roll(even, -1, axis=0) - even, axis=1), 0.5, rtol=0.01)
+    np.testing.assert_allclose(
+        np.linalg.norm(np.roll(even, -1, axis=0) - even, axis=1), 0.5, rtol=0.01
+    )
     np.testing.assert_allclose(even[0], middle[0])
 
 
@@ -87,17 +91,32 @@ def test_length_is_that_of_the_centre_line_in_either_direction(sides):
     ("changes", "words"),
     [
         ({"left": 9 * CIRCLE[:3]}, "left side of track 'ring' has 3 cones"),
-        ({"right": 11 * np.ones((8, 3))}, "right side of track 'ring' has 8 cones, of shape [8, 3]"),
-        ({"left": np.where(np.arange(32)[:, None] == 5, np.nan, 9 * CIRCLE)}, "Cone 5 of the left side"),
+        (
+            {"right": 11 * np.ones((8, 3))},
+            "right side of track 'ring' has 8 cones, of shape [8, 3]",
+        ),
+        (
+            {"left": np.where(np.arange(32)[:, None] == 5, np.nan, 9 * CIRCLE)},
+            "Cone 5 of the left side",
+        ),
         ({"right": 11_000 * CIRCLE}, "at most 10000 from the origin"),
         ({"left": np.vstack([9 * CIRCLE, 9 * CIRCLE[:1]])}, "Cones 32 and 0 of the left side"),
-        ({"left": 9 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]}, "The left side crosses itself near"),
-        ({"right": 11 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]}, "The right side crosses itself near"),
+        (
+            {"left": 9 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]},
+            "The left side crosses itself near",
+        ),
+        (
+            {"right": 11 * CIRCLE[[0, 1, 5, 4, 3, 2, *range(6, 32)]]},
+            "The right side crosses itself near",
+        ),
         ({"left": 9 * CIRCLE + [3, 0]}, "The two sides cross each other near"),
         ({"left": 11 * CIRCLE, "right": 9 * CIRCLE}, "swap LEFT and RIGHT"),
         ({"left": 9 * CIRCLE[::-1]}, "list both sides in driving order"),
         ({"left": 9 * CIRCLE + [50, 0]}, "not on the left of its driving direction"),
-        ({"start": (0, 0, 0)}, "The start of track 'ring' at [0.0, 0.0] is not between its two sides"),
+        (
+            {"start": (0, 0, 0)},
+            "The start of track 'ring' at [0.0, 0.0] is not between its two sides",
+        ),
         ({"right": 11 * np.roll(CIRCLE, 16, axis=0)}, "list both sides from the same place on"),
         ({"start": (10, 0, np.inf)}, "three finite numbers"),
         ({"start": (10, 0)}, "three finite numbers"),
@@ -108,7 +127,8 @@ def test_invalid_tracks_are_rejected_with_a_message(changes, words):
 
 
 def test_crossings_are_tested_on_the_curves_instead_of_the_polygons():
-    # The curve through four corners is nearly a circle, and bulges through the straight edges of the larger square.
+    # The curve through four corners is nearly a circle, and bulges through the straight edges of
+    # the larger square.
     corners = np.array([[5, -5], [5, 5], [-5, 5], [-5, -5.0]])
     edge = np.stack([np.full(12, 6.0), np.arange(-6.0, 6.0)], axis=1)
     quarter = np.array([[0, 1], [-1, 0]])

@@ -11,10 +11,19 @@ from coil_rl.envs.level_files import load_track, save_track, shipped_tracks
 from coil_rl.envs.track_generator import random_track, random_tracks
 
 SIDES = ("left", "right")
-# Seeds of the files in envs/tracks, selected by eye for laps of different lengths and difficulty in both directions.
-# After a change of the generator, write each file again: save_track(random_track(seed, name), path).
+# Seeds of the files in envs/tracks, selected by eye for laps of different lengths and difficulty in
+# both directions. After a change of the generator, write each file again:
+# save_track(random_track(seed, name), path).
 SHIPPED = {
-    "train": {"train_1": 29, "train_2": 20, "train_3": 26, "train_4": 0, "train_5": 47, "train_6": 13, "train_7": 10},
+    "train": {
+        "train_1": 29,
+        "train_2": 20,
+        "train_3": 26,
+        "train_4": 0,
+        "train_5": 47,
+        "train_6": 13,
+        "train_7": 10,
+    },
     "test": {"test_1": 22, "test_2": 16, "test_3": 27},
 }
 
@@ -39,12 +48,16 @@ def centre(track):
     near, far = sorted((track.boundary(side) for side in SIDES), key=len)
     line = (near + far[cKDTree(far).query(near)[1]]) / 2
     window = np.hanning(41) / np.hanning(41).sum()
-    smooth = np.stack([np.convolve(np.pad(axis, 20, mode="wrap"), window, "valid") for axis in line.T], axis=1)
+    smooth = np.stack(
+        [np.convolve(np.pad(axis, 20, mode="wrap"), window, "valid") for axis in line.T], axis=1
+    )
     return smooth[::5]
 
 
 def test_cones_have_the_spacing_of_tracks_drawn_by_hand(tracks):
-    gaps = [np.linalg.norm(edges(getattr(track, side)), axis=1) for track in tracks for side in SIDES]
+    gaps = [
+        np.linalg.norm(edges(getattr(track, side)), axis=1) for track in tracks for side in SIDES
+    ]
     assert min(gap.min() for gap in gaps) > 1.0
     assert max(gap.max() for gap in gaps) < 3.1
     assert np.concatenate(gaps).mean() == pytest.approx(1.6, abs=0.1)
@@ -95,7 +108,9 @@ def test_start_is_on_a_straight_that_leads_to_the_finish(tracks):
         assert 0.7 < np.linalg.norm(track.finish - (x, y)) < 2.5  # outside the finish circle
         line = centre(track)
         near = np.linalg.norm(line - track.finish, axis=1) < 2.5
-        assert np.abs((line[near] - track.finish) @ [-direction[1], direction[0]]).max() < 0.4, track.name
+        assert np.abs((line[near] - track.finish) @ [-direction[1], direction[0]]).max() < 0.4, (
+            track.name
+        )
 
 
 def test_tracks_depend_only_on_their_seed():
@@ -123,7 +138,9 @@ def test_shipped_tracks_are_those_of_the_recorded_seeds(tmp_path):
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "3", None])
 def test_invalid_arguments_are_rejected(seed):
     random_track(1)
-    with pytest.raises(ValueError, match=re.escape(f"seed={seed!r} of a random track must be an integer")):
+    with pytest.raises(
+        ValueError, match=re.escape(f"seed={seed!r} of a random track must be an integer")
+    ):
         random_track(seed)
     with pytest.raises(ValueError, match="must be from 1 to 10000"):
         random_tracks(0, seed=1)
@@ -132,5 +149,7 @@ def test_invalid_arguments_are_rejected(seed):
 def test_generator_gives_up_after_its_tries(monkeypatch):
     monkeypatch.setattr(track_generator, "TRIES", 3)
     monkeypatch.setattr(track_generator, "RADIUS", 1000.0)
-    with pytest.raises(ValueError, match="None of 3 draws of seed 77 makes a track; take another seed"):
+    with pytest.raises(
+        ValueError, match="None of 3 draws of seed 77 makes a track; take another seed"
+    ):
         random_track(77)

@@ -91,7 +91,9 @@ def test_clearance_is_the_distance_to_the_nearest_crash() -> None:
         # A car moves 8 cm a step, so it is never more than 10 cm past the crash distance.
         relevant = (truth > -0.1) & (truth < 1)
         assert relevant.sum() > POSES / 2
-        np.testing.assert_allclose(ours[relevant], truth[relevant], rtol=0, atol=3e-3, err_msg=track.name)
+        np.testing.assert_allclose(
+            ours[relevant], truth[relevant], rtol=0, atol=3e-3, err_msg=track.name
+        )
         assert ((ours <= 0) == (truth <= 0))[np.abs(truth) > 3e-3].all()
         assert (ours[truth >= 1] > 0.9).all()
         single = clearances(track_map(torch.float32), which, where.float()).numpy()
@@ -116,7 +118,9 @@ def test_tables_of_a_track_do_not_depend_on_other_tracks() -> None:
         alone = TrackMap([tracks()[index]], dtype=torch.float64)
         pose = torch.tensor(random_poses(tracks()[index], index, spread=1)).t()
         zero = torch.zeros(POSES, dtype=torch.int64)
-        assert torch.equal(clearances(alone, zero, pose[:2]), clearances(lookup, zero + index, pose[:2]))
+        assert torch.equal(
+            clearances(alone, zero, pose[:2]), clearances(lookup, zero + index, pose[:2])
+        )
         _, few = candidates(alone, zero, pose)
         _, many = candidates(lookup, zero + index, pose)
         assert torch.equal(many[:, : few.shape[1]], few)

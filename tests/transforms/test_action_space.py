@@ -20,7 +20,14 @@ from torchrl.envs import Compose, EnvBase, TransformedEnv
 
 from coil_rl.guides import FollowAdvice
 from coil_rl.testing import check_env
-from coil_rl.transforms import GuideActions, MixedAction, RemovedAdvice, ResidualAction, RewardCoupling, Takeover
+from coil_rl.transforms import (
+    GuideActions,
+    MixedAction,
+    RemovedAdvice,
+    ResidualAction,
+    RewardCoupling,
+    Takeover,
+)
 from coil_rl.transforms.action_space import ActionSpace
 
 
@@ -37,17 +44,27 @@ class Copies(EnvBase):
         reward = Unbounded((*lead, 1), dtype=dtype)
         if agents:
             self.observation_spec = Composite(agents=group, shape=batch)
-            self.full_action_spec = Composite(agents=Composite(action=action, shape=lead), shape=batch)
-            self.full_reward_spec = Composite(agents=Composite(reward=reward, shape=lead), shape=batch)
+            self.full_action_spec = Composite(
+                agents=Composite(action=action, shape=lead), shape=batch
+            )
+            self.full_reward_spec = Composite(
+                agents=Composite(reward=reward, shape=lead), shape=batch
+            )
         else:
             self.observation_spec, self.action_spec, self.reward_spec = group, action, reward
-        self.full_done_spec = Composite(done=flags, terminated=flags.clone(), truncated=flags.clone(), shape=batch)
+        self.full_done_spec = Composite(
+            done=flags, terminated=flags.clone(), truncated=flags.clone(), shape=batch
+        )
         self.received = None
 
     def _data(self, **more):
-        data = TensorDict({**self.full_done_spec.zero(), **self.observation_spec.zero()}, self.batch_size)
+        data = TensorDict(
+            {**self.full_done_spec.zero(), **self.observation_spec.zero()}, self.batch_size
+        )
         observation = data[(*self.path, "observation")]
-        observation += torch.arange(float(observation[..., 0].numel())).view(*observation.shape[:-1], 1)
+        observation += torch.arange(float(observation[..., 0].numel())).view(
+            *observation.shape[:-1], 1
+        )
         for key, value in more.items():
             data.set((*self.path, key), value)
         return data
@@ -100,7 +117,10 @@ def test_discrete_advice_is_one_hot_in_whatever_form_a_guide_gives_it(spec, form
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_numbers_have_the_bounds_and_the_dtype_of_the_action(dtype):
-    low, high = torch.tensor([[-1.0, 0.0]] * 4, dtype=dtype), torch.tensor([[1.0, 2.0]] * 4, dtype=dtype)
+    low, high = (
+        torch.tensor([[-1.0, 0.0]] * 4, dtype=dtype),
+        torch.tensor([[1.0, 2.0]] * 4, dtype=dtype),
+    )
     for network in (nn.Linear(2, 2), nn.Linear(2, 2).double()):
         nn.init.ones_(network.weight)
         nn.init.constant_(network.bias, -2)
@@ -113,13 +133,37 @@ def test_numbers_have_the_bounds_and_the_dtype_of_the_action(dtype):
 @pytest.mark.parametrize(
     ("spec", "action", "message"),
     [
-        (Unbounded((4, 1)), torch.zeros(4), r"the action of guide 'give' has the shape \[4\], but must have \[4, 1\]"),
-        (Unbounded((4, 1)), torch.full((4, 1), torch.nan), "guide 'give' holds a number that is not finite"),
-        (Categorical(3, (4,)), torch.zeros(4, 2), r"has the shape \[4, 2\], but must have \[4, 3\]"),
-        (Categorical(3, (4,)), torch.tensor([0, 1, 2, 3]), "'give' is neither an index below 3 nor a one-hot vector"),
-        (OneHot(3, (4, 3)), torch.full((4, 3), 2.5), "is neither an index below 3 nor a one-hot vector"),
+        (
+            Unbounded((4, 1)),
+            torch.zeros(4),
+            r"the action of guide 'give' has the shape \[4\], but must have \[4, 1\]",
+        ),
+        (
+            Unbounded((4, 1)),
+            torch.full((4, 1), torch.nan),
+            "guide 'give' holds a number that is not finite",
+        ),
+        (
+            Categorical(3, (4,)),
+            torch.zeros(4, 2),
+            r"has the shape \[4, 2\], but must have \[4, 3\]",
+        ),
+        (
+            Categorical(3, (4,)),
+            torch.tensor([0, 1, 2, 3]),
+            "'give' is neither an index below 3 nor a one-hot vector",
+        ),
+        (
+            OneHot(3, (4, 3)),
+            torch.full((4, 3), 2.5),
+            "is neither an index below 3 nor a one-hot vector",
+        ),
         (Unbounded((4,)), torch.zeros(4), "advice needs a vector of real numbers or choices"),
-        (Bounded(0, 9, (4, 1), dtype=torch.int64), torch.zeros(4), "advice needs a vector of real numbers or choices"),
+        (
+            Bounded(0, 9, (4, 1), dtype=torch.int64),
+            torch.zeros(4),
+            "advice needs a vector of real numbers or choices",
+        ),
     ],
 )
 def test_action_that_the_env_does_not_have_is_refused(spec, action, message):
@@ -136,11 +180,18 @@ def test_advice_of_several_agents(number):
     spec = Bounded(-9, 9, (4, 3, 1)) if number else Categorical(5, (4, 3))
     guide = TensorDictModule(
         lambda x: (x[..., :1] if number else x[..., 0].long()).clamp(max=4),
-        in_keys=[("agents", "observation")], out_keys=[("agents", "action")],
-    )  # fmt: skip
+        in_keys=[("agents", "observation")],
+        out_keys=[("agents", "action")],
+    )
     guides = GuideActions({"count": guide}, ["agents", "action"], ["agents", "advice"])
-    transforms = [ResidualAction(0.0, **KEYS), MixedAction(1.0, **KEYS)] if number else [Takeover(0.0, **KEYS)]
-    env = TransformedEnv(Copies(spec, 3), Compose(guides, *transforms, RewardCoupling(1.0, **KEYS))).train()
+    transforms = (
+        [ResidualAction(0.0, **KEYS), MixedAction(1.0, **KEYS)]
+        if number
+        else [Takeover(0.0, **KEYS)]
+    )
+    env = TransformedEnv(
+        Copies(spec, 3), Compose(guides, *transforms, RewardCoupling(1.0, **KEYS))
+    ).train()
     check_env(env, steps=3)
     data = env.reset()
     expected = torch.arange(12).view(4, 3).clamp(max=4)
@@ -155,7 +206,9 @@ def test_advice_of_several_agents(number):
 
 def test_removed_advice_is_the_last_action_of_several_choices():
     spec = MultiCategorical([3, 2], (4, 2))
-    guide = TensorDictModule(lambda x: MULTI[x[:, 0].long()], in_keys=["observation"], out_keys=["action"])
+    guide = TensorDictModule(
+        lambda x: MULTI[x[:, 0].long()], in_keys=["observation"], out_keys=["action"]
+    )
     env = TransformedEnv(Copies(spec), Compose(GuideActions({"a": guide}), RemovedAdvice()))
     check_env(env, steps=2)
     action = torch.tensor([[2, 1], [0, 0], [1, 1], [0, 1]])

@@ -38,21 +38,28 @@ def step(env, action):
 
 @pytest.mark.parametrize(
     ("transform", "of_guide"),
-    [(ResidualAction(scale=0.0), True), (MixedAction(weight=0.0), True), (MixedAction(weight=1.0), False)],
+    [
+        (ResidualAction(scale=0.0), True),
+        (MixedAction(weight=0.0), True),
+        (MixedAction(weight=1.0), False),
+    ],
     ids=["no residual", "guide only", "agent only"],
 )
 def test_without_one_of_both_actions_the_other_is_executed_exactly(transform, of_guide):
     guide = SplineGuide()
     combined = drive(worlds.cones(transform).train(), constant)
     alone = drive(
-        worlds.cones(), lambda data: guide(data.select(*guide.in_keys))["action"] if of_guide else constant(data)
+        worlds.cones(),
+        lambda data: guide(data.select(*guide.in_keys))["action"] if of_guide else constant(data),
     )
     for key in ("observation", "reward", "done", "steering"):
         assert torch.equal(combined[key], alone[key])
 
 
 def test_sum_is_clamped_to_the_bounds_of_the_action_and_the_data_keep_the_action_of_the_agent():
-    assert (step(worlds.cones(ResidualAction(scale=5.0)).train(), 0.9)["next", "steering"] == 1).all()
+    assert (
+        step(worlds.cones(ResidualAction(scale=5.0)).train(), 0.9)["next", "steering"] == 1
+    ).all()
     env = worlds.pendulum(ResidualAction(scale=10.0)).train()
     check_env(env)
     assert env.transform.inv(env.reset().set("action", torch.tensor([2.0])))["action"].item() == 2.0
@@ -62,12 +69,16 @@ def test_sum_is_clamped_to_the_bounds_of_the_action_and_the_data_keep_the_action
 
 
 @pytest.mark.parametrize(("progress", "weight"), [(0.0, 0.0), (0.25, 0.5), (0.5, 1.0), (1.0, 1.0)])
-def test_weight_follows_its_schedule_in_training_and_has_its_final_value_in_evaluation(progress, weight):
+def test_weight_follows_its_schedule_in_training_and_has_its_final_value_in_evaluation(
+    progress, weight
+):
     transform = MixedAction(Linear(0.0, 1.0, until=0.5))
     env = worlds.cones(transform).train()
     transform.progress = progress
     after = step(env, 0.5)
-    torch.testing.assert_close(after["next", "steering"], weight * 0.5 + (1 - weight) * after["guide_action"][:, 0])
+    torch.testing.assert_close(
+        after["next", "steering"], weight * 0.5 + (1 - weight) * after["guide_action"][:, 0]
+    )
     assert (step(env.eval(), 0.5)["next", "steering"] == 0.5).all()
 
 
@@ -80,7 +91,10 @@ def test_takeover_executes_the_action_of_the_guide_where_the_agent_does_not_act(
 
 
 def test_probability_and_horizon_follow_their_schedules():
-    takeover, jump_start = Takeover(Linear(1.0, 0.0, until=0.5)), JumpStart(Linear(20, 0, until=0.5))
+    takeover, jump_start = (
+        Takeover(Linear(1.0, 0.0, until=0.5)),
+        JumpStart(Linear(20, 0, until=0.5)),
+    )
     shared, jumping = worlds.cones(takeover).train(), worlds.cones(jump_start).train()
     for progress, agent, steps in ((0.0, False, 20), (0.5, True, 0), (1.0, True, 0)):
         takeover.progress = jump_start.progress = progress
@@ -90,7 +104,9 @@ def test_probability_and_horizon_follow_their_schedules():
     assert (jumping.reset()["guide_steps"] == 10).all()
 
 
-@pytest.mark.parametrize("transform", [Takeover(1.0), JumpStart(10)], ids=["takeover", "jump start"])
+@pytest.mark.parametrize(
+    "transform", [Takeover(1.0), JumpStart(10)], ids=["takeover", "jump start"]
+)
 def test_agent_acts_alone_in_evaluation(transform):
     rollout = worlds.cones(transform).eval().rollout(15, break_when_any_done=False)
     assert rollout["agent_acts"].all()
@@ -158,7 +174,11 @@ def test_executed_action_of_choices_is_a_choice(categorical):
     assert rollout["next", "executed_action"].dtype == rollout["action"].dtype
     assert bare.full_action_spec["action"].shape == rollout["next", "executed_action"][:, 0].shape
     leaning = (rollout["observation"][..., 2] > 0).long()
-    index = rollout["next", "executed_action"] if categorical else rollout["next", "executed_action"].argmax(-1)
+    index = (
+        rollout["next", "executed_action"]
+        if categorical
+        else rollout["next", "executed_action"].argmax(-1)
+    )
     guide = ~rollout["agent_acts"].squeeze(-1)
     assert guide.any()
     assert torch.equal(index[guide], leaning[guide])
@@ -166,23 +186,41 @@ def test_executed_action_of_choices_is_a_choice(categorical):
 
 def test_guide_acts_in_the_first_steps_of_the_run_with_frames():
     env = worlds.cones(Takeover(1.0, 6 * 7)).train()
-    first, second = env.rollout(5, break_when_any_done=False), env.rollout(5, break_when_any_done=False)
+    first, second = (
+        env.rollout(5, break_when_any_done=False),
+        env.rollout(5, break_when_any_done=False),
+    )
     assert not first["agent_acts"].any()
-    assert torch.equal(second["agent_acts"][0].squeeze(-1), torch.tensor([False, False, True, True, True]))
-    assert worlds.cones(Takeover(1.0, 1000)).eval().rollout(5, break_when_any_done=False)["agent_acts"].all()
+    assert torch.equal(
+        second["agent_acts"][0].squeeze(-1), torch.tensor([False, False, True, True, True])
+    )
+    assert (
+        worlds.cones(Takeover(1.0, 1000))
+        .eval()
+        .rollout(5, break_when_any_done=False)["agent_acts"]
+        .all()
+    )
 
 
 def test_weight_of_the_agent_is_a_clipped_linear_function_of_the_uncertainty_in_the_step_before():
-    env = worlds.cones(AdaptiveMixedAction(low=0.2, high=1.0, certain=0.1, uncertain=0.5, warm_up=0)).train()
+    env = worlds.cones(
+        AdaptiveMixedAction(low=0.2, high=1.0, certain=0.1, uncertain=0.5, warm_up=0)
+    ).train()
     doubt = torch.tensor([0.0, 0.1, 0.2, 0.3, 0.5, 9.0]).unsqueeze(-1)
     carrier = env.reset()
     assert (carrier["agent_weight"] == 0.2).all()
-    carrier = env.step(carrier.set("action", torch.full((6, 1), 0.5)).set(("next", "uncertainty"), doubt))["next"]
-    torch.testing.assert_close(carrier["agent_weight"].squeeze(-1), torch.tensor([1.0, 1.0, 0.8, 0.6, 0.2, 0.2]))
+    carrier = env.step(
+        carrier.set("action", torch.full((6, 1), 0.5)).set(("next", "uncertainty"), doubt)
+    )["next"]
+    torch.testing.assert_close(
+        carrier["agent_weight"].squeeze(-1), torch.tensor([1.0, 1.0, 0.8, 0.6, 0.2, 0.2])
+    )
     after = env.step(carrier.set("action", torch.full((6, 1), 0.5)))
     weight, advice = carrier["agent_weight"], carrier["guide_action"][:, 0]
     torch.testing.assert_close(after["next", "steering"], weight * 0.5 + (1 - weight) * advice)
-    assert (after["next", "agent_weight"] == 0.2).all(), "without an uncertainty the guide is trusted"
+    assert (after["next", "agent_weight"] == 0.2).all(), (
+        "without an uncertainty the guide is trusted"
+    )
 
 
 def test_weight_of_the_agent_is_drawn_during_the_warm_up():

@@ -72,14 +72,21 @@ def test_specs_hold_in_envs_with_continuous_actions(name):
 def test_specs_hold_with_several_guides_and_another_key():
     key, classes = ("advice", "middle"), (NoisyAdvice, ShuffledAdvice, DelayedAdvice, RemovedAdvice)
     guides = GuideActions({"constant": ConstantGuide(0.5), "spline": SplineGuide()}, out_key=key)
-    env = TransformedEnv(ConeTrackEnv(shipped_tracks("test"), 6), Compose(guides, *(make(key=key) for make in classes)))
+    env = TransformedEnv(
+        ConeTrackEnv(shipped_tracks("test"), 6),
+        Compose(guides, *(make(key=key) for make in classes)),
+    )
     check_env(env)
     assert env.reset()[key].eq(0).all()
 
 
 @pytest.mark.parametrize(
     "transforms",
-    [[ResidualAction(0.5), RewardCoupling(0.1), Takeover(0.5)], [JumpStart(3), DelayedAdvice(3)], [RemovedAdvice()]],
+    [
+        [ResidualAction(0.5), RewardCoupling(0.1), Takeover(0.5)],
+        [JumpStart(3), DelayedAdvice(3)],
+        [RemovedAdvice()],
+    ],
 )
 def test_specs_hold_with_discrete_actions(transforms):
     check_env(worlds.cones(*transforms, DiscreteActions(3)).train(), steps=5)
@@ -103,7 +110,9 @@ def test_specs_hold_with_discrete_actions(transforms):
 def test_draws_continue_from_a_state_dict(transform):
     def env(seed):
         guide = GuideActions({"spline": SplineGuide()})
-        env = TransformedEnv(ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))).train()
+        env = TransformedEnv(
+            ConeTrackEnv(shipped_tracks("test")[:1], 6), Compose(guide, transform(seed=seed))
+        ).train()
         set_progress(env, 0.0)
         return env
 
@@ -126,7 +135,10 @@ def degraded(transform):
     [
         (lambda: Guides({}), "at least one guide"),
         (lambda: Guides({"half": ZeroGuide()}), "'half' cannot be the name of a guide"),
-        (lambda: Guides({"a": ZeroGuide(out_key="b")}), r"'a' must write 'action'; it writes \['b'\]"),
+        (
+            lambda: Guides({"a": ZeroGuide(out_key="b")}),
+            r"'a' must write 'action'; it writes \['b'\]",
+        ),
         (lambda: Guides({"zero": ZeroGuide()}, trainable=True), "guide 'zero' has no parameters"),
         (lambda: RewardCoupling(0.5, "l3"), "norm='l3' must be one of l1, l2, linf"),
         (lambda: RewardCoupling(0.5, guide=-1), "guide=-1 must be at least 0"),
@@ -134,10 +146,22 @@ def degraded(transform):
             lambda: worlds.cones(RewardCoupling(0.5, guide=1)).rollout(1),
             "RewardCoupling reads row 1 of guide_action, but there is advice of 1 guides",
         ),
-        (lambda: worlds.carts(ResidualAction()).rollout(1), "needs continuous actions, but this env has 2 discrete"),
-        (lambda: worlds.carts(DiscreteActions(5)).reset(), "bounded number, but this env's action is Categorical"),
-        (lambda: AdaptiveMixedAction(low=0.4), "low=0.4, warm_up_high=0.3 and high=1.0 must be in this order"),
-        (lambda: AdaptiveMixedAction(certain=0.2), "certain=0.2 at least 0 and less than uncertain=0.15"),
+        (
+            lambda: worlds.carts(ResidualAction()).rollout(1),
+            "needs continuous actions, but this env has 2 discrete",
+        ),
+        (
+            lambda: worlds.carts(DiscreteActions(5)).reset(),
+            "bounded number, but this env's action is Categorical",
+        ),
+        (
+            lambda: AdaptiveMixedAction(low=0.4),
+            "low=0.4, warm_up_high=0.3 and high=1.0 must be in this order",
+        ),
+        (
+            lambda: AdaptiveMixedAction(certain=0.2),
+            "certain=0.2 at least 0 and less than uncertain=0.15",
+        ),
         (lambda: DiscreteActions(1), "choices=1 must be at least 2"),
         (lambda: DiscreteActions([0.5, 0.5]), "must be at least two increasing numbers"),
         (lambda: DiscreteActions([0.0, math.inf]), "must be finite"),
@@ -153,10 +177,17 @@ def degraded(transform):
         (lambda: DelayedAdvice(-1), "steps=-1 must be at least 0"),
         (lambda: degraded(DelayedAdvice()), "DelayedAdvice needs the previous steps"),
         (lambda: degraded(RemovedAdvice()), "RemovedAdvice needs the previous steps"),
-        (lambda: worlds.cones(ShuffledAdvice(), cars=1).reset(), "but the batch is one row; use more"),
+        (
+            lambda: worlds.cones(ShuffledAdvice(), cars=1).reset(),
+            "but the batch is one row; use more",
+        ),
         (lambda: worlds.pendulum(ShuffledAdvice()).reset(), "but the batch is one row; use more"),
         (
-            lambda: TransformedEnv(ConeTrackEnv(shipped_tracks("test"), 1), BiasedAdvice()).observation_spec,
+            lambda: (
+                TransformedEnv(
+                    ConeTrackEnv(shipped_tracks("test"), 1), BiasedAdvice()
+                ).observation_spec
+            ),
             "BiasedAdvice changes 'guide_action', but",
         ),
     ],

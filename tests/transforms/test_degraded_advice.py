@@ -25,7 +25,9 @@ from coil_rl.transforms import (
     ShuffledAdvice,
 )
 
-NAMES = sorted(file.stem for file in (Path(__file__).parents[2] / "conf" / "degrade").glob("*.yaml"))
+NAMES = sorted(
+    file.stem for file in (Path(__file__).parents[2] / "conf" / "degrade").glob("*.yaml")
+)
 CARS = 6
 WORLD = ConeTrackEnv(random_tracks(count=1, seed=5), CARS)
 
@@ -43,7 +45,9 @@ class Counting(TensorDictModule):
 
 
 def cone_env(*degraders, guide=None):
-    return TransformedEnv(WORLD, Compose(GuideActions({"guide": guide or SplineGuide()}), *degraders))
+    return TransformedEnv(
+        WORLD, Compose(GuideActions({"guide": guide or SplineGuide()}), *degraders)
+    )
 
 
 def counting_env(*degraders):
@@ -162,7 +166,9 @@ def test_advice_is_delayed_by_k_steps_after_the_first_advice():
     delayed = rollout(DelayedAdvice(3))
     assert delayed[0].tolist() == [0, 0, 0, 0, 1, 2, 3, 4]
     assert delayed[4].tolist() == [40, 40, 40, 40, 41, 42, 43, 44]
-    assert torch.equal(rollout(DelayedAdvice(1), DelayedAdvice(2, memory_key="delayed_again")), delayed)
+    assert torch.equal(
+        rollout(DelayedAdvice(1), DelayedAdvice(2, memory_key="delayed_again")), delayed
+    )
     assert torch.equal(rollout(DelayedAdvice(0)), rollout())
 
 
@@ -179,7 +185,9 @@ def test_delay_starts_again_with_each_episode():
 
 def test_shuffled_advice_is_a_shift_of_the_rows():
     envs = counting_env(ShuffledAdvice(seed=1)), counting_env()
-    shuffled, plain = (hundredths(env.rollout(40, straight, break_when_any_done=False)) for env in envs)
+    shuffled, plain = (
+        hundredths(env.rollout(40, straight, break_when_any_done=False)) for env in envs
+    )
     assert torch.equal(shuffled.sort(0).values, plain.sort(0).values)
     assert (shuffled != plain).all()
     shifts = {tuple(column) for column in ((shuffled - torch.arange(40)) // 10).t().tolist()}
@@ -188,11 +196,13 @@ def test_shuffled_advice_is_a_shift_of_the_rows():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_reset_row_gets_the_previous_advice_of_another_row(seed):
-    # The next transform must not halve advice twice, and advice for the rows without a reset is not used.
+    # The next transform must not halve advice twice, and advice for the rows without a reset is not
+    # used.
     env = counting_env(ShuffledAdvice(seed), ScaledAdvice(0.5))
     carrier = steps(env, env.reset(), 1)
     before, after = (
-        (td["guide_action"] * 200).round().int().flatten() for td in (carrier, reset_rows(env, carrier, 1, 3))
+        (td["guide_action"] * 200).round().int().flatten()
+        for td in (carrier, reset_rows(env, carrier, 1, 3))
     )
     assert torch.equal(after[[0, 2, 4, 5]], before[[0, 2, 4, 5]])
     assert after[1] in (1, 21, 31, 41, 51)
@@ -205,7 +215,10 @@ def test_reset_and_stored_rows_are_shuffled_among_themselves():
     assert sorted(hundredths(after).tolist()) == [2, 12, 22, 32, 42, 52]
     stored = TensorDict({"guide_action": torch.arange(24.0).view(2, 3, 2, 2)}, [2, 3])
     shuffled = ShuffledAdvice()(stored.clone())
-    before, after = ([row.flatten().tolist() for row in td["guide_action"].flatten(0, 1)] for td in (stored, shuffled))
+    before, after = (
+        [row.flatten().tolist() for row in td["guide_action"].flatten(0, 1)]
+        for td in (stored, shuffled)
+    )
     assert sorted(before) == sorted(after)
     assert all(one != other for one, other in zip(before, after, strict=True))
 

@@ -21,7 +21,9 @@ def test_advice_is_the_action_of_the_guide_for_the_same_step():
     rollout = env.rollout(100, break_when_any_done=False)
     expected = guide(rollout.select(*guide.in_keys).reshape(-1).clone())["action"].view(6, 100, 1)
     torch.testing.assert_close(rollout["guide_action"].squeeze(2), expected)
-    assert rollout["next", "done"].any(), "random driving should have crashed, so that resets are covered"
+    assert rollout["next", "done"].any(), (
+        "random driving should have crashed, so that resets are covered"
+    )
 
 
 def test_several_guides_keep_their_order_also_in_the_state():
@@ -75,7 +77,9 @@ def test_cached_advice_equals_the_function_and_the_cache_is_bounded():
         calls.clear()
         advice = [cache(data, function) for data in batches]
         called_with = sum(calls)
-        assert all(torch.equal(one, function(data)) for one, data in zip(advice, batches, strict=True))
+        assert all(
+            torch.equal(one, function(data)) for one, data in zip(advice, batches, strict=True)
+        )
         return called_with
 
     batches = [rows(1, 2, 1), rows(2), rows(3, 3, 1), rows(), rows(1, 2, 3)]

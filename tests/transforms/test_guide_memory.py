@@ -8,7 +8,14 @@ import worlds
 from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
 from torchrl.data import Unbounded
-from torchrl.envs import Compose, ParallelEnv, PendulumEnv, SerialEnv, TensorDictPrimer, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    ParallelEnv,
+    PendulumEnv,
+    SerialEnv,
+    TensorDictPrimer,
+    TransformedEnv,
+)
 from torchrl.modules import GRUModule, LSTMModule
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
@@ -31,7 +38,9 @@ class Integrator(TensorDictModuleBase):
         return tensordict.set("action", (total / 100).clamp(-1, 1)).set(("next", "total"), total)
 
     def make_tensordict_primer(self):
-        return TensorDictPrimer({"total": Unbounded((1,))}, default_value=self.first, expand_specs=True)
+        return TensorDictPrimer(
+            {"total": Unbounded((1,))}, default_value=self.first, expand_specs=True
+        )
 
 
 class Witness(TensorDictModuleBase):
@@ -48,11 +57,15 @@ def recurrent(kind):
     torch.manual_seed(0)
     states = ["h", "c"][: 1 if kind is GRUModule else 2]
     core = kind(
-        input_size=20, hidden_size=8,
-        in_keys=["observation", *states], out_keys=["features", *(("next", state) for state in states)],
-    )  # fmt: skip
+        input_size=20,
+        hidden_size=8,
+        in_keys=["observation", *states],
+        out_keys=["features", *(("next", state) for state in states)],
+    )
     head = nn.Sequential(nn.Linear(8, 1), nn.Tanh())
-    return TensorDictSequential(core, TensorDictModule(head, in_keys=["features"], out_keys=["action"]))
+    return TensorDictSequential(
+        core, TensorDictModule(head, in_keys=["features"], out_keys=["action"])
+    )
 
 
 def cones(guides, *transforms, cars=6, seed=0):
@@ -71,7 +84,9 @@ def episodes(rollout):
 def driven(env, steps=80):
     torch.manual_seed(1)
     rollout = env.rollout(steps, break_when_any_done=False)
-    assert rollout["next", "done"].sum() > 3, "random driving should have crashed, so that resets are covered"
+    assert rollout["next", "done"].sum() > 3, (
+        "random driving should have crashed, so that resets are covered"
+    )
     assert not rollout["next", "done"].all(1).any(), "rows should be reset one by one"
     return rollout
 
@@ -84,7 +99,10 @@ def test_memory_begins_anew_with_every_episode_of_every_row():
         torch.testing.assert_close(episode["guide_action"][:, 0], expected)
         torch.testing.assert_close(episode["guide_state", "sum", "total"], expected * 100)
     assert set(rollout["guide_state"].keys()) == {"sum"}
-    assert torch.equal(rollout["guide_action"][:, :, 1], driven(cones({"s": SplineGuide()}))["guide_action"][:, :, 0])
+    assert torch.equal(
+        rollout["guide_action"][:, :, 1],
+        driven(cones({"s": SplineGuide()}))["guide_action"][:, :, 0],
+    )
 
 
 @pytest.mark.parametrize("kind", [LSTMModule, GRUModule])
@@ -113,7 +131,9 @@ def test_guide_is_told_first_step_row_and_the_action_that_the_env_was_given():
     first[:, 1:] = rollout["next", "done"][:, :-1].float()
     last = torch.cat([torch.zeros(6, 1, 1), given[:, :-1]], 1) * (1 - first)
     rows = torch.arange(6.0).view(6, 1, 1)
-    torch.testing.assert_close(rollout["guide_action"][:, :, 1], (first + rows / 10 + last / 10) / 10)
+    torch.testing.assert_close(
+        rollout["guide_action"][:, :, 1], (first + rows / 10 + last / 10) / 10
+    )
 
 
 class Speed(Integrator):
@@ -142,22 +162,30 @@ def inside():
 def test_memory_works_inside_and_around_an_env_of_several_envs(make):
     env = make()
     rollout = env.rollout(5)
-    torch.testing.assert_close(rollout["guide_action"][..., 0, :], rollout["thdot"].cumsum(1).unsqueeze(-1) / 100)
+    torch.testing.assert_close(
+        rollout["guide_action"][..., 0, :], rollout["thdot"].cumsum(1).unsqueeze(-1) / 100
+    )
     before = rollout[:, -1]["next"].clone()
     mask = torch.tensor([[True], [False]])
-    after = env.reset(before.clone().set("_reset", mask), set_state=False)["guide_state", "sum", "total"]
+    after = env.reset(before.clone().set("_reset", mask), set_state=False)[
+        "guide_state", "sum", "total"
+    ]
     assert after[1] == before["guide_state", "sum", "total"][1] != after[0]
     assert after[0].abs() < 1.1, "the first speed is at most 1"
     env.close()
 
 
 def policy():
-    return TensorDictModule(lambda observation: torch.tanh(observation[:, :1]), ["observation"], ["action"])
+    return TensorDictModule(
+        lambda observation: torch.tanh(observation[:, :1]), ["observation"], ["action"]
+    )
 
 
 def test_resumed_rollout_is_equal_to_the_bit():
     def rollout(seed):
-        return Rollout(cones({"memory": recurrent(LSTMModule), "sum": Integrator()}, seed=seed), policy(), 20)
+        return Rollout(
+            cones({"memory": recurrent(LSTMModule), "sum": Integrator()}, seed=seed), policy(), 20
+        )
 
     expected, resumed = worlds.continued(rollout)
     assert (expected == resumed).all()
@@ -174,14 +202,27 @@ def test_rollout_of_chosen_keys_stores_no_memory():
     ("make", "message"),
     [
         (
-            lambda: GuideActions({"pi": TensorDictModule(nn.Linear(1, 2), ["a"], ["action", ("next", "b")])}),
+            lambda: GuideActions(
+                {"pi": TensorDictModule(nn.Linear(1, 2), ["a"], ["action", ("next", "b")])}
+            ),
             r"guide 'pi' writes \['b'\] for its next step, but nothing",
         ),
-        (lambda: Guides({"pi": recurrent(GRUModule)}, trainable=True), "guide 'pi' has a memory, and such a guide"),
-        (lambda: cones({"pi": Integrator()}).transform[0](worlds.cones().reset()), "the guides pi need the previous"),
-        (lambda: cones({"w": Witness()}).transform[0](worlds.cones().reset()), "the guides w need the previous steps"),
         (
-            lambda: cones({"pi": Integrator()}, GuideActions({"pi": Integrator()}, out_key="b")).reset(),
+            lambda: Guides({"pi": recurrent(GRUModule)}, trainable=True),
+            "guide 'pi' has a memory, and such a guide",
+        ),
+        (
+            lambda: cones({"pi": Integrator()}).transform[0](worlds.cones().reset()),
+            "the guides pi need the previous",
+        ),
+        (
+            lambda: cones({"w": Witness()}).transform[0](worlds.cones().reset()),
+            "the guides w need the previous steps",
+        ),
+        (
+            lambda: cones(
+                {"pi": Integrator()}, GuideActions({"pi": Integrator()}, out_key="b")
+            ).reset(),
             "two guides 'pi' have a memory",
         ),
     ],

@@ -8,7 +8,14 @@ from torchrl.envs import Compose, PendulumEnv, SerialEnv, StepCounter, Transform
 
 from coil_rl.guides import SplineGuide
 from coil_rl.schedules import Linear
-from coil_rl.transforms import GuideActions, JumpStart, MixedAction, RewardCoupling, Takeover, set_progress
+from coil_rl.transforms import (
+    GuideActions,
+    JumpStart,
+    MixedAction,
+    RewardCoupling,
+    Takeover,
+    set_progress,
+)
 
 ACTIVE = {
     "coupling": lambda: RewardCoupling(0.5),
@@ -19,19 +26,25 @@ ACTIVE = {
 
 
 def collected(env, steps=6):
-    collector = Collector(env, SplineGuide(), frames_per_batch=6 * steps, auto_register_policy_transforms=False)
+    collector = Collector(
+        env, SplineGuide(), frames_per_batch=6 * steps, auto_register_policy_transforms=False
+    )
     return next(iter(collector))
 
 
 @pytest.mark.parametrize("name", ACTIVE)
 def test_transform_that_would_be_silently_off_in_a_collector_is_refused(name):
-    with pytest.raises(RuntimeError, match=r"acts in training only: call env.train\(\) or env.eval\(\) first"):
+    with pytest.raises(
+        RuntimeError, match=r"acts in training only: call env.train\(\) or env.eval\(\) first"
+    ):
         collected(worlds.cones(ACTIVE[name]()))
 
 
 def test_transforms_work_in_a_collector():
     after = collected(worlds.cones(RewardCoupling(0.5)).train())["next"]
-    torch.testing.assert_close(after["reward"], after["task_reward"] - 0.5 * after["guide_distance"])
+    torch.testing.assert_close(
+        after["reward"], after["task_reward"] - 0.5 * after["guide_distance"]
+    )
     assert not collected(worlds.cones(JumpStart(3)).train())["agent_acts"][:, :3].any()
     after = collected(worlds.cones(RewardCoupling(0.5)).eval())["next"]
     assert torch.equal(after["reward"], after["task_reward"])
@@ -39,7 +52,9 @@ def test_transforms_work_in_a_collector():
 
 def test_progress_moves_the_schedules_in_a_collector():
     env = worlds.cones(MixedAction(Linear(0.0, 1.0)), StepCounter())
-    with pytest.raises(RuntimeError, match=r"nothing tells it the progress of the run: call .*set_progress\(env"):
+    with pytest.raises(
+        RuntimeError, match=r"nothing tells it the progress of the run: call .*set_progress\(env"
+    ):
         collected(env.train())
     for progress in (0.25, 0.75):
         set_progress(env, progress)
@@ -61,10 +76,16 @@ def test_mode_is_asked_for_again_when_torchrl_forgets_it():
 def test_env_inside_a_serial_env_needs_its_mode_where_it_is_made():
     def make(mode):
         guide = worlds.pendulum().transform[0].guides.guides["damp"]
-        env = TransformedEnv(PendulumEnv(), Compose(GuideActions({"damp": guide}), RewardCoupling(0.5)))
+        env = TransformedEnv(
+            PendulumEnv(), Compose(GuideActions({"damp": guide}), RewardCoupling(0.5))
+        )
         return env.train() if mode else env
 
-    with pytest.raises(RuntimeError, match="inside SerialEnv or ParallelEnv in the function that makes it"):
+    with pytest.raises(
+        RuntimeError, match="inside SerialEnv or ParallelEnv in the function that makes it"
+    ):
         SerialEnv(2, lambda: make(False)).train().rollout(2)
     after = SerialEnv(2, lambda: make(True)).rollout(2)["next"]
-    torch.testing.assert_close(after["reward"], after["task_reward"] - 0.5 * after["guide_distance"])
+    torch.testing.assert_close(
+        after["reward"], after["task_reward"] - 0.5 * after["guide_distance"]
+    )

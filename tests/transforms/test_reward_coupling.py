@@ -14,7 +14,9 @@ def test_reward_is_the_task_reward_minus_beta_times_the_distance(norm, order):
     env.transform.insert(0, RewardSum())
     rollout = env.train().rollout(30, break_when_any_done=False)
     after = rollout["next"]
-    distance = torch.linalg.vector_norm(rollout["action"] - rollout["guide_action"][..., 0, :], order, -1, True)
+    distance = torch.linalg.vector_norm(
+        rollout["action"] - rollout["guide_action"][..., 0, :], order, -1, True
+    )
     assert torch.equal(after["guide_distance"], distance)
     assert torch.equal(after["reward"], after["task_reward"] - 0.3 * distance)
     assert (distance > 0.01).any()
@@ -26,7 +28,10 @@ def test_task_reward_is_exactly_the_reward_of_the_env():
     actions = torch.rand(40, 6, 1, generator=torch.Generator().manual_seed(0)) * 2 - 1
     one, other = coupled.reset(), plain.reset()
     for action in actions:
-        ours, theirs = coupled.step(one.set("action", action)), plain.step(other.set("action", action))
+        ours, theirs = (
+            coupled.step(one.set("action", action)),
+            plain.step(other.set("action", action)),
+        )
         assert torch.equal(ours["next", "task_reward"], theirs["next", "reward"])
         one, other = step_mdp(ours), step_mdp(theirs)
 

@@ -31,7 +31,10 @@ def function(name, **options):
 @pytest.mark.parametrize("continuous", [False, True])
 def test_lander_is_the_heuristic_of_gymnasium(continuous):
     module = pytest.importorskip("gymnasium.envs.box2d.lunar_lander")
-    env, generator = gymnasium.make("LunarLander-v3", continuous=continuous), np.random.default_rng(0)
+    env, generator = (
+        gymnasium.make("LunarLander-v3", continuous=continuous),
+        np.random.default_rng(0),
+    )
     states = generator.normal(0, 0.5, (1000, 8)).astype(np.float32)
     states[:, 6:] = generator.integers(0, 2, (1000, 2)) * (generator.random((1000, 1)) < 0.3)
     expected = np.array([module.heuristic(env, state) for state in states])
@@ -41,7 +44,9 @@ def test_lander_is_the_heuristic_of_gymnasium(continuous):
 
 
 def test_energy_pump_climbs_and_a_brake_does_not():
-    assert np.mean(returns("MountainCarContinuous-v0", function("energy_pump"))) == pytest.approx(89.4, abs=0.5)
+    assert np.mean(returns("MountainCarContinuous-v0", function("energy_pump"))) == pytest.approx(
+        89.4, abs=0.5
+    )
     assert max(returns("MountainCarContinuous-v0", function("energy_pump", power=-1.0), 1)) < 0
 
 
@@ -63,15 +68,21 @@ def test_oscillator_follows_its_sines_from_the_first_step_of_each_row():
     after = guide(data)
     assert torch.allclose(after["action"], torch.tensor([[0.0, 0.1]]).expand(2, 2), atol=1e-5)
     assert after["next", "swum_steps"].tolist() == [[1], [26]]
-    moving = data.clone().set("observation", torch.tensor([0.0, 0.02, 0, 0, 0, 0, 0, 0.2]).expand(2, 8))
-    assert torch.allclose(guide(moving)["action"], torch.tensor([[-0.2, 0.0]]).expand(2, 2), atol=1e-5)
+    moving = data.clone().set(
+        "observation", torch.tensor([0.0, 0.02, 0, 0, 0, 0, 0, 0.2]).expand(2, 8)
+    )
+    assert torch.allclose(
+        guide(moving)["action"], torch.tensor([[-0.2, 0.0]]).expand(2, 2), atol=1e-5
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("frequency", "known"), [(0.62, 352), (0.3, 112)])
 def test_oscillator_swims(frequency, known):
     pytest.importorskip("mujoco")
-    assert np.mean(returns("Swimmer-v5", classic.Oscillator(frequency), 2)) == pytest.approx(known, abs=10)
+    assert np.mean(returns("Swimmer-v5", classic.Oscillator(frequency), 2)) == pytest.approx(
+        known, abs=10
+    )
 
 
 def test_walker_keeps_one_state_a_row_and_continues_from_a_checkpoint():
@@ -97,7 +108,10 @@ def test_walker_keeps_one_state_a_row_and_continues_from_a_checkpoint():
 
 
 def bot_env(**options):
-    wrappers = [classic.LastAction, partial(pytest.importorskip("minigrid.wrappers").FlatObsWrapper)]
+    wrappers = [
+        classic.LastAction,
+        partial(pytest.importorskip("minigrid.wrappers").FlatObsWrapper),
+    ]
     bot = {"bot": "coil_rl.guides.classic:Bot"}
     return {"wrappers": wrappers, "controllers": bot, **options}
 

@@ -85,7 +85,9 @@ def cones(guide, cars=6, seed=0):
 def driven(env, steps=80):
     torch.manual_seed(1)
     rollout = env.rollout(steps, break_when_any_done=False)
-    assert rollout["next", "done"].sum() > 3, "random driving should have crashed, so that resets are covered"
+    assert rollout["next", "done"].sum() > 3, (
+        "random driving should have crashed, so that resets are covered"
+    )
     return rollout, rollout["guide_action"][:, :, 0]
 
 
@@ -110,7 +112,9 @@ def test_network_and_function_act_on_the_batch():
     rollout, advice = driven(cones(guide))
     with torch.no_grad():
         torch.testing.assert_close(advice, guide.guide.module(rollout["observation"]))
-    rollout, advice = driven(cones(ControllerGuide("my_control:half", ["steering"], {"gain": 0.25})))
+    rollout, advice = driven(
+        cones(ControllerGuide("my_control:half", ["steering"], {"gain": 0.25}))
+    )
     assert torch.equal(advice, rollout["steering"] / 4)
 
 
@@ -129,7 +133,9 @@ def test_object_without_reset_is_made_anew_for_each_episode():
 
     rollout, advice = driven(cones(PerRow(Forgetful, ["observation", "steering"])))
     torch.testing.assert_close(advice.squeeze(-1), 0.001 * steps_of_episode(rollout))
-    assert (rollout["observation"] < 9).all(), "what a controller does with its array should not change the data"
+    assert (rollout["observation"] < 9).all(), (
+        "what a controller does with its array should not change the data"
+    )
 
 
 def test_states_of_the_objects_are_in_the_checkpoint():
@@ -158,7 +164,8 @@ def test_state_that_a_checkpoint_cannot_hold_is_refused():
     env = cones(PerRow(Stateful), cars=2)
     env.rollout(2)
     with pytest.raises(
-        ValueError, match=r"state_dict\(\) of the controller Stateful may hold numbers, .*; convert NumPy"
+        ValueError,
+        match=r"state_dict\(\) of the controller Stateful may hold numbers, .*; convert NumPy",
     ):
         env.state_dict()
 
@@ -176,19 +183,39 @@ def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
     ("of", "options", "message"),
     [
         ("my_control", {}, "of=my_control must be MODULE:NAME, such as my_package.control:MyPID"),
-        ("my_contrl:Net", {}, "there is no module my_contrl; install its package, or add its folder to PYTHONPATH"),
+        (
+            "my_contrl:Net",
+            {},
+            "there is no module my_contrl; install its package, or add its folder to PYTHONPATH",
+        ),
         ("my_needy:Net", {}, "my_needy needs no_such_package, which is missing; install it"),
-        ("my_broken:Net", {}, r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)"),
+        (
+            "my_broken:Net",
+            {},
+            r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)",
+        ),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
         ("my_control:number", {}, "of=my_control:number is int; name a class or a function"),
-        ("my_control:Other", {}, r"is a class without act\(observation\); give it this method, or name a function"),
+        (
+            "my_control:Other",
+            {},
+            r"is a class without act\(observation\); give it this method, or name a function",
+        ),
         (
             "my_control:Counter",
             {"stpe": 1},
             r"takes \(step=0.01\), but is called with \(stpe=\): .* mean step",
         ),
-        ("my_control:half", {"k": 1}, r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)"),
-        ("my_control:Guide", {"k": 1}, r"my_control:Guide takes \(gain=1.0\), but is called with \(k=\)"),
+        (
+            "my_control:half",
+            {"k": 1},
+            r"takes \(observation, gain=0.5\), but is called with \(observation, k=\)",
+        ),
+        (
+            "my_control:Guide",
+            {"k": 1},
+            r"my_control:Guide takes \(gain=1.0\), but is called with \(k=\)",
+        ),
     ],
 )
 def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, message):
@@ -200,8 +227,14 @@ def test_controller_that_cannot_be_used_is_refused_in_one_sentence(of, options, 
 @pytest.mark.parametrize(
     ("of", "message"),
     [
-        ("my_control:Counter", r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)"),
-        ("my_control:Guide", r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out"),
+        (
+            "my_control:Counter",
+            r"my_control:Counter.act takes \(self, observation\), but is called with \(a, b\)",
+        ),
+        (
+            "my_control:Guide",
+            r"of=my_control:Guide has its own in_keys=\['steering'\]; leave in_keys out",
+        ),
     ],
 )
 def test_entries_that_a_controller_does_not_take_are_refused(of, message):

@@ -13,9 +13,19 @@ from coil_rl.testing import check_guide
 from coil_rl.train.build import build_env, build_guides
 from coil_rl.train.evaluation import evaluate_policy
 
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.num_envs=4", "budget.steps=16",
-        "budget.frames=128"]  # fmt: skip
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=1",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+]
 
 
 def composed(*overrides, name="train"):
@@ -23,16 +33,24 @@ def composed(*overrides, name="train"):
         return compose(name, [*overrides])
 
 
-@pytest.fixture(scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"])
+@pytest.fixture(
+    scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"]
+)
 def run(request, tmp_path_factory):
-    return make_untrained_run(tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split())
+    return make_untrained_run(
+        tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split()
+    )
 
 
 def test_guide_drives_as_the_policy_in_its_own_env(run):
-    config, agent = restore(run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate"))
+    config, agent = restore(
+        run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate")
+    )
     overrides = {"num_envs": 3, "assignment": "cyclic"}
     policy = evaluate_policy(build_env(config, overrides), agent)
-    guided = composed(*TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
+    guided = composed(
+        *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+    )
     learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
 
@@ -43,14 +61,18 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
     check_guide(guide, data, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
     assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
-    config = composed(*TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused")
+    config = composed(
+        *TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+    )
     step = build_env(config).rollout(5, break_when_any_done=False)[:, -1]
     assert torch.equal(step["guide_action"][:, 0], guide(step.clone())["action"])
 
 
 def test_run_without_an_agent_is_refused(tmp_path):
     run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
-    with pytest.raises(ValueError, match="trained no agent: its method is guide; name its guide instead"):
+    with pytest.raises(
+        ValueError, match="trained no agent: its method is guide; name its guide instead"
+    ):
         LearnedGuide(str(run))
 
 
@@ -58,7 +80,9 @@ def test_run_whose_advice_needs_earlier_steps_is_refused(tmp_path):
     (tmp_path / "actions.csv").write_text("0.1\n0.2\n")
     options = ["method=coil", "guide=recorded", f"guide.recorded.file={tmp_path / 'actions.csv'}"]
     run = make_untrained_run(tmp_path / "run", *TINY, *options)
-    with pytest.raises(ValueError, match="run has GuideActions, which needs earlier steps; its policy is no guide"):
+    with pytest.raises(
+        ValueError, match="run has GuideActions, which needs earlier steps; its policy is no guide"
+    ):
         LearnedGuide(str(run))
 
 
@@ -77,7 +101,11 @@ def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
         shutil.copytree(tmp_path / "0", tmp_path / str(number))
     for number in range(length):
         guided_by(tmp_path / str(number), tmp_path / str((number + 1) % length))
-    message = "is its own guide" if length <= LONGEST_CHAIN else f"a chain of more than {LONGEST_CHAIN} learned guides"
+    message = (
+        "is its own guide"
+        if length <= LONGEST_CHAIN
+        else f"a chain of more than {LONGEST_CHAIN} learned guides"
+    )
     for _ in range(2):  # the first refusal leaves nothing behind
         with pytest.raises(UserError, match=message):
             LearnedGuide(str(tmp_path / "0"))

@@ -8,14 +8,19 @@ DATA = TensorDict({"observation": torch.zeros(5, 20)}, [5])
 
 
 def test_constant_and_zero_keep_the_contract():
-    for guide, expected in ((ConstantGuide([0.1, -0.2]), [0.1, -0.2]), (ZeroGuide(size=3), [0, 0, 0])):
+    for guide, expected in (
+        (ConstantGuide([0.1, -0.2]), [0.1, -0.2]),
+        (ZeroGuide(size=3), [0, 0, 0]),
+    ):
         check_guide(guide, DATA)
         assert torch.equal(guide(DATA.copy())["action"], torch.tensor(expected).expand(5, -1))
 
 
 def test_random_is_uniform_and_depends_on_its_seed():
     many = TensorDict({"observation": torch.zeros(100_000, 1)}, [100_000])
-    action, same, other = (RandomGuide(-2, 1, seed=seed)(many.copy())["action"] for seed in (7, 7, 8))
+    action, same, other = (
+        RandomGuide(-2, 1, seed=seed)(many.copy())["action"] for seed in (7, 7, 8)
+    )
     assert torch.equal(action, same)
     assert not torch.equal(action, other)
     assert -2 <= action.min() < -1.99

@@ -14,25 +14,35 @@ from coil_rl.guides import RacingLineGuide, SplineGuide
 SLOTS = 16
 both_splines = pytest.mark.parametrize("spline", ["cubic", "quadratic"])
 every_guide = pytest.mark.parametrize(
-    "guide", [SplineGuide(), SplineGuide("quadratic"), RacingLineGuide()], ids=["cubic", "quadratic", "racing line"]
+    "guide",
+    [SplineGuide(), SplineGuide("quadratic"), RacingLineGuide()],
+    ids=["cubic", "quadratic", "racing line"],
 )
 Point = tuple[float, float]
 
 
-def inputs(left: list[Point], right: list[Point], steering: float = 0.0) -> tuple[Tensor, Tensor, Tensor]:
+def inputs(
+    left: list[Point], right: list[Point], steering: float = 0.0
+) -> tuple[Tensor, Tensor, Tensor]:
     """Arguments of `SplineGuide.steer` for one car."""
     cones = torch.zeros(1, 2, SLOTS, 2, dtype=torch.float64)
     for side, points in enumerate((left, right)):
         for slot, point in enumerate(sorted(points, key=lambda p: math.hypot(*p))):
             cones[0, side, slot] = torch.tensor(point, dtype=torch.float64)
-    return cones, torch.tensor([[len(left), len(right)]]), torch.full((1, 1), steering, dtype=torch.float64)
+    return (
+        cones,
+        torch.tensor([[len(left), len(right)]]),
+        torch.full((1, 1), steering, dtype=torch.float64),
+    )
 
 
 def advice(left: list[Point], right: list[Point], steering: float = 0.0, **kwargs) -> float:
     return SplineGuide(**kwargs).steer(*inputs(left, right, steering)).item()
 
 
-def roads(seed: int, cars: int, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor]:
+def roads(
+    seed: int, cars: int, dtype: torch.dtype = torch.float64
+) -> tuple[Tensor, Tensor, Tensor]:
     """Bends of random curvature from random poses, with zero to five cones a side."""
     draw = torch.Generator().manual_seed(seed)
 
@@ -40,7 +50,9 @@ def roads(seed: int, cars: int, dtype: torch.dtype = torch.float64) -> tuple[Ten
         return low + (high - low) * torch.rand(cars, *shape, dtype=torch.float64, generator=draw)
 
     along = torch.arange(SLOTS) * uniform(1, 2, 2, 1) + uniform(0.3, 1.5, 2, 1)
-    side = torch.tensor([1.2, -1.2], dtype=torch.float64).view(1, 2, 1) + uniform(-0.4, 0.4, 2, SLOTS)
+    side = torch.tensor([1.2, -1.2], dtype=torch.float64).view(1, 2, 1) + uniform(
+        -0.4, 0.4, 2, SLOTS
+    )
     y = side + uniform(-0.3, 0.3, 1, 1) * along**2 + uniform(-0.5, 0.5, 1, 1)
     cones = torch.stack([along, y], dim=-1)
     order = cones.square().sum(-1).argsort(dim=-1).unsqueeze(-1).expand_as(cones)
@@ -62,8 +74,16 @@ TWO_MIDPOINTS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])
     ("left", "right", "target"),
     [
         (*TWO_MIDPOINTS, (2, 0.5)),
-        ([(0.5, 1.0)], [(0.5, -1.0), (2.5, 0.0)], (1.5, 0.5)),  # midpoint (0.5, 0) is within 0.625 m
-        ([(0.5, 1.9)], [(0.0, -0.1), (2.0, -0.1)], (1.25, 0.9)),  # midpoint (0.25, 0.9) is at 74 degrees
+        (
+            [(0.5, 1.0)],
+            [(0.5, -1.0), (2.5, 0.0)],
+            (1.5, 0.5),
+        ),  # midpoint (0.5, 0) is within 0.625 m
+        (
+            [(0.5, 1.9)],
+            [(0.0, -0.1), (2.0, -0.1)],
+            (1.25, 0.9),
+        ),  # midpoint (0.25, 0.9) is at 74 degrees
     ],
     ids=["nearest", "reached", "to the side"],
 )
@@ -73,10 +93,14 @@ def test_advice_is_equation_103_of_the_nearest_eligible_target(left, right, targ
 
 
 def test_parameters_of_equation_103() -> None:
-    assert advice(*TWO_MIDPOINTS, sharpness=1) == pytest.approx(equation_103(2, 0.5, sharpness=1), abs=1e-12)
+    assert advice(*TWO_MIDPOINTS, sharpness=1) == pytest.approx(
+        equation_103(2, 0.5, sharpness=1), abs=1e-12
+    )
     assert advice(*TWO_MIDPOINTS, gain=0.5) == pytest.approx(equation_103(2, 0.5) / 2, abs=1e-12)
     assert advice([], [], steering=0.3, gain=0.5) == 0.3
-    assert advice(*TWO_MIDPOINTS, max_steering=40) == pytest.approx(advice(*TWO_MIDPOINTS), abs=1e-12)
+    assert advice(*TWO_MIDPOINTS, max_steering=40) == pytest.approx(
+        advice(*TWO_MIDPOINTS), abs=1e-12
+    )
 
 
 @both_splines
@@ -98,7 +122,9 @@ def test_pairs_are_less_than_four_metres_apart(spline: str) -> None:
     ],
     ids=["no cones", "left only", "right only", "one pair", "all reached", "all to the side"],
 )
-def test_without_a_target_steering_is_kept(left: list[Point], right: list[Point], spline: str) -> None:
+def test_without_a_target_steering_is_kept(
+    left: list[Point], right: list[Point], spline: str
+) -> None:
     for steering in (0.0, -0.7, 1.0):
         assert advice(left, right, steering, spline=spline) == steering
 
@@ -108,7 +134,9 @@ def test_advice_is_antisymmetric_and_independent_of_padding(guide: SplineGuide) 
     cones, count, steering = roads(7, cars=1000)
     action = guide.steer(cones, count, steering)
     mirrored = cones.flip(1) * torch.tensor([1.0, -1.0])
-    assert torch.allclose(guide.steer(mirrored, count.flip(1), -steering), -action, rtol=0, atol=1e-9)
+    assert torch.allclose(
+        guide.steer(mirrored, count.flip(1), -steering), -action, rtol=0, atol=1e-9
+    )
     padding = torch.arange(SLOTS) >= count.unsqueeze(-1)
     shuffled = torch.where(padding.unsqueeze(-1), cones.flip(2) - 3, cones)
     assert torch.equal(guide.steer(shuffled, count, steering), action)
@@ -131,7 +159,9 @@ def test_advice_is_batch_invariant(guide: SplineGuide, dtype: torch.dtype) -> No
     batch = roads(9, cars=1003, dtype=dtype)
     together = guide.steer(*batch)
     for car in range(0, 1003, 33):
-        assert torch.equal(guide.steer(*(value[car : car + 1] for value in batch)), together[car : car + 1])
+        assert torch.equal(
+            guide.steer(*(value[car : car + 1] for value in batch)), together[car : car + 1]
+        )
 
 
 coordinates = st.sampled_from([0.0, 1.0, 1.0 + 1e-7, -1.0, 2.0, 5.0]) | st.floats(-7, 7, width=32)
@@ -155,12 +185,29 @@ def test_advice_is_an_action_for_any_cones(
 @pytest.mark.parametrize(
     ("guide", "values"),
     [
-        (SplineGuide, {"spline": "linear", "smoothing": -1, "sharpness": math.nan, "max_steering": 0,
-                       "gain": math.inf}),
-        (RacingLineGuide, {"margin": -0.1, "turn": 0, "lookahead": math.inf, "spacing": 0, "car_length": math.nan,
-                           "max_steering": 100}),
+        (
+            SplineGuide,
+            {
+                "spline": "linear",
+                "smoothing": -1,
+                "sharpness": math.nan,
+                "max_steering": 0,
+                "gain": math.inf,
+            },
+        ),
+        (
+            RacingLineGuide,
+            {
+                "margin": -0.1,
+                "turn": 0,
+                "lookahead": math.inf,
+                "spacing": 0,
+                "car_length": math.nan,
+                "max_steering": 100,
+            },
+        ),
     ],
-)  # fmt: skip
+)
 def test_values_out_of_range_are_refused(guide: type, values: dict) -> None:
     for name, value in values.items():
         with pytest.raises(ValueError, match=f"{name}={value!r}"):

@@ -16,16 +16,27 @@ from coil_rl.transforms import GuideActions
 
 SIGHT = 7.03125
 AUTHORS: dict[str, Any] = {
-    "rate": 60.0, "spline": "quadratic", "cone_bonus": "every_sighting", "held_steps": 2, "sight": SIGHT,
-    "hold_boundary": True, "late_observation": True, "finish_in_sight": True,
-}  # fmt: skip
+    "rate": 60.0,
+    "spline": "quadratic",
+    "cone_bonus": "every_sighting",
+    "held_steps": 2,
+    "sight": SIGHT,
+    "hold_boundary": True,
+    "late_observation": True,
+    "finish_in_sight": True,
+}
 ODD = {"oddities": True, "sight": SIGHT, "gain": 80 / 120}
-both_guides = pytest.mark.parametrize(("world", "options"), [({}, {}), (AUTHORS, ODD)], ids=["default", "authors"])
-# Reward, lap time in s and smoothness of the authors' program with its guide (shared/tracks/README.md).
+both_guides = pytest.mark.parametrize(
+    ("world", "options"), [({}, {}), (AUTHORS, ODD)], ids=["default", "authors"]
+)
+# Reward, lap time in s and smoothness of the authors' program with its guide
+# (shared/tracks/README.md).
 RECORDED = [(835.4, 69.58, 0.088), (776.7, 63.55, 0.103), (536.1, 41.13, 0.107)]
 
 
-def guided(tracks: list[Track], cars: int, world: dict[str, Any], options: dict[str, Any]) -> TransformedEnv:
+def guided(
+    tracks: list[Track], cars: int, world: dict[str, Any], options: dict[str, Any]
+) -> TransformedEnv:
     env = ConeTrackEnv(tracks, cars, assignment="cyclic", **world)
     return TransformedEnv(env, GuideActions({"memory": SplineMemoryGuide(**options)})).eval()
 
@@ -42,7 +53,8 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
         for _ in range(steps):
             advice = state["guide_action"][:, 0, 0].numpy()
             expected = [
-                guide.act(car.pose.copy(), car.visible, car.steering) for guide, car in zip(guides, cars, strict=True)
+                guide.act(car.pose.copy(), car.visible, car.steering)
+                for guide, car in zip(guides, cars, strict=True)
             ]
             off += list(np.abs(advice - expected))
             # The noise is large enough to leave the path, not to crash.
@@ -53,7 +65,8 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
             state = env.step(state)
             assert not state["next", "done"].any()
             state = env.step_mdp(state)
-    # In single precision nearly coincident midpoints move a target by millimetres, and a choice may come a step later.
+    # In single precision nearly coincident midpoints move a target by millimetres, and a choice may
+    # come a step later.
     assert np.mean(np.array(off) < 1e-2) > 0.99
     counts = state["guide_state", "memory", "path_target_count"].flatten().tolist()
     assert counts == [len(guide.targets) for guide in guides]
@@ -61,14 +74,19 @@ def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, 
 
 
 @both_guides
-def test_guide_contract_holds(rings: list[Track], world: dict[str, Any], options: dict[str, Any]) -> None:
+def test_guide_contract_holds(
+    rings: list[Track], world: dict[str, Any], options: dict[str, Any]
+) -> None:
     env = ConeTrackEnv(rings, 5, **world)
     check_guide(SplineMemoryGuide(**options), env, steps=30)
 
 
 @both_guides
 def test_rows_that_need_nothing_may_be_computed_too(
-    rings: list[Track], world: dict[str, Any], options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+    rings: list[Track],
+    world: dict[str, Any],
+    options: dict[str, Any],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def drive() -> TensorDictBase:
         env = guided(rings, 5, world, options)
@@ -93,7 +111,9 @@ def test_guide_knows_its_way_from_motion_alone() -> None:
             state = env.step_mdp(env.step(state))
     x, y, turned = state["guide_state", "memory", "path_pose"].double().unbind(-1)
     cos, sin = start[:, 2].cos(), start[:, 2].sin()
-    place = torch.stack([start[:, 0] + cos * x - sin * y, start[:, 1] + sin * x + cos * y, start[:, 2] + turned], -1)
+    place = torch.stack(
+        [start[:, 0] + cos * x - sin * y, start[:, 1] + sin * x + cos * y, start[:, 2] + turned], -1
+    )
     assert torch.allclose(place, state["info", "pose"].double(), atol=1e-3)
 
 
@@ -127,7 +147,9 @@ def test_authors_preset_and_guide_earn_what_their_program_earns(levels: list[Tra
             state["action"] = state["guide_action"][:, 0]
             after = env.step(state)["next"]
             info = after["info"]
-            row = torch.cat([after["reward"], info["lap_time"], info["smoothness"], info["crashed"].float()], -1)
+            row = torch.cat(
+                [after["reward"], info["lap_time"], info["smoothness"], info["crashed"].float()], -1
+            )
             steps.append(row.masked_fill(over, torch.nan))
             over |= after["done"]
             state = env.step_mdp(state)

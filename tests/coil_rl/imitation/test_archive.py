@@ -20,7 +20,11 @@ from coil_rl.errors import UserError
 from coil_rl.imitation import archive
 
 X = np.random.default_rng(0).random((80, 4)).astype(np.float32)
-FORESTS = [RandomForestRegressor(3), ExtraTreesRegressor(3), GradientBoostingRegressor(n_estimators=3)]
+FORESTS = [
+    RandomForestRegressor(3),
+    ExtraTreesRegressor(3),
+    GradientBoostingRegressor(n_estimators=3),
+]
 
 
 def fitted(estimator):
@@ -30,7 +34,10 @@ def fitted(estimator):
 def forged(tree, change):
     """Return a copy of a tree whose state `change` has altered."""
     kind, (features, classes, outputs), state = tree.__reduce__()
-    state = {key: value.copy() if isinstance(value, np.ndarray) else value for key, value in state.items()}
+    state = {
+        key: value.copy() if isinstance(value, np.ndarray) else value
+        for key, value in state.items()
+    }
     change(state)
     copy = kind(features, classes, outputs)
     copy.__setstate__(state)
@@ -64,11 +71,15 @@ FORGED_TREES = {
 }
 
 
-@pytest.mark.parametrize("estimator", [DecisionTreeRegressor(), *FORESTS], ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize(
+    "estimator", [DecisionTreeRegressor(), *FORESTS], ids=lambda model: type(model).__name__
+)
 @pytest.mark.parametrize("forgery", FORGED_TREES)
 def test_forged_tree_is_refused(estimator, forgery):
     model, (change, message) = fitted(estimator), FORGED_TREES[forgery]
-    owner = model if isinstance(estimator, DecisionTreeRegressor) else np.ravel(model.estimators_)[1]
+    owner = (
+        model if isinstance(estimator, DecisionTreeRegressor) else np.ravel(model.estimators_)[1]
+    )
     owner.tree_ = forged(owner.tree_, change)
     with pytest.raises(UserError, match=message):
         archive.load(skops.io.dumps(model))
@@ -79,7 +90,10 @@ def test_forest_whose_trees_do_not_fit_is_refused(estimator):
     for change, message in (
         (lambda model: setattr(model, "estimators_", model.estimators_[:0]), "has no trees"),
         (lambda model: setattr(model, "n_features_in_", 2), "the trees of a forest differ"),
-        (lambda model: setattr(np.ravel(model.estimators_)[0], "n_features_in_", 9), "differ|other features"),
+        (
+            lambda model: setattr(np.ravel(model.estimators_)[0], "n_features_in_", 9),
+            "differ|other features",
+        ),
         (lambda model: vars(np.ravel(model.estimators_)[2]).pop("tree_"), "differ"),
     ):
         model = fitted(estimator)
@@ -97,12 +111,36 @@ def hist_node(name, value):
 
 
 FORGED = {
-    "child of a boosted tree": (HistGradientBoostingRegressor(max_iter=3), hist_node("left", 10**6), "form a tree"),
-    "cycle of a boosted tree": (HistGradientBoostingRegressor(max_iter=3), hist_node("right", 0), "form a tree"),
-    "feature of a boosted tree": (HistGradientBoostingRegressor(max_iter=3), hist_node("feature_idx", -1), "feature"),
-    "category": (HistGradientBoostingRegressor(max_iter=3), hist_node("is_categorical", 1), "cannot be checked"),
-    "support vectors": (SVR(), lambda model: setattr(model, "support_vectors_", np.zeros((9, 1))), "wrong shapes"),
-    "coefficients": (SVR(), lambda model: setattr(model, "_dual_coef_", np.zeros((1, 1))), "wrong shapes"),
+    "child of a boosted tree": (
+        HistGradientBoostingRegressor(max_iter=3),
+        hist_node("left", 10**6),
+        "form a tree",
+    ),
+    "cycle of a boosted tree": (
+        HistGradientBoostingRegressor(max_iter=3),
+        hist_node("right", 0),
+        "form a tree",
+    ),
+    "feature of a boosted tree": (
+        HistGradientBoostingRegressor(max_iter=3),
+        hist_node("feature_idx", -1),
+        "feature",
+    ),
+    "category": (
+        HistGradientBoostingRegressor(max_iter=3),
+        hist_node("is_categorical", 1),
+        "cannot be checked",
+    ),
+    "support vectors": (
+        SVR(),
+        lambda model: setattr(model, "support_vectors_", np.zeros((9, 1))),
+        "wrong shapes",
+    ),
+    "coefficients": (
+        SVR(),
+        lambda model: setattr(model, "_dual_coef_", np.zeros((1, 1))),
+        "wrong shapes",
+    ),
     "kind of machine": (SVR(), lambda model: setattr(model, "_impl", "c_svc"), "wrong shapes"),
 }
 

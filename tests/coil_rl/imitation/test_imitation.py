@@ -44,7 +44,9 @@ def batches(env):
     """Two batches of random driving with crashes and resets, with all entries that a guide may read."""
     torch.manual_seed(1)
     rollout = Rollout(
-        env, TensorDictModule(lambda x: torch.rand_like(x[..., :1]) - 0.5, ["observation"], ["action"]), 60
+        env,
+        TensorDictModule(lambda x: torch.rand_like(x[..., :1]) - 0.5, ["observation"], ["action"]),
+        60,
     )
     return rollout.collect(), rollout.collect()
 
@@ -56,7 +58,9 @@ def test_samples_are_the_actions_of_the_guide_in_the_same_states(env, batches):
     expected = guide(batch.select(*guide.in_keys).reshape(-1).clone())["action"]
     torch.testing.assert_close(learner.dataset["action"], expected)
     assert torch.equal(learner.dataset["observation"], batch["observation"].flatten(0, 1))
-    assert torch.equal(learner.dataset["info", "track"], torch.arange(7).repeat_interleave(60).unsqueeze(-1))
+    assert torch.equal(
+        learner.dataset["info", "track"], torch.arange(7).repeat_interleave(60).unsqueeze(-1)
+    )
 
 
 def test_any_row_of_the_advice_can_be_imitated():
@@ -78,7 +82,9 @@ def test_linear_guide_is_recovered():
     assert metrics.keys() >= {"samples", "target_variance", "mse_ahead", "r2_ahead", "r2_by_track"}
     assert all(math.isfinite(value) for value in metrics.values())
     fresh = env.rollout(20, break_when_any_done=False)
-    torch.testing.assert_close(learner.policy(fresh.clone())["action"], fresh["guide_action"][..., 0, :])
+    torch.testing.assert_close(
+        learner.policy(fresh.clone())["action"], fresh["guide_action"][..., 0, :]
+    )
 
 
 def test_data_set_grows_with_every_batch_and_can_come_from_another_run(env, batches, tmp_path):
@@ -89,7 +95,9 @@ def test_data_set_grows_with_every_batch_and_can_come_from_another_run(env, batc
     assert (other.dataset == learner.dataset).all()
     assert learner.update(batches[1])["samples"] == other.update(batches[1])["samples"] == 840
     both.update(torch.cat(batches, 1))
-    first, second, third = (each.policy(batches[0].clone())["action"] for each in (learner, other, both))
+    first, second, third = (
+        each.policy(batches[0].clone())["action"] for each in (learner, other, both)
+    )
     assert torch.equal(first, second)
     torch.testing.assert_close(first, third)
 
@@ -118,8 +126,12 @@ class Points(EnvBase):
 
     def __init__(self):
         super().__init__(batch_size=[2, 3])
-        self.observation_spec = Composite(place=Unbounded((2, 3, 2)), wind=Unbounded((2, 3)), shape=(2, 3))
-        self.action_spec = Bounded(torch.tensor([-1.0, 1.0]), torch.tensor([1.0, 3.0])).expand(2, 3, 2)
+        self.observation_spec = Composite(
+            place=Unbounded((2, 3, 2)), wind=Unbounded((2, 3)), shape=(2, 3)
+        )
+        self.action_spec = Bounded(torch.tensor([-1.0, 1.0]), torch.tensor([1.0, 3.0])).expand(
+            2, 3, 2
+        )
         self.reward_spec = Unbounded((2, 3, 1))
         self.generator = torch.Generator().manual_seed(0)
 
@@ -131,7 +143,13 @@ class Points(EnvBase):
         place = tensordict["place"] + 0.1 * tensordict["action"]
         done = torch.zeros(2, 3, 1, dtype=torch.bool)
         return TensorDict(
-            {"place": place, "wind": place.sum(-1), "reward": -place.norm(dim=-1, keepdim=True), "done": done}, [2, 3]
+            {
+                "place": place,
+                "wind": place.sum(-1),
+                "reward": -place.norm(dim=-1, keepdim=True),
+                "done": done,
+            },
+            [2, 3],
         )
 
     def _set_seed(self, seed):
@@ -141,7 +159,9 @@ class Points(EnvBase):
 @pytest.mark.parametrize("name", REGRESSORS)
 def test_two_dimensional_actions_and_batches(name):
     def linear(place, wind):
-        return 0.1 * (wind.unsqueeze(-1) - place) + torch.tensor([0.0, 2.0])  # within the bounds of the action
+        return 0.1 * (wind.unsqueeze(-1) - place) + torch.tensor(
+            [0.0, 2.0]
+        )  # within the bounds of the action
 
     pull = TensorDictModule(linear, ["place", "wind"], ["action"])
     env = TransformedEnv(Points(), GuideActions({"pull": pull}))
@@ -171,7 +191,10 @@ def test_discrete_actions_are_learned_from_one_hot_advice(categorical):
     learner.update(data)
     expected = data["guide_action"][..., 0, :]
     assert 0 < expected[..., 0].mean() < 1
-    assert torch.equal(learner.policy(data.clone())["action"], expected.argmax(-1) if categorical else expected.long())
+    assert torch.equal(
+        learner.policy(data.clone())["action"],
+        expected.argmax(-1) if categorical else expected.long(),
+    )
     assert env.action_spec.is_in(learner.policy(env.reset())["action"])
 
 
@@ -180,13 +203,20 @@ def test_unusable_data_sets_envs_and_values_are_refused(env, tmp_path):
     with pytest.raises(UserError, match=r"there is no data set .*dataset\.pt"):
         Imitation(env, **linear(dataset=file))
     checkpoint.save({"observation": torch.zeros(5, 3), "action": torch.zeros(5, 1)}, file)
-    with pytest.raises(UserError, match=r"of another env: observation is \[3\], but must be \[20\]"):
+    with pytest.raises(
+        UserError, match=r"of another env: observation is \[3\], but must be \[20\]"
+    ):
         Imitation(env, **linear(dataset=file))
     file.write_bytes(file.read_bytes()[:-1])
     with pytest.raises(UserError, match=r"dataset\.pt is damaged"):
         Imitation(env, **linear(dataset=file))
-    with pytest.raises(KeyError, match=r"no entry guide_action; it has observation, .*GuideActions"):
+    with pytest.raises(
+        KeyError, match=r"no entry guide_action; it has observation, .*GuideActions"
+    ):
         Imitation(ConeTrackEnv(shipped_tracks("test"), 2), **linear())
-    for option, value, message in (("guide", 1, "at least 0 and less than 1"), ("seed", -1, "at least 0")):
+    for option, value, message in (
+        ("guide", 1, "at least 0 and less than 1"),
+        ("seed", -1, "at least 0"),
+    ):
         with pytest.raises(ValueError, match=f"{option}={value} must be {message}"):
             Imitation(env, **linear(**{option: value}))

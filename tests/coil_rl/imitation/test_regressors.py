@@ -29,7 +29,12 @@ def scaled_data():
 
 
 def fitted_network(**changes):
-    options = {"hidden": (16,), "epochs": 80, "minibatch": 64, "learning_rate": Linear(1e-2, 0)} | changes
+    options = {
+        "hidden": (16,),
+        "epochs": 80,
+        "minibatch": 64,
+        "learning_rate": Linear(1e-2, 0),
+    } | changes
     network = NetworkRegressor(**options).fresh(3, 2)
     network.fit(*scaled_data())
     return network
@@ -96,7 +101,9 @@ def test_restored_regressor_and_equal_fit_predict_the_same(estimator, tmp_path):
 @pytest.mark.parametrize("forest", [RandomForestRegressor, ExtraTreesRegressor])
 def test_fast_prediction_of_a_forest_equals_that_of_scikit_learn(forest, outputs, monkeypatch):
     regressor = fitted(forest(8, n_jobs=2), outputs)
-    assert (regressor.estimator.n_jobs, regressor.model.n_jobs) == (2, 1), "threads are for the fit only"
+    assert (regressor.estimator.n_jobs, regressor.model.n_jobs) == (2, 1), (
+        "threads are for the fit only"
+    )
     x = torch.randn(300, 4, generator=torch.Generator().manual_seed(1))
     expected = torch.from_numpy(regressor.model.predict(x.numpy())).float().reshape(300, outputs)
     monkeypatch.setattr(forest, "predict", None)
@@ -117,14 +124,23 @@ def test_states_that_could_run_code_or_do_not_fit_are_refused():
     for content, message in (
         (skops.io.dumps(UNSAFE), r"torch\.from_numpy could run code"),
         (b"no archive", "is not a regressor of scikit-learn .BadZipFile"),
-        (skops.io.dumps(fitted(LinearRegression()).model), "a regressor of 4 inputs, but there are 6 here"),
+        (
+            skops.io.dumps(fitted(LinearRegression()).model),
+            "a regressor of 4 inputs, but there are 6 here",
+        ),
     ):
         with pytest.raises(UserError, match=message):
             regressor.set_extra_state(torch.frombuffer(bytearray(content), dtype=torch.uint8))
 
 
 def test_unusable_estimators_and_values_out_of_range_are_refused_before_the_fit():
-    for name, value in (("hidden", (0,)), ("epochs", 0), ("minibatch", 0), ("learning_rate", 0), ("seed", -1)):
+    for name, value in (
+        ("hidden", (0,)),
+        ("epochs", 0),
+        ("minibatch", 0),
+        ("learning_rate", 0),
+        ("seed", -1),
+    ):
         with pytest.raises(ValueError, match=f"{name}=.* must be"):
             NetworkRegressor(**{name: value})
     for estimator in (KMeans(), LinearRegression):

@@ -12,7 +12,11 @@ from coil_rl.imitation import SklearnRegressor
 from coil_rl.imitation.validation import cross_validate, group_splits
 
 
-@given(st.lists(st.integers(0, 30), min_size=2, max_size=80).filter(lambda groups: len(set(groups)) > 1))
+@given(
+    st.lists(st.integers(0, 30), min_size=2, max_size=80).filter(
+        lambda groups: len(set(groups)) > 1
+    )
+)
 def test_no_track_is_on_both_sides_and_every_sample_is_tested_once(groups):
     groups = torch.tensor(groups)
     splits = group_splits(groups)
@@ -32,7 +36,9 @@ def sines(rows=90):
 
 def test_error_on_left_out_tracks_equals_that_of_scikit_learn_for_every_seed():
     x, y, groups = sines()
-    metrics, other = (cross_validate(SklearnRegressor(LinearRegression()), x, y, groups, seed=k) for k in (0, 1))
+    metrics, other = (
+        cross_validate(SklearnRegressor(LinearRegression()), x, y, groups, seed=k) for k in (0, 1)
+    )
     assert metrics["mse_by_track"] == other["mse_by_track"]
     assert metrics["mse_random_split"] != other["mse_random_split"]
     predicted = cross_val_predict(LinearRegression(), x, y, groups=groups, cv=LeaveOneGroupOut())
@@ -42,7 +48,10 @@ def test_error_on_left_out_tracks_equals_that_of_scikit_learn_for_every_seed():
 
 def test_without_tracks_there_is_a_random_split_only():
     x, y, groups = sines()
-    assert set(cross_validate(SklearnRegressor(LinearRegression()), x, y)) == {"mse_random_split", "r2_random_split"}
+    assert set(cross_validate(SklearnRegressor(LinearRegression()), x, y)) == {
+        "mse_random_split",
+        "r2_random_split",
+    }
     with pytest.raises(UserError, match="from one track"):
         cross_validate(SklearnRegressor(LinearRegression()), x, y, torch.zeros_like(groups))
     with pytest.raises(UserError, match="9 samples are too few"):

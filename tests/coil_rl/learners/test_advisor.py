@@ -29,7 +29,9 @@ def distance(advisor, minibatch, categorical):
     distribution = advisor.imitator.get_dist(minibatch.select("observation"))
     if categorical:
         return -distribution.log_prob(minibatch["guide_action"][:, 0].argmax(-1))
-    return (minibatch["guide_action"][:, 0] - distribution.deterministic_sample).abs().squeeze(-1)  # bounds -1 and 1
+    return (
+        (minibatch["guide_action"][:, 0] - distribution.deterministic_sample).abs().squeeze(-1)
+    )  # bounds -1 and 1
 
 
 @pytest.mark.parametrize("world", ["cones", "carts"])
@@ -41,8 +43,10 @@ def test_each_step_is_weighted_by_how_well_the_guide_can_be_imitated(world):
         weight = (-2.0 * distance(advisor, data, world == "carts")).exp()
         assert weight.std() > 0.01
         imitation = KickstartLoss()
-        ratio = (advisor.policy.get_dist(data.select("observation")).log_prob(data["action"])
-                 - data["action_log_prob"]).exp()  # fmt: skip
+        ratio = (
+            advisor.policy.get_dist(data.select("observation")).log_prob(data["action"])
+            - data["action_log_prob"]
+        ).exp()
         advantage = standardise(data["advantage"]).squeeze(-1)
         gain = torch.minimum(ratio * advantage, ratio.clamp(0.8, 1.2) * advantage)
         expected = (weight * imitation.each(advisor.policy, data) - (1 - weight) * gain).mean()
@@ -56,7 +60,9 @@ def test_steps_that_nobody_can_imitate_are_learned_as_ppo_does():
     data = minibatch_of(advisor, rollout)
     with torch.no_grad():
         losses, plain = advisor.losses(data.clone()), PPO.losses(advisor, data.clone())
-    torch.testing.assert_close(losses["loss_objective"] - losses["loss_imitation"], plain["loss_objective"])
+    torch.testing.assert_close(
+        losses["loss_objective"] - losses["loss_imitation"], plain["loss_objective"]
+    )
     assert losses["weight"] < 1e-3
 
 
@@ -71,7 +77,9 @@ def test_imitator_learns_from_the_guide_alone_and_tells_what_it_can_predict():
         advisor.gradient.minimise(advisor.losses(data.clone())["loss_imitation"])
     close = distance(advisor, data, categorical=False)
     assert close[known].mean() < 0.2 < 0.5 < close[~known].mean()
-    assert all(torch.equal(value, before[key]) for key, value in advisor.critic.state_dict().items())
+    assert all(
+        torch.equal(value, before[key]) for key, value in advisor.critic.state_dict().items()
+    )
 
 
 @pytest.mark.parametrize("options", [{}, {"normalise": True}, {"squash": False}])

@@ -50,7 +50,14 @@ ACTIONS = {
 
 
 def learner(env, kind=PPO, minibatches=2, options=None, **anchor):
-    return kind(env, KEYS, action_gain=0.0, minibatches=minibatches, anchor=Anchor(**anchor), **(options or {}))
+    return kind(
+        env,
+        KEYS,
+        action_gain=0.0,
+        minibatches=minibatches,
+        anchor=Anchor(**anchor),
+        **(options or {}),
+    )
 
 
 def acted(policy, data):
@@ -65,7 +72,10 @@ def test_first_policy_is_the_guide(name):
     data = env.reset()
     expected = guide(data["observation"])
     if isinstance(action, Bounded):  # tanh reaches no bound
-        middle, half = (action.space.low + action.space.high) / 2, (action.space.high - action.space.low) / 2
+        middle, half = (
+            (action.space.low + action.space.high) / 2,
+            (action.space.high - action.space.low) / 2,
+        )
         expected = middle + half * ((expected - middle) / half).clamp(-0.97, 0.97)
     torch.testing.assert_close(acted(learner(env).policy, data), expected)
 
@@ -119,13 +129,19 @@ def test_sac_starts_at_the_guide_and_its_policy_waits_for_the_critics():
     assert torch.equal(sampled, torch.zeros(1)), "the loss has the same weight"
 
 
-@pytest.mark.parametrize(("weight", "advised_acts"), [(1.0, True), (0.6, True), (0.4, False), (0.0, False)])
+@pytest.mark.parametrize(
+    ("weight", "advised_acts"), [(1.0, True), (0.6, True), (0.4, False), (0.0, False)]
+)
 def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_than_the_weighted_range(
     weight, advised_acts
 ):
-    env = advised(OneHot(3), lambda observation: F.one_hot(torch.ones_like(observation[..., 0]).long(), 3))
+    env = advised(
+        OneHot(3), lambda observation: F.one_hot(torch.ones_like(observation[..., 0]).long(), 3)
+    )
     dqn = DQN(env, KEYS, action_gain=0.0, anchor=Anchor(), **REPLAY)
-    assert acted(dqn.policy, env.reset()).argmax(-1).eq(1).all(), "without any knowledge of the values"
+    assert acted(dqn.policy, env.reset()).argmax(-1).eq(1).all(), (
+        "without any knowledge of the values"
+    )
     values = dqn.policy.module[1]
     dqn.anchor.head.weight.fill_(weight)
     numbers = torch.tensor([[4.0, 2.0, 0.0]])
@@ -151,7 +167,9 @@ def anchor():
 
 
 def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(anchor):
-    anchor.begin(first_look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]), anchor.head)
+    anchor.begin(
+        first_look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]), anchor.head
+    )
     assert anchor.holds
     assert anchor.head.weight.tolist() == [0, 1]
     assert anchor.best.tolist() == [9, 10, 12]
@@ -198,13 +216,17 @@ def begun(anchor, weight=1.0):
     return anchor
 
 
-def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_the_tolerance_of_its_steps(anchor):
+def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_the_tolerance_of_its_steps(
+    anchor,
+):
     assert torch.stack(begun(anchor).tried()).tolist() == [[1, 0], pytest.approx([0.7, 0])]
     assert not anchor.decide(look([100.0, 100, 100], [94.5, 94, 94]), anchor.head)
     assert anchor.weight == pytest.approx(0.95)
     assert not anchor.decide(look([100.0, 100, 100], [93.5, 93.5, 93.5]), anchor.head)
     assert anchor.weight == pytest.approx(0.95), "the lower one loses too much"
-    assert not anchor.decide(look([100.0, 100, 100], [100.0, 100, 100], failures=(0, 1)), anchor.head)
+    assert not anchor.decide(
+        look([100.0, 100, 100], [100.0, 100, 100], failures=(0, 1)), anchor.head
+    )
     assert anchor.weight == pytest.approx(0.95), "the lower one fails"
 
 
@@ -219,7 +241,9 @@ def test_weight_falls_by_the_margin_if_the_lower_one_is_much_better_than_all_bef
 def test_policy_goes_back_to_the_best_look_after_a_failure_or_a_loss(kind):
     torch.manual_seed(0)
     action = OneHot(3) if kind is DQN else Bounded(-1, 1, (2,))
-    guide = (lambda observation: F.one_hot(option(3)(observation), 3)) if kind is DQN else two_numbers
+    guide = (
+        (lambda observation: F.one_hot(option(3)(observation), 3)) if kind is DQN else two_numbers
+    )
     trained = kind(advised(action, guide), KEYS, action_gain=0.0, anchor=Anchor())
     anchor, policy, good = begun(trained.anchor, 0.5), trained.policy, [100.0, 100, 100]
     for bad in (look(good, good, failures=(1, 0)), look([96.5, 96.5, 96.5], good)):

@@ -6,7 +6,15 @@ from any_env import FLOAT64, AnyEnv
 from tensordict import TensorDict
 from torch.distributions import Bernoulli, Normal
 from torch.distributions import Categorical as Choice
-from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, MultiOneHot, OneHot, Unbounded
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    Unbounded,
+)
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Reinforce
@@ -26,7 +34,7 @@ ACTIONS = {
     "one_hot": OneHot(3),
     "multi_categorical": MultiCategorical([2, 4, 3]),
     "binary": Binary(3),
-}  # fmt: skip
+}
 ON_POLICY = [PPO, A2C, Reinforce, TRPO]
 
 
@@ -79,18 +87,28 @@ def test_log_probability_is_that_of_pytorch(name, squash):
             expected = expected - (half * (1 - raw.tanh().square())).log()
         expected = expected.reshape(64, -1).sum(-1)
     elif name == "binary":
-        expected = Bernoulli(logits=data["logits"][..., 1] - data["logits"][..., 0]).log_prob(action.float()).sum(-1)
+        expected = (
+            Bernoulli(logits=data["logits"][..., 1] - data["logits"][..., 0])
+            .log_prob(action.float())
+            .sum(-1)
+        )
     elif name == "one_hot":
         expected = Choice(logits=data["logits"]).log_prob(action.long().argmax(-1))
     elif name == "multi_categorical":
         parts = [data["logits"][:, index, :n] for index, n in enumerate((2, 4, 3))]
-        expected = sum(Choice(logits=part).log_prob(action[:, index]) for index, part in enumerate(parts))
+        expected = sum(
+            Choice(logits=part).log_prob(action[:, index]) for index, part in enumerate(parts)
+        )
     else:
         expected = Choice(logits=data["logits"]).log_prob(action).reshape(64)
-    torch.testing.assert_close(data["action_log_prob"], expected.to(data["action_log_prob"]), rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(
+        data["action_log_prob"], expected.to(data["action_log_prob"]), rtol=1e-3, atol=1e-3
+    )
 
 
-@pytest.mark.parametrize("name", ["matrix", "float64", "multi_categorical", "categorical_column", "binary"])
+@pytest.mark.parametrize(
+    "name", ["matrix", "float64", "multi_categorical", "categorical_column", "binary"]
+)
 def test_deterministic_action_is_the_mode_after_ppo_has_learned_the_best_action(name):
     torch.manual_seed(0)
     env = env_with(name, 64)
@@ -122,14 +140,26 @@ def test_dqn_updates_with_one_discrete_action(name):
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: PPO(AnyEnv(action=MultiOneHot([2, 3]))), "the action of this env is MultiOneHot .* transform it"),
-        (lambda: PPO(AnyEnv(action=Unbounded((2,), dtype=torch.long))), "the action of this env is Unbounded.*int64"),
+        (
+            lambda: PPO(AnyEnv(action=MultiOneHot([2, 3]))),
+            "the action of this env is MultiOneHot .* transform it",
+        ),
+        (
+            lambda: PPO(AnyEnv(action=Unbounded((2,), dtype=torch.long))),
+            "the action of this env is Unbounded.*int64",
+        ),
         (lambda: DQN(env_with("multi_categorical")), "DQN needs one discrete action, .* use PPO"),
         (lambda: DQN(env_with("binary")), "DQN needs one discrete action, .* use PPO"),
         (lambda: DQN(env_with("bounded")), "DQN needs discrete actions"),
         (lambda: SAC(env_with("multi_categorical")), "SAC needs continuous actions"),
-        (lambda: SAC(AnyEnv(agents=True)), r"SAC needs one entry action .* RenameTransform, or use PPO"),
-        (lambda: PPO(AnyEnv(), ["sight"]), "the env has no entry sight to observe; it has observation"),
+        (
+            lambda: SAC(AnyEnv(agents=True)),
+            r"SAC needs one entry action .* RenameTransform, or use PPO",
+        ),
+        (
+            lambda: PPO(AnyEnv(), ["sight"]),
+            "the env has no entry sight to observe; it has observation",
+        ),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_sentence(make, message):
@@ -158,14 +188,18 @@ def test_entries_of_all_kinds_are_read():
     read = concat(*(data[key] for key in learner.policy.in_keys))
     assert read.dtype == torch.float32
     assert torch.equal(read[:, 7:12], torch.nn.functional.one_hot(data["place"], 5).float())
-    assert torch.equal(read[:, 12:14], torch.nn.functional.one_hot(data["switches"][:, 0], 2).float())
+    assert torch.equal(
+        read[:, 12:14], torch.nn.functional.one_hot(data["switches"][:, 0], 2).float()
+    )
     assert torch.equal(read[:, -12:], data["image"].flatten(1) / 255)
     trained(learner, env)
 
 
 def test_ppo_trains_the_joint_action_of_several_agents_for_the_sum_of_their_rewards():
     torch.manual_seed(0)
-    env = AnyEnv(64, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True)
+    env = AnyEnv(
+        64, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True
+    )
     check_env_specs(env)
     learner = PPO(env, [("agents", "observation")], learning_rate=1e-2, minibatches=4)
     trained(learner, env, updates=15)

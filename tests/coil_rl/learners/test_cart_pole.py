@@ -17,7 +17,13 @@ from coil_rl.train.rollout import Rollout
     [
         (PPO, 16, 64, 200_000, {"minibatches": 8}),
         (TRPO, 32, 64, 200_000, {"learning_rate": 1e-3, "max_kl": 0.01}),
-        (A2C, 16, 16, 300_000, {"learning_rate": Linear(3e-3, 0.0), "gae_lambda": 0.8, "minibatches": 1}),
+        (
+            A2C,
+            16,
+            16,
+            300_000,
+            {"learning_rate": Linear(3e-3, 0.0), "gae_lambda": 0.8, "minibatches": 1},
+        ),
         (Reinforce, 32, 128, 500_000, {"learning_rate": Linear(1e-2, 0.0), "minibatches": 1}),
     ],
 )

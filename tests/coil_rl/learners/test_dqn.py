@@ -58,7 +58,9 @@ def test_epsilon_follows_its_schedule():
         with torch.no_grad():
             best = dqn.network(batch.select("observation"))["action"]
         shares.append(float((batch["action"] != best).float().mean()))
-        assert dqn.update(batch, progress)["epsilon"] == pytest.approx(1.0 if progress == 0 else 0.2)
+        assert dqn.update(batch, progress)["epsilon"] == pytest.approx(
+            1.0 if progress == 0 else 0.2
+        )
     assert shares == pytest.approx([0.5, 0.5, 0.1], abs=0.02)
 
 
@@ -73,9 +75,18 @@ def test_epsilon_follows_its_schedule():
 )
 def test_dqn_finds_the_optimal_policy_of_a_table(mdp, key):
     optimal = torch.as_tensor(value_iteration(mdp).policy)
-    guide = TensorDictModule(lambda state: optimal[state.argmax(-1)], in_keys=["observation"], out_keys=["action"])
+    guide = TensorDictModule(
+        lambda state: optimal[state.argmax(-1)], in_keys=["observation"], out_keys=["action"]
+    )
     env = TransformedEnv(table(mdp, max_steps=1_000), GuideActions({"optimal": guide}))
-    options = {"gamma": mdp.gamma, "ratio": 4, "batch_size": 64, "learning_rate": 1e-2, "tau": 0.1, "epsilon": 1.0}
+    options = {
+        "gamma": mdp.gamma,
+        "ratio": 4,
+        "batch_size": 64,
+        "learning_rate": 1e-2,
+        "tau": 0.1,
+        "epsilon": 1.0,
+    }
     dqn, rollout = make(env, in_keys=[key], **options)
     for _ in range(25):
         dqn.update(rollout.collect())

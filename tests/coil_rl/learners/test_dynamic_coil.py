@@ -15,7 +15,9 @@ AGENT = (True, ())
 
 
 def schedule(guides=3, **options):
-    return PhaseSchedule(guides, agent_phase=AfterFrames(20), guide_phase=AfterFrames(10), **options)
+    return PhaseSchedule(
+        guides, agent_phase=AfterFrames(20), guide_phase=AfterFrames(10), **options
+    )
 
 
 def phases(schedule, updates, frames=10):
@@ -28,16 +30,42 @@ def phases(schedule, updates, frames=10):
 
 
 def test_agent_and_guides_alternate_and_the_ith_guide_phase_is_of_guide_i_mod_n():
-    assert phases(schedule(), 8) == [AGENT, AGENT, (False, (0,)), AGENT, AGENT, (False, (1,)), AGENT, AGENT]
-    assert [guides[0] for agent, guides in phases(schedule(), 24) if not agent] == [0, 1, 2, 0, 1, 2, 0, 1]
+    assert phases(schedule(), 8) == [
+        AGENT,
+        AGENT,
+        (False, (0,)),
+        AGENT,
+        AGENT,
+        (False, (1,)),
+        AGENT,
+        AGENT,
+    ]
+    assert [guides[0] for agent, guides in phases(schedule(), 24) if not agent] == [
+        0,
+        1,
+        2,
+        0,
+        1,
+        2,
+        0,
+        1,
+    ]
     assert set(phases(schedule(2, order="joint"), 9)) == {(True, (0, 1))}
     assert set(phases(schedule(2, order="agent"), 9)) == {AGENT}
-    assert phases(schedule(2, order="guide"), 4) == [(False, (0,)), (False, (1,)), (False, (0,)), (False, (1,))]
+    assert phases(schedule(2, order="guide"), 4) == [
+        (False, (0,)),
+        (False, (1,)),
+        (False, (0,)),
+        (False, (1,)),
+    ]
 
 
 def test_stochastic_choice_is_uniform_and_follows_from_the_seed():
     def guides(seed):
-        return [guides[0] for _, guides in phases(schedule(order="guide", choice="stochastic", seed=seed), 300)]
+        return [
+            guides[0]
+            for _, guides in phases(schedule(order="guide", choice="stochastic", seed=seed), 300)
+        ]
 
     assert guides(1) == guides(1) != guides(2)
     assert all(70 < guides(1).count(guide) < 130 for guide in range(3))
@@ -59,7 +87,13 @@ def test_convergence_is_several_evaluations_without_improvement_within_a_phase()
     assert not stop(100, [])
     assert AtConvergence(evaluations=5, frames=100)(100, [1.0])
     order = PhaseSchedule(1, agent_phase=AtConvergence(1), guide_phase=AtConvergence(1))
-    assert [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)] == [False, False, True, False, True]
+    assert [order.advance(1, reward) for reward in (1, 2, 1.5, 1, 0.5)] == [
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]
 
 
 def cars():
@@ -76,10 +110,19 @@ def make(env, guides=("left", "right"), frames=512, seed=0, **options):
     stop = AfterFrames(frames)
     phases = partial(PhaseSchedule, agent_phase=stop, guide_phase=stop, **options.pop("phases", {}))
     return DynamicCoil(
-        env, guides={name: guide(env) for name in guides}, phases=phases,
-        **{"minibatches": 4, "epochs": 2, "hidden": [16], "action_gain": 1.0, "learning_rate": 1e-3,
-           "guide_learning_rate": 1e-3} | options,
-    )  # fmt: skip
+        env,
+        guides={name: guide(env) for name in guides},
+        phases=phases,
+        **{
+            "minibatches": 4,
+            "epochs": 2,
+            "hidden": [16],
+            "action_gain": 1.0,
+            "learning_rate": 1e-3,
+            "guide_learning_rate": 1e-3,
+        }
+        | options,
+    )
 
 
 def weights(learner):
@@ -104,7 +147,11 @@ def updates(learner, env, count):
 
 def test_each_phase_changes_its_networks_only_with_a_smaller_learning_rate_than_the_last_of_its_kind():
     result = updates(make(env := cars(), shrink=0.5, epochs=1), env, 4)
-    agent_phase, first, second = [True, True, False, False], [False, True, True, False], [False, True, False, True]
+    agent_phase, first, second = (
+        [True, True, False, False],
+        [False, True, True, False],
+        [False, True, False, True],
+    )
     assert [groups for groups, _ in result] == [agent_phase, first, agent_phase, second]
     assert [metrics["guide"] for _, metrics in result] == [-1, 0, -1, 1]
     assert [metrics["guides_changed"] for _, metrics in result] == [0, 1, 0, 1]
@@ -135,10 +182,14 @@ def test_dynamic_coil_with_frozen_guides_is_coil():
     learner = make(env, phases={"order": "agent"})
     batch = Rollout(env, learner.policy, 8).collect()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        advice = torch.stack([guide(batch.select("observation"))["action"] for guide in learner.guides.values()], 2)
+        advice = torch.stack(
+            [guide(batch.select("observation"))["action"] for guide in learner.guides.values()], 2
+        )
         torch.testing.assert_close(batch["guide_action"], advice)
         observed = batch.select("observation").set("guide_action", advice)
-        assert torch.equal(learner.policy(batch.select("observation"))["loc"], learner.policy[1](observed)["loc"])
+        assert torch.equal(
+            learner.policy(batch.select("observation"))["loc"], learner.policy[1](observed)["loc"]
+        )
 
 
 def test_state_resumes_in_the_middle_of_a_phase():
@@ -157,7 +208,14 @@ def test_state_resumes_in_the_middle_of_a_phase():
 def test_guide_learns_to_steer_through_a_frozen_agent():
     """Steering left is rewarded. The guide can change it only through its advice to the agent."""
     env = cars()
-    learner = make(env, guides=("only",), phases={"order": "guide"}, gamma=0.0, epochs=8, guide_learning_rate=3e-3)
+    learner = make(
+        env,
+        guides=("only",),
+        phases={"order": "guide"},
+        gamma=0.0,
+        epochs=8,
+        guide_learning_rate=3e-3,
+    )
     rollout = Rollout(env, learner.policy, 32, [*learner.keys])
     observed = rollout.collect().select("observation")
 

@@ -18,7 +18,11 @@ def linears(module):
 
 
 def images(*shape, dtype=torch.uint8, action=None):
-    image = Bounded(0, 255, shape, dtype=dtype) if dtype == torch.uint8 else Unbounded(shape, dtype=dtype)
+    image = (
+        Bounded(0, 255, shape, dtype=dtype)
+        if dtype == torch.uint8
+        else Unbounded(shape, dtype=dtype)
+    )
     return AnyEnv(4, action, {"image": image, "speed": Unbounded((2,))})
 
 
@@ -77,11 +81,23 @@ def test_image_is_read_the_same_with_channels_first_and_last_in_bytes_and_fracti
     [
         (lambda: Mlp([0]), "hidden=0 must be at least 1"),
         (lambda: Mlp(activation="sigmoid"), "activation='sigmoid' must be one of tanh, relu"),
-        (lambda: Cnn(channels=[1], kernels=[3], strides=[]), "must have one number for each convolution"),
-        (lambda: Cnn(channels=[], kernels=[], strides=[]), "must have one number for each convolution"),
+        (
+            lambda: Cnn(channels=[1], kernels=[3], strides=[]),
+            "must have one number for each convolution",
+        ),
+        (
+            lambda: Cnn(channels=[], kernels=[], strides=[]),
+            "must have one number for each convolution",
+        ),
         (lambda: Cnn(channels=[4], kernels=[0], strides=[1]), "kernels=0 must be at least 1"),
-        (lambda: PPO(AnyEnv(), network=Cnn()), "needs an image among observation.* use network=mlp"),
-        (lambda: PPO(images(7, 7, 3), ["image"], network=Cnn()), r"the image image of shape \[7, 7, 3\] is too small"),
+        (
+            lambda: PPO(AnyEnv(), network=Cnn()),
+            "needs an image among observation.* use network=mlp",
+        ),
+        (
+            lambda: PPO(images(7, 7, 3), ["image"], network=Cnn()),
+            r"the image image of shape \[7, 7, 3\] is too small",
+        ),
     ],
 )
 def test_networks_that_cannot_be_built_are_refused_in_one_sentence(make, message):

@@ -31,7 +31,9 @@ def log_probability(learner, rows):
     with torch.no_grad():
         mean, scale = learner.policy.module[0].module(rows["observation"])
     action = rows["action"]
-    normal = -((action.atanh() - mean) ** 2) / (2 * scale**2) - scale.log() - math.log(2 * math.pi) / 2
+    normal = (
+        -((action.atanh() - mean) ** 2) / (2 * scale**2) - scale.log() - math.log(2 * math.pi) / 2
+    )
     return (normal - (1 - action**2).log()).squeeze(-1)
 
 
@@ -112,7 +114,11 @@ def test_equations_89_and_90():
     with torch.no_grad():
         new_mean, new_scale = learner.policy.module[0].module(rows["observation"])
     ratio = (log_probability(learner, batch).flatten() - old).exp()
-    torch.testing.assert_close(report["loss_objective"], -(ratio * advantage).mean(), rtol=1e-3, atol=1e-4)
-    divergence = (new_scale / scale).log() + (scale**2 + (mean - new_mean) ** 2) / (2 * new_scale**2) - 0.5
+    torch.testing.assert_close(
+        report["loss_objective"], -(ratio * advantage).mean(), rtol=1e-3, atol=1e-4
+    )
+    divergence = (
+        (new_scale / scale).log() + (scale**2 + (mean - new_mean) ** 2) / (2 * new_scale**2) - 0.5
+    )
     torch.testing.assert_close(report["kl"], divergence.mean(), rtol=1e-3, atol=1e-5)
     assert 0 < report["kl"] <= 0.05

@@ -26,16 +26,28 @@ def numbers(learner):
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path_factory, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp()))  # one for all tests here
+    monkeypatch.setenv(
+        "XDG_CACHE_HOME", str(tmp_path_factory.getbasetemp())
+    )  # one for all tests here
 
 
 CASES = [
     pytest.param(PPO, (), {"minibatches": 4}, id="ppo"),
     pytest.param(A2C, (), {"minibatches": 4}, id="a2c", marks=pytest.mark.slow),
-    pytest.param(PPO, (), {"minibatches": 4, "normalise": True, "squash": False}, id="clipped", marks=pytest.mark.slow),
+    pytest.param(
+        PPO,
+        (),
+        {"minibatches": 4, "normalise": True, "squash": False},
+        id="clipped",
+        marks=pytest.mark.slow,
+    ),
     pytest.param(SAC, (), {"starts": 64, "batch_size": 32}, id="sac", marks=pytest.mark.slow),
     pytest.param(
-        DQN, (partial(DiscreteActions, 5),), {"starts": 64, "batch_size": 32}, id="dqn", marks=pytest.mark.slow
+        DQN,
+        (partial(DiscreteActions, 5),),
+        {"starts": 64, "batch_size": 32},
+        id="dqn",
+        marks=pytest.mark.slow,
     ),
 ]
 
@@ -69,7 +81,10 @@ def test_auto_compiles_a_run_of_many_steps_and_remembers_it(monkeypatch):
     monkeypatch.setattr(gradient, "ENOUGH", 100)
     for updates, expected in ((2, False), (10, True)):  # of 20 steps each
         ppo, rollout = make(PPO, "auto", minibatches=4)
-        for waiting in (0.0, 0.2):  # nothing is learned yet, as before there are enough steps for replay
+        for waiting in (
+            0.0,
+            0.2,
+        ):  # nothing is learned yet, as before there are enough steps for replay
             ppo.gradient.begin(waiting)
         ppo.update(rollout.collect(), 0.4)
         assert ppo.gradient.compile == "auto"
@@ -84,7 +99,9 @@ def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path
     monkeypatch.setattr(gradient, "ENOUGH", 1)
     ppo, rollout = make(PPO, "auto", minibatches=3)
     ppo.update(rollout.collect(), 0.0)
-    with pytest.warns(UserWarning, match=r"without a C\+\+ compiler.*the update goes on uncompiled"):
+    with pytest.warns(
+        UserWarning, match=r"without a C\+\+ compiler.*the update goes on uncompiled"
+    ):
         assert ppo.update(rollout.collect(), 0.5)["compiled"] == 0.0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -96,5 +113,7 @@ def test_auto_goes_on_without_a_compiler_and_true_does_not(monkeypatch, tmp_path
 
 def test_update_with_shapes_from_data_is_not_compiled():
     driver = TensorDictModule(torch.nn.Linear(20, 1), ["observation"], ["action"])
-    with pytest.raises(ValueError, match="compile=true: this learner's update depends on data in its shapes"):
+    with pytest.raises(
+        ValueError, match="compile=true: this learner's update depends on data in its shapes"
+    ):
         make(DynamicCoil, True, guides={"driver": driver})

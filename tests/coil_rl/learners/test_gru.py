@@ -17,7 +17,18 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.errors import UserError
 from coil_rl.guides.learned import LearnedGuide
-from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, Gru, KickstartLoss, Mlp, Reinforce
+from coil_rl.learners import (
+    A2C,
+    DQN,
+    PPO,
+    SAC,
+    TRPO,
+    DynamicCoil,
+    Gru,
+    KickstartLoss,
+    Mlp,
+    Reinforce,
+)
 from coil_rl.learners.encoders import ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.programs.evaluate import restore
@@ -32,9 +43,23 @@ from coil_rl.train.rollout import Rollout
 from coil_rl.transforms import DiscreteActions, Takeover
 
 DELAY = 5
-TINY = ["track=generated", "track.train.count=1", "track.test.count=2", "env.laps=1", "env.time_limit=1", "env.rate=12",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "checkpoint_every=1", "budget.num_envs=4",
-        "budget.steps=16", "budget.frames=128", "learner.epochs=2", "learner.minibatches=2"]  # fmt: skip
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=2",
+    "env.laps=1",
+    "env.time_limit=1",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "checkpoint_every=1",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "learner.epochs=2",
+    "learner.minibatches=2",
+]
 
 
 class Recall(SeededEnv):
@@ -46,11 +71,15 @@ class Recall(SeededEnv):
     def __init__(self, count, seed=0):
         super().__init__(batch_size=[count])
         flag, number = Categorical(2, (count, 1), dtype=torch.bool), Unbounded((count, 1))
-        self.observation_spec = Composite(observation=number, cue=number.clone(), clock=number.clone(), shape=(count,))
+        self.observation_spec = Composite(
+            observation=number, cue=number.clone(), clock=number.clone(), shape=(count,)
+        )
         self.state_spec = Composite(cue=number.clone(), clock=number.clone(), shape=(count,))
         self.action_spec = Categorical(2, (count,))
         self.reward_spec = Bounded(-1, 1, (count, 1))
-        self.full_done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,))
+        self.full_done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(count,)
+        )
         self.generator = torch.Generator().manual_seed(seed)
 
     def _reset(self, tensordict=None, **_):
@@ -62,7 +91,12 @@ class Recall(SeededEnv):
         cue, clock = tensordict["cue"], tensordict["clock"] + 1
         done = clock >= DELAY
         right = torch.where(cue == 2 * tensordict["action"].unsqueeze(-1) - 1, 1.0, -1.0)
-        entries = {"observation": torch.zeros_like(cue), "cue": cue, "clock": clock, "reward": done * right}
+        entries = {
+            "observation": torch.zeros_like(cue),
+            "cue": cue,
+            "clock": clock,
+            "reward": done * right,
+        }
         ends = {"done": done, "terminated": done.clone(), "truncated": torch.zeros_like(done)}
         return TensorDict(entries | ends, self.batch_size)
 
@@ -125,7 +159,9 @@ def test_update_sees_the_log_probabilities_and_states_of_the_rollout(action, opt
     assert (batch["policy_state"][begins] == 0).all()
     assert (batch["policy_state"][~begins] != 0).any(-1).all()
     goes_on = ~batch["next", "done"][:, :-1].squeeze(-1)
-    assert torch.equal(batch["next", "policy_state"][:, :-1][goes_on], batch["policy_state"][:, 1:][goes_on])
+    assert torch.equal(
+        batch["next", "policy_state"][:, :-1][goes_on], batch["policy_state"][:, 1:][goes_on]
+    )
     rows = learner.prepare(batch, 0.0)
     order = torch.randperm(len(rows))
     steps = learner.remember(rows[order])
@@ -143,7 +179,8 @@ def test_critic_values_the_state_in_which_a_truncated_episode_ended():
     after = batch["next"][:, 4].copy()
     expected = learner.critic(after.copy())["state_value"]
     assert not torch.allclose(
-        learner.critic(after.set("policy_state", 0 * after["policy_state"]))["state_value"], expected
+        learner.critic(after.set("policy_state", 0 * after["policy_state"]))["state_value"],
+        expected,
     )
     learner.prepare(batch, 0.0)
     torch.testing.assert_close(batch["next", "state_value"][:, 4], expected)
@@ -163,20 +200,30 @@ def test_on_policy_learners_train_all_parts_also_where_a_guide_acts(kind, option
     torch.manual_seed(0)
     gru = Gru((8,), state=8)
     env = worlds.cones(Takeover(Linear(0.5, 0.5)), *gru.env_transforms())
-    learner = kind(env, ["observation", "guide_action"], network=gru, minibatches=3, action_gain=1.0, **options)
+    learner = kind(
+        env, ["observation", "guide_action"], network=gru, minibatches=3, action_gain=1.0, **options
+    )
     before = copy.deepcopy(learner.state_dict())
     rollout = Rollout(env, learner.policy, 8, learner.keys)
     batch = rollout.collect()
     assert 0 < batch["agent_acts"].float().mean() < 1
     assert torch.tensor(list(learner.update(batch).values())).isfinite().all()
     for part in ("policy", "critic"):
-        assert not any(torch.equal(value, before[part][name]) for name, value in learner.state_dict()[part].items())
+        assert not any(
+            torch.equal(value, before[part][name])
+            for name, value in learner.state_dict()[part].items()
+        )
     # A learner that is restored goes on with the same numbers.
-    second, batch = kind(env, ["observation", "guide_action"], network=gru, minibatches=3, **options), rollout.collect()
+    second, batch = (
+        kind(env, ["observation", "guide_action"], network=gru, minibatches=3, **options),
+        rollout.collect(),
+    )
     second.load_state_dict(copy.deepcopy(learner.state_dict()))
     metrics = []
     for each in (learner, second):
-        torch.manual_seed(1)  # TorchRL estimates the entropy of a squashed distribution from samples
+        torch.manual_seed(
+            1
+        )  # TorchRL estimates the entropy of a squashed distribution from samples
         metrics.append(each.update(batch.clone()))
     assert metrics[0] == metrics[1]
 
@@ -194,7 +241,9 @@ def test_batch_of_kept_policies_acts_and_remembers_like_each_of_them():
             for step in part.unbind(1):
                 alone = policy(step.select(*policy.in_keys))
                 assert torch.equal(alone["action"], step["action"])
-                torch.testing.assert_close(alone["next", "policy_state"], step["next", "policy_state"])
+                torch.testing.assert_close(
+                    alone["next", "policy_state"], step["next", "policy_state"]
+                )
     assert (together["policy_state"][:, 1] != 0).any()
     assert (together["policy_state"][:, DELAY] == 0).all()
 
@@ -205,7 +254,8 @@ def composed(folder, *overrides, name="train"):
 
 
 @pytest.mark.parametrize(
-    "method", ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil", "jump_start"))]
+    "method",
+    ["ppo", *(pytest.param(name, marks=pytest.mark.slow) for name in ("coil", "jump_start"))],
 )
 def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     run, stopped = tmp_path / "run", tmp_path / "stopped"
@@ -222,34 +272,57 @@ def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     overrides = {**again.evaluation.env, "num_envs": 2}
     mean = evaluate_policy(build_env(again, overrides), policy).mean_reward
     table = (run / "evaluation.csv").read_text().splitlines()
-    (row,) = (line.split(",") for line in table if line.startswith(f"{config.label},,deterministic,mean,"))
+    (row,) = (
+        line.split(",") for line in table if line.startswith(f"{config.label},,deterministic,mean,")
+    )
     assert float(row[4]) == pytest.approx(mean)
 
 
 def test_policy_with_a_memory_is_a_guide(tmp_path):
-    run = make_untrained_run(tmp_path / "run", *TINY, "method=ppo", "network=gru", "learner.action_gain=3")
+    run = make_untrained_run(
+        tmp_path / "run", *TINY, "method=ppo", "network=gru", "learner.action_gain=3"
+    )
     guided = composed("unused", *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}")
     overrides = {"num_envs": 3, "assignment": "cyclic"}
     config, agent = restore(run, composed("unused", *TINY[:3], f"run={run}", name="evaluate"))
     policy = evaluate_policy(build_env(config, overrides), agent)
     learned = evaluate_policy(*build_guided_env(guided, overrides))
-    assert [row["reward"] for row in learned.episodes] == pytest.approx([row["reward"] for row in policy.episodes])
-    assert not any(parameter.requires_grad for parameter in build_guides(guided)["learned"].parameters())
+    assert [row["reward"] for row in learned.episodes] == pytest.approx(
+        [row["reward"] for row in policy.episodes]
+    )
+    assert not any(
+        parameter.requires_grad for parameter in build_guides(guided)["learned"].parameters()
+    )
 
 
 def test_policy_with_a_memory_behind_transforms_is_no_guide(tmp_path):
     run = make_untrained_run(tmp_path / "run", *TINY, "method=coil", "network=gru")
-    with pytest.raises(ValueError, match="has a policy with a memory behind transforms, which is no guide; train one"):
+    with pytest.raises(
+        ValueError,
+        match="has a policy with a memory behind transforms, which is no guide; train one",
+    ):
         LearnedGuide(str(run))
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: PPO(worlds.cones(), network=Gru()), "the env does not carry the memory of the network; put"),
-        (lambda: PPO(worlds.cones(*Gru(state=8).env_transforms()), network=Gru()), "the env does not carry the memory"),
-        (lambda: SAC(worlds.cones(), network=Gru()), "SAC cannot train a network with a memory; take network=mlp"),
-        (lambda: DQN(worlds.cones(DiscreteActions(3)), network=Gru()), "DQN cannot train a network with a memory"),
+        (
+            lambda: PPO(worlds.cones(), network=Gru()),
+            "the env does not carry the memory of the network; put",
+        ),
+        (
+            lambda: PPO(worlds.cones(*Gru(state=8).env_transforms()), network=Gru()),
+            "the env does not carry the memory",
+        ),
+        (
+            lambda: SAC(worlds.cones(), network=Gru()),
+            "SAC cannot train a network with a memory; take network=mlp",
+        ),
+        (
+            lambda: DQN(worlds.cones(DiscreteActions(3)), network=Gru()),
+            "DQN cannot train a network with a memory",
+        ),
         (lambda: TRPO(worlds.cones(), network=Gru()), "TRPO cannot train a network with a memory"),
         (
             lambda: DynamicCoil(worlds.cones(), guides={"one": one_guide()}, network=Gru()),
@@ -266,7 +339,9 @@ def test_unusable_memory_is_refused(make, message):
 
 def one_guide():
     return FastTensorDictModule(
-        ObservationNetwork(worlds.cones(), ["observation"], Mlp([8]), 1, 1.0), ["observation"], ["action"]
+        ObservationNetwork(worlds.cones(), ["observation"], Mlp([8]), 1, 1.0),
+        ["observation"],
+        ["action"],
     )
 
 
@@ -274,7 +349,8 @@ def test_more_minibatches_than_envs_are_refused():
     env = around(Recall(4), gru := Gru())
     learner = PPO(env, network=gru, minibatches=5)
     with pytest.raises(
-        UserError, match="minibatches=5 are more than the 4 envs, but with a memory each needs all steps"
+        UserError,
+        match="minibatches=5 are more than the 4 envs, but with a memory each needs all steps",
     ):
         learner.update(Rollout(env, learner.policy, 8, learner.keys).collect())
 
@@ -282,7 +358,11 @@ def test_more_minibatches_than_envs_are_refused():
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        pytest.param(["method=oil", "learner=linear"], "learner: Imitation takes no network", marks=pytest.mark.slow),
+        pytest.param(
+            ["method=oil", "learner=linear"],
+            "learner: Imitation takes no network",
+            marks=pytest.mark.slow,
+        ),
         (["learner=trpo"], "learner: TRPO cannot train a network with a memory"),
         (["learner.network.state=0"], "learner.network: state=0 must be at least 1"),
     ],

@@ -14,7 +14,11 @@ from coil_rl.transforms import AdaptiveMixedAction, GradualResidual, GuideAction
 
 SMALL = {"starts": 8, "batch_size": 8, "ratio": 2, "hidden": [8]}
 WAYS = {
-    "warm start": ([lambda: Takeover(1.0, 16)], SAC, {"critics": 4, "target_critics": 2, "critic_layer_norm": True}),
+    "warm start": (
+        [lambda: Takeover(1.0, 16)],
+        SAC,
+        {"critics": 4, "target_critics": 2, "critic_layer_norm": True},
+    ),
     "prior steps": ([lambda: Takeover(0.5)], SAC, {"prior": 0.5, "normalise": True}),
     "adaptive": ([lambda: AdaptiveMixedAction(warm_up=16)], SAC, {"uncertainty": True}),
     "gradual residual": ([lambda: GradualResidual(0.5, probability=0.5)], SAC, {}),
@@ -29,12 +33,19 @@ WAYS = {
 def test_it_learns_from_any_numbers(way, shape, dtype):
     transforms, learner, options = WAYS[way]
     halves = TensorDictModule(
-        lambda seen: seen[..., :1].clamp(-1, 1).unflatten(-1, (1,) * len(shape)).expand(*seen.shape[:-1], *shape),
+        lambda seen: (
+            seen[..., :1]
+            .clamp(-1, 1)
+            .unflatten(-1, (1,) * len(shape))
+            .expand(*seen.shape[:-1], *shape)
+        ),
         in_keys=["observation"],
         out_keys=["action"],
     )
     world = AnyEnv(8, Bounded(-1, 1, shape, dtype=dtype), dtype=dtype)
-    env = TransformedEnv(world, Compose(GuideActions({"halves": halves}), *(make() for make in transforms))).train()
+    env = TransformedEnv(
+        world, Compose(GuideActions({"halves": halves}), *(make() for make in transforms))
+    ).train()
     check_env(env, steps=3)
     observed = ["observation", "agent_weight"] if way == "adaptive" else ["observation"]
     built = learner(env, observed, **SMALL | options)

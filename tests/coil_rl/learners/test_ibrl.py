@@ -17,7 +17,14 @@ RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC
 def make(**options):
     torch.manual_seed(0)
     env = worlds.pendulum()
-    given = {"in_keys": ["th", "thdot"], "hidden": [16], "starts": 0, "batch_size": 16, "ratio": 1, "action_gain": 1.0}
+    given = {
+        "in_keys": ["th", "thdot"],
+        "hidden": [16],
+        "starts": 0,
+        "batch_size": 16,
+        "ratio": 1,
+        "action_gain": 1.0,
+    }
     ibrl = IBRL(env, **given | options)
     with torch.no_grad():  # critics and target networks must differ
         for value in ibrl.loss.qvalue_network_params.values(True, True):
@@ -43,7 +50,10 @@ def test_better_proposal_of_guide_and_policy_is_executed():
     batch = rollout.collect()
     guide = batch["guide_action"][:, 0]
     with set_exploration_type(DETERMINISTIC):
-        own, chosen = own_action(ibrl, batch), ibrl.policy(batch.select("th", "thdot", "guide_action"))["action"]
+        own, chosen = (
+            own_action(ibrl, batch),
+            ibrl.policy(batch.select("th", "thdot", "guide_action"))["action"],
+        )
     better = target_values(ibrl, batch, guide) >= target_values(ibrl, batch, own)
     assert 5 < better.sum() < 60
     assert torch.equal(chosen, torch.where(better.unsqueeze(-1), guide, own))
@@ -59,8 +69,12 @@ def test_critics_learn_the_value_of_the_choice_in_the_next_state(sharpness):
     torch.manual_seed(1)
     with torch.no_grad(), set_exploration_type(RANDOM):
         own = own_action(ibrl, after)
-        values = torch.stack([target_values(ibrl, after, a) for a in (after["guide_action"][:, 0], own)])
-    value = values.amax(0) if sharpness is None else ((sharpness * values).softmax(0) * values).sum(0)
+        values = torch.stack(
+            [target_values(ibrl, after, a) for a in (after["guide_action"][:, 0], own)]
+        )
+    value = (
+        values.amax(0) if sharpness is None else ((sharpness * values).softmax(0) * values).sum(0)
+    )
     expected = after["reward"] + 0.9 * ~after["terminated"] * value.unsqueeze(-1)
     torch.manual_seed(1)
     torch.testing.assert_close(ibrl.loss._compute_target_v2(data), expected.squeeze(-1))
@@ -71,7 +85,9 @@ def test_proposals_are_drawn_by_the_sharpness_of_the_choice_in_training_only():
     batch = rollout.collect()
     guide = batch["guide_action"][:, 0]
     with set_exploration_type(RANDOM):
-        drawn = torch.cat([(ibrl.policy(batch.copy())["action"] == guide).squeeze(-1) for _ in range(20)])
+        drawn = torch.cat(
+            [(ibrl.policy(batch.copy())["action"] == guide).squeeze(-1) for _ in range(20)]
+        )
     assert abs(drawn.float().mean() - 0.5) < 0.05
     assert ibrl.update(rollout.collect())["guide_share"] == pytest.approx(0.5)
     with set_exploration_type(DETERMINISTIC):
@@ -103,11 +119,15 @@ def test_edited_action_stays_near_the_guide_and_learns_to_have_a_larger_value():
         ibrl.loss.actor_loss(batch.copy())[0].backward()
         optimiser.step()
     assert gain() > first + 0.01
-    assert any(parameter in set(ibrl.gradient.parameters) for parameter in proposals.editor.parameters())
+    assert any(
+        parameter in set(ibrl.gradient.parameters) for parameter in proposals.editor.parameters()
+    )
     assert not all(map(torch.equal, before, proposals.editor.parameters()))
 
 
-@pytest.mark.parametrize("options", [{"edit": 0.2}, {"normalise": True}], ids=["edit", "normalised"])
+@pytest.mark.parametrize(
+    "options", [{"edit": 0.2}, {"normalise": True}], ids=["edit", "normalised"]
+)
 def test_state_of_the_policy_is_complete(options):
     first, rollout = make(**options)
     first.update(rollout.collect())
@@ -116,7 +136,10 @@ def test_state_of_the_policy_is_complete(options):
     second, _ = make(**options)
     second.policy.load_state_dict(copy.deepcopy(first.policy.state_dict()))
     with set_exploration_type(DETERMINISTIC):
-        chosen = [each(batch.select("th", "thdot", "guide_action"))["action"] for each in (first.policy, second.policy)]
+        chosen = [
+            each(batch.select("th", "thdot", "guide_action"))["action"]
+            for each in (first.policy, second.policy)
+        ]
         chosen.append(policies(batch.select("th", "thdot", "guide_action"))["action"])
     assert torch.equal(chosen[0], chosen[1])
     torch.testing.assert_close(chosen[0], chosen[2])
@@ -125,7 +148,10 @@ def test_state_of_the_policy_is_complete(options):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"target_critics": 1}, "IBRL compares all critics; leave target_critics and uncertainty out"),
+        (
+            {"target_critics": 1},
+            "IBRL compares all critics; leave target_critics and uncertainty out",
+        ),
         ({"uncertainty": True}, "IBRL compares all critics"),
         ({"edit": -0.1}, "edit=-0.1 must be"),
         ({"sharpness": -1}, "sharpness=-1 must be"),

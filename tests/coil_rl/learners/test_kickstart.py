@@ -78,7 +78,9 @@ def test_loss_of_several_choices_is_their_cross_entropy():
     policy = PPO(env, action_gain=2.0).policy
     data = env.reset()
     advised = torch.stack([torch.randint(n, (8,)) for n in (2, 4)], -1)
-    one_hot = torch.cat([F.one_hot(advised[:, index], n) for index, n in enumerate((2, 4))], -1).float()
+    one_hot = torch.cat(
+        [F.one_hot(advised[:, index], n) for index, n in enumerate((2, 4))], -1
+    ).float()
     loss = KickstartLoss()(policy, data.set("guide_action", one_hot.unsqueeze(1)))
     torch.testing.assert_close(loss, -policy.get_dist(data).log_prob(advised).mean())
 
@@ -87,7 +89,16 @@ def replay(auxiliary, **options):
     """SAC with critics that differ, and a minibatch of its steps."""
     torch.manual_seed(0)
     env = worlds.cones()
-    sac = SAC(env, critics=3, starts=0, batch_size=32, ratio=1, auxiliary=[auxiliary], action_gain=1.0, **options)
+    sac = SAC(
+        env,
+        critics=3,
+        starts=0,
+        batch_size=32,
+        ratio=1,
+        auxiliary=[auxiliary],
+        action_gain=1.0,
+        **options,
+    )
     with torch.no_grad():
         for value in sac.loss.qvalue_network_params.values(True, True):
             value.add_(torch.randn_like(value), alpha=0.3)
@@ -100,11 +111,16 @@ def test_imitation_is_weighted_by_the_opinion_of_the_critics(soft):
     filtered = FilteredKickstartLoss(soft=soft)
     sac, _, data = replay(filtered)
     own = sac.actor.get_dist(data.select("observation")).deterministic_sample
-    both = [filtered.critics.values(data.copy().set("action", a)) for a in (data["guide_action"][:, 0], own)]
+    both = [
+        filtered.critics.values(data.copy().set("action", a))
+        for a in (data["guide_action"][:, 0], own)
+    ]
     gain, spread = both[0].mean(0) - both[1].mean(0), (both[0].var(0) + both[1].var(0)).sqrt()
     weight = Normal(0.0, 1.0).cdf(gain / spread) if soft else (gain > 0).float()
     assert 0.05 < weight.mean() < 0.95
-    torch.testing.assert_close(filtered(sac.actor, data), (weight * KickstartLoss().each(sac.actor, data)).mean())
+    torch.testing.assert_close(
+        filtered(sac.actor, data), (weight * KickstartLoss().each(sac.actor, data)).mean()
+    )
 
 
 def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
@@ -113,10 +129,14 @@ def test_loss_is_added_to_that_of_the_policy_of_sac_by_its_schedule():
     for progress, coefficient in ((0.0, 3.0), (1.0, 0.0)):
         weights = sac.loss_weights(progress)
         assert weights == dict.fromkeys(sac.minimised, 1.0) | {"loss_guide": coefficient}
-        torch.testing.assert_close(sac.losses(data.clone())["loss_guide"], KickstartLoss()(sac.actor, data))
+        torch.testing.assert_close(
+            sac.losses(data.clone())["loss_guide"], KickstartLoss()(sac.actor, data)
+        )
     assert sac.update(rollout.collect())["loss_guide"] != 0
 
 
 def test_filter_needs_a_learner_with_action_values():
-    with pytest.raises(ValueError, match="compares values of actions; take learner=sac, or KickstartLoss"):
+    with pytest.raises(
+        ValueError, match="compares values of actions; take learner=sac, or KickstartLoss"
+    ):
         PPO(worlds.cones(), auxiliary=[FilteredKickstartLoss()])

@@ -94,11 +94,15 @@ def test_evaluation_does_not_change_the_statistics_and_several_policies_act_at_o
     learner.update(Rollout(env, learner.policy, 8, learner.keys).collect())
     state = copy.deepcopy(learner.policy.state_dict())
     data = env.reset()
-    policies = policy_batch(learner.policy, [state, PPO(shifted(), normalise=True).policy.state_dict()])
+    policies = policy_batch(
+        learner.policy, [state, PPO(shifted(), normalise=True).policy.state_dict()]
+    )
     with torch.no_grad():
         assert policies(torch.cat([data, data]))["action"].shape == (16, 2)
         learner.policy.eval()(data)
-    assert all(torch.equal(value, state[name]) for name, value in learner.policy.state_dict().items())
+    assert all(
+        torch.equal(value, state[name]) for name, value in learner.policy.state_dict().items()
+    )
 
 
 def test_only_measurements_are_normalised_and_never_advice():
@@ -107,7 +111,12 @@ def test_only_measurements_are_normalised_and_never_advice():
     assert learner.normaliser.in_keys == ["observation"]
     with pytest.raises(ValueError, match="normalise: guide_action is advice"):
         PPO(env, ["observation", "guide_action"], normalise=["guide_action"])
-    seen = {"a": Unbounded((2,), **FLOAT64), "b": Categorical(3, ()), "image": Unbounded((8, 8, 3)), "c": Unbounded(())}
+    seen = {
+        "a": Unbounded((2,), **FLOAT64),
+        "b": Categorical(3, ()),
+        "image": Unbounded((8, 8, 3)),
+        "c": Unbounded(()),
+    }
     mixed = AnyEnv(observations=seen)
     assert PPO(mixed, list(seen), normalise=True).normaliser.in_keys == ["a", "c"]
     assert PPO(mixed, list(seen), normalise=["c"]).normaliser.in_keys == ["c"]

@@ -34,7 +34,14 @@ def steps(first, count, **more):
 
 def replay(env=None, **options):
     """The buffer of a learner, without networks."""
-    options = {"in_keys": ["th"], "capacity": 10, "batch_size": 4, "ratio": 1.0, "starts": 0, "tau": 0.1} | options
+    options = {
+        "in_keys": ["th"],
+        "capacity": 10,
+        "batch_size": 4,
+        "ratio": 1.0,
+        "starts": 0,
+        "tau": 0.1,
+    } | options
     return OffPolicy(env or PendulumEnv(), **options)
 
 
@@ -79,11 +86,15 @@ def test_steps_of_the_guide_are_not_stored_if_the_agent_cannot_choose_its_action
         env = worlds.cones(*transforms)
         learner = replay(env, in_keys=["observation"])
         assert ("next", "executed_action") not in learner.keys
-        given = steps(0, 6, agent_acts=agent_acts(1, 0, 0, 1, 1, 0)).rename_key_("th", "observation")
+        given = steps(0, 6, agent_acts=agent_acts(1, 0, 0, 1, 1, 0)).rename_key_(
+            "th", "observation"
+        )
         given["next"].rename_key_("th", "observation")
         learner.store(given)
         assert stored(learner) == [0, 3, 4]
-        with pytest.raises(ValueError, match=r"prior=0\.5 needs steps in which a guide acts in place of the agent"):
+        with pytest.raises(
+            ValueError, match=r"prior=0\.5 needs steps in which a guide acts in place of the agent"
+        ):
             replay(env, in_keys=["observation"], prior=0.5)
 
 
@@ -99,14 +110,23 @@ SWITCHES = {
 def test_stored_steps_agree_with_the_env(name):
     """A fresh env that is given the stored state and action returns the stored reward and next state."""
     env = worlds.pendulum(SWITCHES[name]())
-    learner = SAC(env, ["th", "thdot", "guide_action"], hidden=[8], starts=10_000, capacity=10_000, action_scale=2.0)
+    learner = SAC(
+        env,
+        ["th", "thdot", "guide_action"],
+        hidden=[8],
+        starts=10_000,
+        capacity=10_000,
+        action_scale=2.0,
+    )
     batch = Rollout(env, learner.policy, 60, [*learner.keys, "agent_acts"]).collect()
     assert 0.2 < batch["agent_acts"].float().mean() < 0.8
     learner.update(batch)
     taken = learner.buffer[:]
     assert len(taken) == 60
     action = taken["action"]
-    if name == "gradual residual":  # the sum is a part of the env, and the agent's action is 0 where it does not act
+    if (
+        name == "gradual residual"
+    ):  # the sum is a part of the env, and the agent's action is 0 where it does not act
         action = (taken["guide_action"][:, 0] + 0.5 * action).clamp(-2, 2)
     state = PendulumEnv.gen_params(batch_size=[60]).update(taken.select("th", "thdot"))
     after = PendulumEnv().step(state.set("action", action))["next"]
@@ -115,7 +135,9 @@ def test_stored_steps_agree_with_the_env(name):
 
 
 def test_steps_of_the_guide_are_sampled_as_their_share():
-    learner = replay(worlds.pendulum(Takeover(0.5)), prior=0.25, batch_size=8, capacity=50, starts=30, ratio=8.0)
+    learner = replay(
+        worlds.pendulum(Takeover(0.5)), prior=0.25, batch_size=8, capacity=50, starts=30, ratio=8.0
+    )
     for first, acts in ((0, False), (20, False), (40, True), (60, True)):
         given = steps(first, 20, agent_acts=torch.full((20, 1), acts))
         given["next", "executed_action"] = given["action"]
@@ -138,7 +160,9 @@ def make(kind, seed=0, **changes):
     torch.manual_seed(seed)
     advice = [GuideActions({"any": RandomGuide(seed=seed)}), DelayedAdvice(2)]
     discrete = [DiscreteActions(5)] if kind is DQN else []
-    env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed), Compose(*advice, *discrete))
+    env = TransformedEnv(
+        ConeTrackEnv(shipped_tracks("train")[:2], 8, seed=seed), Compose(*advice, *discrete)
+    )
     learner = kind(env, ["observation", "guide_action"], seed=seed, **TINY | changes)
     return learner, Rollout(env, learner.policy, 4, learner.keys)
 
@@ -181,10 +205,14 @@ def test_learning_starts_after_some_steps_with_metrics_of_zero(kind):
     first, second = (learner.update(rollout.collect()) for _ in range(2))
     assert first["minibatches"] == 0
     assert second["minibatches"] == 8
-    assert {value for name, value in first.items() if name.startswith(("loss", "value", "alpha"))} == {0.0}
+    assert {
+        value for name, value in first.items() if name.startswith(("loss", "value", "alpha"))
+    } == {0.0}
 
 
-@pytest.mark.parametrize(("kind", "name"), [(DQN, "value_network_params"), (SAC, "qvalue_network_params")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [(DQN, "value_network_params"), (SAC, "qvalue_network_params")]
+)
 def test_target_network_follows_by_tau(kind, name):
     learner, rollout = make(kind, starts=0, ratio=0.5, tau=0.25)
     params, target_params = getattr(learner.loss, name), getattr(learner.loss, f"target_{name}")

@@ -25,7 +25,9 @@ LEARNERS = [PPO, A2C, TRPO, Reinforce]
 
 
 def weights(learner):
-    return torch.cat([p.detach().flatten() for net in (learner.policy, learner.critic) for p in net.parameters()])
+    return torch.cat(
+        [p.detach().flatten() for net in (learner.policy, learner.critic) for p in net.parameters()]
+    )
 
 
 def trained(kind, env, updates=2, steps=8, **options):
@@ -101,7 +103,11 @@ def test_only_the_critic_learns_from_steps_of_the_guide(kind):
 def test_large_kickstart_loss_makes_the_policy_imitate_the_guide(kind):
     torch.manual_seed(0)
     env = worlds.cones(cars=16)
-    own = {PPO: {"minibatches": 2}, A2C: {"learning_rate": 1e-2, "minibatches": 8}, TRPO: {"max_kl": 0.1}}
+    own = {
+        PPO: {"minibatches": 2},
+        A2C: {"learning_rate": 1e-2, "minibatches": 8},
+        TRPO: {"max_kl": 0.1},
+    }
     learner = kind(env, auxiliary=[KickstartLoss(100.0)], **own[kind])
     rollout = Rollout(env, learner.policy, 16, learner.keys)
     losses = [learner.update(rollout.collect())["loss_guide"] for _ in range(6)]
@@ -114,7 +120,11 @@ def test_entropy_bonus_keeps_the_policy_random(kind):
         env = CartPoles(16)
         learner = trained(kind, env, updates=10, learning_rate=1e-2, entropy=entropy)
         with torch.no_grad():
-            return learner.policy.get_dist(env.rollout(8).select("observation")).probs.max(-1).values.mean()
+            return (
+                learner.policy.get_dist(env.rollout(8).select("observation"))
+                .probs.max(-1)
+                .values.mean()
+            )
 
     assert largest_probability(1.0) < largest_probability(0.0)
 
@@ -127,15 +137,27 @@ def test_minibatch_of_one_frame_is_refused(kind):
         trained(kind, CartPoles(2), steps=4, minibatches=5)
 
 
-@pytest.mark.parametrize("make", [worlds.cones, partial(CartPoles, 6), partial(AnyEnv, 6, MultiCategorical([2, 3]))])
+@pytest.mark.parametrize(
+    "make", [worlds.cones, partial(CartPoles, 6), partial(AnyEnv, 6, MultiCategorical([2, 3]))]
+)
 @pytest.mark.parametrize("entropy", [0.0, 0.01])
 def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
     torch.manual_seed(0)
     env = make()
     ppo = PPO(env, epochs=3, minibatches=2, learning_rate=5e-2, entropy=entropy)
-    options = {"entropy_bonus": entropy > 0, "entropy_coeff": entropy, "critic_coeff": 0.5, "loss_critic_type": "l2"}
+    options = {
+        "entropy_bonus": entropy > 0,
+        "entropy_coeff": entropy,
+        "critic_coeff": 0.5,
+        "loss_critic_type": "l2",
+    }
     reference = ClipPPOLoss(
-        ppo.policy, ppo.critic, clip_epsilon=0.2, normalize_advantage=True, functional=False, **options
+        ppo.policy,
+        ppo.critic,
+        clip_epsilon=0.2,
+        normalize_advantage=True,
+        functional=False,
+        **options,
     )
     batch = Rollout(env, ppo.policy, 8, ppo.keys).collect()
     ppo.update(batch.clone())  # the ratios are no longer 1
@@ -145,7 +167,9 @@ def test_loss_of_ppo_is_that_of_torchrl_to_the_bit(make, entropy):
         ppo.gradient.adam.zero_grad()
         losses = loss(rows)
         sum(value for name, value in losses.items() if name.startswith("loss_")).backward()
-        found.append((losses.detach(), [parameter.grad.clone() for parameter in ppo.gradient.parameters]))
+        found.append(
+            (losses.detach(), [parameter.grad.clone() for parameter in ppo.gradient.parameters])
+        )
     (losses, gradients), (our_losses, our_gradients) = found
     assert losses["clip_fraction"] > 0
     assert list(our_losses.keys()) == list(losses.keys())  # the columns of the log

@@ -19,12 +19,18 @@ from coil_rl.envs.gym import ConeTrackGym
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
 from coil_rl.train.rollout import Rollout
 
-CONFIG = OmegaConf.to_container(OmegaConf.load(Path(__file__).parents[3] / "conf/learner/ppo_sb3.yaml"))
-OPTIONS = {key: value for key, value in CONFIG["learner"].items() if key not in ("_target_", "seed")}
+CONFIG = OmegaConf.to_container(
+    OmegaConf.load(Path(__file__).parents[3] / "conf/learner/ppo_sb3.yaml")
+)
+OPTIONS = {
+    key: value for key, value in CONFIG["learner"].items() if key not in ("_target_", "seed")
+}
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
-def test_env_executes_the_clipped_sample_whose_probability_is_that_of_the_unclipped_one(deterministic):
+def test_env_executes_the_clipped_sample_whose_probability_is_that_of_the_unclipped_one(
+    deterministic,
+):
     torch.manual_seed(0)
     env = worlds.cones(cars=16)
     policy = PPO(env, action_scale=1.5, action_gain=5.0, squash=False).policy
@@ -33,7 +39,9 @@ def test_env_executes_the_clipped_sample_whose_probability_is_that_of_the_unclip
         batch = policy(batch.select("observation"))
         assert torch.equal(batch["unclipped_action"], batch["loc"])
     else:
-        expected = torch.distributions.Normal(batch["loc"], batch["scale"]).log_prob(batch["unclipped_action"])
+        expected = torch.distributions.Normal(batch["loc"], batch["scale"]).log_prob(
+            batch["unclipped_action"]
+        )
         torch.testing.assert_close(batch["action_log_prob"], expected.sum(-1))
     assert 0 < (batch["action"].abs() == 1).float().mean() < 1
     assert torch.equal(batch["action"], batch["unclipped_action"].clamp(-1, 1))
@@ -52,13 +60,17 @@ def test_learners_learn_from_the_unclipped_sample(kind):
         rows["action"] *= 0
         rows["unclipped_action"] += offset
         other.update(rows)
-        weights.append(torch.cat([parameter.detach().flatten() for parameter in other.policy.parameters()]))
+        weights.append(
+            torch.cat([parameter.detach().flatten() for parameter in other.policy.parameters()])
+        )
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
 
 
 def linears(*modules):
-    return [layer for module in modules for layer in module.modules() if isinstance(layer, nn.Linear)]
+    return [
+        layer for module in modules for layer in module.modules() if isinstance(layer, nn.Linear)
+    ]
 
 
 def stable_baselines3(env, **options):
@@ -71,19 +83,32 @@ def batch_of(model):
     buffer = model.rollout_buffer
     names = ("observations", "actions", "rewards", "episode_starts", "log_probs")
     parts = {name: torch.from_numpy(getattr(buffer, name).copy()).transpose(0, 1) for name in names}
-    observation, action, starts = parts["observations"], parts["actions"], parts["episode_starts"].unsqueeze(-1)
-    done = torch.cat([starts[:, 1:], torch.from_numpy(model._last_episode_starts)[:, None, None]], 1).bool()
+    observation, action, starts = (
+        parts["observations"],
+        parts["actions"],
+        parts["episode_starts"].unsqueeze(-1),
+    )
+    done = torch.cat(
+        [starts[:, 1:], torch.from_numpy(model._last_episode_starts)[:, None, None]], 1
+    ).bool()
     after = torch.cat([observation[:, 1:], torch.from_numpy(model._last_obs)[:, None]], 1)
     ends = {"reward": parts["rewards"].unsqueeze(-1), "done": done, "terminated": done}
     rows = {"observation": observation, "next": {"observation": after} | ends}
-    rows |= {"unclipped_action": action, "action": action.squeeze(-1).long(), "action_log_prob": parts["log_probs"]}
+    rows |= {
+        "unclipped_action": action,
+        "action": action.squeeze(-1).long(),
+        "action_log_prob": parts["log_probs"],
+    }
     return TensorDict(rows, done.shape[:2])
 
 
 @pytest.mark.parametrize(
     ("env", "gym_env"),
     [
-        (partial(ConeTrackEnv, shipped_tracks("test"), 1), partial(ConeTrackGym, shipped_tracks("test"))),
+        (
+            partial(ConeTrackEnv, shipped_tracks("test"), 1),
+            partial(ConeTrackGym, shipped_tracks("test")),
+        ),
         (partial(CartPoles, 1), partial(gymnasium.make, "CartPole-v1")),
     ],
     ids=["continuous", "discrete"],
@@ -92,7 +117,11 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
     torch.manual_seed(0)
     default = stable_baselines3(gym_env())
     budget, minibatches = CONFIG["budget"], default.n_steps // default.batch_size
-    assert (default.n_envs, default.n_steps, minibatches) == (budget["cars"], budget["steps"], OPTIONS["minibatches"])
+    assert (default.n_envs, default.n_steps, minibatches) == (
+        budget["cars"],
+        budget["steps"],
+        OPTIONS["minibatches"],
+    )
 
     # One minibatch, as their order is drawn in another way.
     model = stable_baselines3(gym_env(), n_steps=512, batch_size=512)
@@ -100,7 +129,9 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
     model.collect_rollouts(model.env, callback, model.rollout_buffer, 512)
     ours, theirs = PPO(env(), **OPTIONS | {"minibatches": 1}), model.policy
     extractor = theirs.mlp_extractor
-    their_layers = linears(extractor.policy_net, theirs.action_net, extractor.value_net, theirs.value_net)
+    their_layers = linears(
+        extractor.policy_net, theirs.action_net, extractor.value_net, theirs.value_net
+    )
     layers = list(zip(linears(ours.policy, ours.critic), their_layers, strict=True))
     for one, other in layers:
         torch.testing.assert_close(one.weight.norm(), other.weight.norm())
@@ -117,7 +148,9 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
     model.train()
     for one, other in [*((one.weight, other.weight) for one, other in layers), *scales]:
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
-    assert all((one.weight - old).abs().max() > 1e-4 for (one, _), old in zip(layers, before, strict=True))
+    assert all(
+        (one.weight - old).abs().max() > 1e-4 for (one, _), old in zip(layers, before, strict=True)
+    )
 
 
 @pytest.mark.slow
@@ -128,7 +161,10 @@ def test_cart_pole_is_learned_as_fast_as_by_stable_baselines3():
         torch.manual_seed(seed)
         env = TransformedEnv(CartPoles(1, seed), RewardSum())
         learner = PPO(env, **OPTIONS, seed=seed)
-        rollout, of_seed = Rollout(env, learner.policy, 2048, [*learner.keys, ("next", "episode_reward")]), []
+        rollout, of_seed = (
+            Rollout(env, learner.policy, 2048, [*learner.keys, ("next", "episode_reward")]),
+            [],
+        )
         for _ in range(12):  # 24,576 frames; the last 100 episodes count
             batch = rollout.collect()
             learner.update(batch)

@@ -13,19 +13,40 @@ from coil_rl.learners.dynamic_coil import AfterFrames, AtConvergence, PhaseSched
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule, actor
 from coil_rl.schedules import Linear
-from coil_rl.transforms import DiscreteActions, MixedAction, ResidualAction, RewardCoupling, Takeover
+from coil_rl.transforms import (
+    DiscreteActions,
+    MixedAction,
+    ResidualAction,
+    RewardCoupling,
+    Takeover,
+)
 
-COMMON = {"gamma": 2, "learning_rate": -1, "action_gain": -1, "hidden": [0], "max_grad_norm": 0, "seed": -1}
+COMMON = {
+    "gamma": 2,
+    "learning_rate": -1,
+    "action_gain": -1,
+    "hidden": [0],
+    "max_grad_norm": 0,
+    "seed": -1,
+}
 REPLAY = {"tau": 2, "batch_size": 0, "capacity": 10, "ratio": -1, "starts": -1}
 OUT_OF_RANGE = {
-    PPO: COMMON | {"max_grad_norm": math.inf, "minibatches": 0, "action_scale": 0, "epochs": 0, "clip": 0,
-                   "entropy": -1, "critic": -1},
+    PPO: COMMON
+    | {
+        "max_grad_norm": math.inf,
+        "minibatches": 0,
+        "action_scale": 0,
+        "epochs": 0,
+        "clip": 0,
+        "entropy": -1,
+        "critic": -1,
+    },
     A2C: {"gae_lambda": -1, "minibatches": 0},
     Reinforce: {"baseline": "mean", "gamma": 2},
     TRPO: {"max_kl": 0, "damping": -1, "iterations": 0, "backtracks": -1, "shrink": 1.5},
     DQN: COMMON | REPLAY | {"epsilon": Linear(0.5, 2.0)},
     SAC: COMMON | REPLAY | {"temperature": 0, "action_scale": 0},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", OUT_OF_RANGE)
@@ -48,7 +69,10 @@ def test_values_out_of_range_are_refused(kind):
         (lambda: AtConvergence(0), "evaluations=0 must be at least 1"),
         (lambda: AtConvergence(improvement=-1), "improvement=-1 must be at least 0"),
         (lambda: AtConvergence(frames=0), "frames=0 must be at least 1"),
-        (lambda: DQN(PendulumEnv(), ["th"]), r"DQN needs discrete actions, .* around it: action=choices"),
+        (
+            lambda: DQN(PendulumEnv(), ["th"]),
+            r"DQN needs discrete actions, .* around it: action=choices",
+        ),
         (
             lambda: SAC(worlds.pendulum(DiscreteActions(5)), ["th"]),
             r"SAC needs continuous actions, .* action=continuous, or a learner .* DQN",
@@ -64,7 +88,9 @@ def test_unknown_choices_and_wrong_kinds_of_env_are_refused(make, message):
         make()
 
 
-@pytest.mark.parametrize(("kind", "name"), [(A2C, "clip"), (A2C, "epochs"), (Reinforce, "entropy"), (TRPO, "critic")])
+@pytest.mark.parametrize(
+    ("kind", "name"), [(A2C, "clip"), (A2C, "epochs"), (Reinforce, "entropy"), (TRPO, "critic")]
+)
 def test_options_that_have_no_effect_are_refused(kind, name):
     with pytest.raises(TypeError, match=name):
         kind(CartPoles(2), **{name: 1})
@@ -87,7 +113,9 @@ def test_replay_refuses_an_effect_of_actions_that_changes_over_the_run(transform
 
 def test_dynamic_coil_refuses_unusable_guides_and_values_out_of_range():
     env = worlds.cones()
-    constant = TensorDictModule(lambda observation: observation[..., :1] * 0, ["observation"], ["action"])
+    constant = TensorDictModule(
+        lambda observation: observation[..., :1] * 0, ["observation"], ["action"]
+    )
     network = ObservationNetwork(env, ["observation"], Mlp([8]), 1, 1.0)
     one = FastTensorDictModule(network, ["observation"], ["action"])
     for guides, message in (
@@ -98,6 +126,10 @@ def test_dynamic_coil_refuses_unusable_guides_and_values_out_of_range():
             DynamicCoil(env, guides=guides)
     with pytest.raises(ValueError, match="Dynamic COIL needs continuous actions"):
         DynamicCoil(worlds.carts(), guides={"one": one})
-    for name, value in (("shrink", 0), ("critic_phases", "never"), ("guide_learning_rate", math.nan)):
+    for name, value in (
+        ("shrink", 0),
+        ("critic_phases", "never"),
+        ("guide_learning_rate", math.nan),
+    ):
         with pytest.raises(ValueError, match=f"{name}=.* must be"):
             DynamicCoil(env, guides={"one": one}, **{name: value})

@@ -14,7 +14,11 @@ from coil_rl.train.rollout import Rollout
 def make(**options):
     torch.manual_seed(0)
     env = options.pop("env", None) or worlds.pendulum()
-    sac = SAC(env, **{"in_keys": ["th", "thdot"], "hidden": [16], "starts": 0, "batch_size": 16, "ratio": 1} | options)
+    sac = SAC(
+        env,
+        **{"in_keys": ["th", "thdot"], "hidden": [16], "starts": 0, "batch_size": 16, "ratio": 1}
+        | options,
+    )
     return sac, Rollout(env, sac.policy, 32, sac.keys)
 
 
@@ -52,11 +56,17 @@ def test_critics_learn_the_soft_value_of_the_next_state():
         torch.manual_seed(1)
         action, log_prob = sample(sac, data["next"])
         soft = (
-            action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action).min(0).values
+            action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action)
+            .min(0)
+            .values
             - 0.5 * log_prob
         )
-        target = (data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft.unsqueeze(-1)).squeeze(-1)
-        expected = (action_values(sac, params, data, data["action"]) - target).square().sum(0).mean()
+        target = (
+            data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft.unsqueeze(-1)
+        ).squeeze(-1)
+        expected = (
+            (action_values(sac, params, data, data["action"]) - target).square().sum(0).mean()
+        )
         torch.manual_seed(1)
         torch.testing.assert_close(sac.loss(data)["loss_qvalue"], expected)
 
@@ -93,14 +103,16 @@ def test_swings_the_pendulum_up():
     torch.manual_seed(0)
     env = GymEnv("Pendulum-v1")
     env.set_seed(0)
-    # With returns in the hundreds, a small norm of all gradients would scale the gradients of the policy to nearly 0.
+    # With returns in the hundreds, a small norm of all gradients would scale the gradients of the
+    # policy to nearly 0.
     sac = SAC(env, temperature=0.2, tau=0.02, ratio=128, starts=500, max_grad_norm=1e9)
     rollout = Rollout(env, sac.policy, 8, sac.keys)
     for _ in range(1_000):
         sac.update(rollout.collect())
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         returns = [float(env.rollout(200, sac.policy)["next", "reward"].sum()) for _ in range(20)]
-    # A random policy gets -1200, a good one -160. Single starts differ by 100, so the standard error is 25.
+    # A random policy gets -1200, a good one -160. Single starts differ by 100, so the standard
+    # error is 25.
     assert sum(returns) / 20 > -230
 
 
@@ -120,7 +132,9 @@ def test_some_of_many_critics_are_drawn_for_the_target_and_the_policy_maximises_
     both = torch.stack([data.select("th", "thdot"), data["next"].select("th", "thdot")])
     action, log_prob = sample(sac, both)
     with torch.no_grad():
-        after = action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action[1])[drawn].amin(0)
+        after = action_values(sac, sac.loss.target_qvalue_network_params, data["next"], action[1])[
+            drawn
+        ].amin(0)
         soft = (after - 0.5 * log_prob[1]).unsqueeze(-1)
         target = (data["next", "reward"] + 0.9 * ~data["next", "terminated"] * soft).squeeze(-1)
         error = (action_values(sac, params, data, data["action"]) - target).square().mean()
@@ -139,7 +153,9 @@ def test_layers_of_the_critics_alone_are_normalised():
     assert not any(isinstance(module, torch.nn.LayerNorm) for module in sac.policy.modules())
 
 
-@pytest.mark.parametrize("many", [{}, {"critics": 4, "target_critics": 2}], ids=["two critics", "drawn critics"])
+@pytest.mark.parametrize(
+    "many", [{}, {"critics": 4, "target_critics": 2}], ids=["two critics", "drawn critics"]
+)
 def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
     sac, rollout = make(uncertainty=True, **many)
     spread(sac)
@@ -160,7 +176,10 @@ def test_uncertainty_is_the_standard_deviation_of_the_critics(many):
     ("options", "message"),
     [
         ({"critics": 1}, "critics=1 must be"),
-        ({"critics": 4, "target_critics": 4}, "target_critics=4 must be at least 1 and less than critics=4"),
+        (
+            {"critics": 4, "target_critics": 4},
+            "target_critics=4 must be at least 1 and less than critics=4",
+        ),
         ({"prior": 0.5}, r"prior=0\.5 needs steps in which a guide acts"),
         ({"prior": 1.5}, r"prior=1\.5 must be"),
     ],

@@ -22,7 +22,9 @@ def linear(**options):
     """A policy with a linear mean of one observation and a global standard deviation."""
     torch.manual_seed(0)
     env = worlds.pendulum()
-    learner = TRPO(env, ["thdot"], hidden=[], action_gain=0.3, action_scale=0.7, damping=0.0, **options)
+    learner = TRPO(
+        env, ["thdot"], hidden=[], action_gain=0.3, action_scale=0.7, damping=0.0, **options
+    )
     return learner, prepared(learner, env, 200)
 
 
@@ -50,7 +52,9 @@ def test_step_is_the_exact_natural_gradient_scaled_to_the_bound():
     standard = ((rows["action"] / 2).clamp(-1 + 1e-6, 1 - 1e-6).atanh() - mean).double() / scale
     advantage = rows["advantage"].double()
     advantage = (advantage - advantage.mean()) / advantage.std()
-    gradient = torch.cat([(advantage * standard / scale * inputs).mean(0), (advantage * (standard**2 - 1)).mean(0)])
+    gradient = torch.cat(
+        [(advantage * standard / scale * inputs).mean(0), (advantage * (standard**2 - 1)).mean(0)]
+    )
     fisher = torch.zeros(3, 3, dtype=torch.float64)
     fisher[:2, :2] = inputs.T @ inputs / len(inputs) / scale**2
     fisher[2, 2] = 2
@@ -58,7 +62,10 @@ def test_step_is_the_exact_natural_gradient_scaled_to_the_bound():
     expected = natural * math.sqrt(2 * bound / (gradient @ natural))
 
     names = [name for name, _ in learner.policy.named_parameters()]
-    order = [next(i for i, name in enumerate(names) if name.endswith(end)) for end in ("weight", "bias", "log_scale")]
+    order = [
+        next(i for i, name in enumerate(names) if name.endswith(end))
+        for end in ("weight", "bias", "log_scale")
+    ]
     before = weights(learner)
     report = learner.improve(rows)
     step = (weights(learner) - before)[order].double()
@@ -75,7 +82,9 @@ def test_bound_holds_and_objective_does_not_get_worse(world, bound):
     for _ in range(2):
         report = learner.improve(prepared(learner, env, 8))
         assert report["kl"] <= bound
-        assert report["loss_objective"] <= 1e-6  # before the step it is minus the mean of what was standardised
+        assert (
+            report["loss_objective"] <= 1e-6
+        )  # before the step it is minus the mean of what was standardised
 
 
 def test_step_is_not_taken_if_the_line_search_fails():

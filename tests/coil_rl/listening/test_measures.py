@@ -7,13 +7,23 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from worlds import cones
 
 from coil_rl.learners import PPO
-from coil_rl.listening.measures import InterceptedPolicy, agreement, gradient, intervention, split_policy
+from coil_rl.listening.measures import (
+    InterceptedPolicy,
+    agreement,
+    gradient,
+    intervention,
+    split_policy,
+)
 
 
 def random_states(count=500, guides=2, size=1):
     torch.manual_seed(0)
     return TensorDict(
-        {"observation": torch.randn(count, 3), "guide_action": torch.rand(count, guides, size) * 2 - 1}, [count]
+        {
+            "observation": torch.randn(count, 3),
+            "guide_action": torch.rand(count, guides, size) * 2 - 1,
+        },
+        [count],
     )
 
 
@@ -24,8 +34,12 @@ def follow_first(states):
 def test_follower_of_the_first_guide_uses_only_that_one():
     states = random_states()
     distance = (states["guide_action"][:, 0] - states["guide_action"][:, 1]).abs().squeeze(-1)
-    assert (agreement(follow_first, states) == torch.stack([torch.zeros_like(distance), distance], 1)).all()
-    change = intervention(follow_first, states, donors=64, generator=torch.Generator().manual_seed(0))
+    assert (
+        agreement(follow_first, states) == torch.stack([torch.zeros_like(distance), distance], 1)
+    ).all()
+    change = intervention(
+        follow_first, states, donors=64, generator=torch.Generator().manual_seed(0)
+    )
     assert (change[:, 1] == 0).all()
     # The mean distance of two independent draws from [-1, 1] is 2/3.
     assert change[:, 0].mean() == pytest.approx(2 / 3, abs=0.04)
@@ -66,15 +80,24 @@ def test_gradient_equals_finite_differences():
 
 
 def test_discrete_action_has_no_gradient():
-    assert gradient(lambda states: (states["guide_action"][:, 0] > 0).float(), random_states()).isnan().all()
+    assert (
+        gradient(lambda states: (states["guide_action"][:, 0] > 0).float(), random_states())
+        .isnan()
+        .all()
+    )
 
 
 def test_interventions_are_seeded_and_do_not_change_the_states():
     states, before = random_states(), random_states()
-    runs = [intervention(follow_first, states, 4, torch.Generator().manual_seed(seed)) for seed in (1, 1, 2)]
+    runs = [
+        intervention(follow_first, states, 4, torch.Generator().manual_seed(seed))
+        for seed in (1, 1, 2)
+    ]
     assert (runs[0] == runs[1]).all()
     assert (runs[0] != runs[2]).any()
-    gradient(lambda states: states.set("more", states["guide_action"])["guide_action"][:, 0], states)
+    gradient(
+        lambda states: states.set("more", states["guide_action"])["guide_action"][:, 0], states
+    )
     assert set(states.keys()) == set(before.keys())
     assert (states == before).all()
 
@@ -84,7 +107,9 @@ def double(state):
 
 
 def test_intercepted_policy_acts_on_changed_advice_and_leaves_that_of_the_env():
-    follow = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
+    follow = TensorDictModule(
+        lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
+    )
     state = cones().reset()
     advice = state["guide_action"].clone()
     acted = InterceptedPolicy(follow, double)(state)
@@ -96,14 +121,18 @@ def test_policy_without_a_change_acts_as_before():
     env = cones()
     policy, state = PPO(env, ["observation", "guide_action"], action_gain=1.0).policy, env.reset()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        assert (policy(state.clone()) == InterceptedPolicy(policy, lambda state: state)(state.clone())).all()
+        assert (
+            policy(state.clone()) == InterceptedPolicy(policy, lambda state: state)(state.clone())
+        ).all()
 
 
 @pytest.mark.parametrize("mode", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
 def test_advice_of_the_first_module_of_a_policy_is_intercepted(mode):
     env = cones()
     actor = PPO(env, ["observation", "guide_action"], action_gain=1.0).policy
-    advise = TensorDictModule(lambda seen: seen[:, None, :1], in_keys=["observation"], out_keys=["guide_action"])
+    advise = TensorDictModule(
+        lambda seen: seen[:, None, :1], in_keys=["observation"], out_keys=["guide_action"]
+    )
     dynamic = ProbabilisticTensorDictSequential(advise, *actor.module)
     state = env.reset().exclude("guide_action")
     actions = []

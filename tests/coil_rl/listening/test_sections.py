@@ -28,10 +28,14 @@ def test_entries_are_before_turns_and_exits_after_them():
     pieces = [sections[0], *(b for a, b in itertools.pairwise(sections) if a != b)]
     assert pieces == ["exit", "straight", "entry", "left"] * 2
     metres = {name: 0.1 * sections.count(name) / 2 for name in SECTIONS}
-    assert metres == pytest.approx({"straight": 32, "left": 6 * np.pi, "right": 0, "entry": 4, "exit": 4}, abs=0.3)
+    assert metres == pytest.approx(
+        {"straight": 32, "left": 6 * np.pi, "right": 0, "entry": 4, "exit": 4}, abs=0.3
+    )
     close = [SECTIONS[section] for section in classify(oval_line(length=5.0), approach=4.0)]
     assert set(close) == {"left", "entry", "exit"}
-    assert close.count("entry") == pytest.approx(close.count("exit"), abs=2), "half-way between close turns"
+    assert close.count("entry") == pytest.approx(close.count("exit"), abs=2), (
+        "half-way between close turns"
+    )
 
 
 def test_sections_do_not_depend_on_the_start_of_the_lap():
@@ -59,7 +63,9 @@ def test_shipped_tracks_turn_once_and_have_all_kinds_of_turns():
 def state(track, positions):
     """Return a state of cars at positions [N, 2] of a track."""
     poses = torch.as_tensor(np.pad(positions, ((0, 0), (0, 1))), dtype=torch.float32)
-    return TensorDict({"info": {"track": torch.full((len(poses), 1), track), "pose": poses}}, [len(poses)])
+    return TensorDict(
+        {"info": {"track": torch.full((len(poses), 1), track), "pose": poses}}, [len(poses)]
+    )
 
 
 def test_cars_are_located_on_their_own_track():

@@ -16,8 +16,12 @@ from coil_rl.transforms import GuideActions
 
 TRACKS = [oval_track("to the left"), oval_track("to the right", clockwise=True)]
 TRACK_SECTIONS = TrackSections(TRACKS)
-EVALUATION = Evaluation([track.name for track in TRACKS], driving_measures(), {"pose": ("info", "pose")})
-FOLLOW = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
+EVALUATION = Evaluation(
+    [track.name for track in TRACKS], driving_measures(), {"pose": ("info", "pose")}
+)
+FOLLOW = TensorDictModule(
+    lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
+)
 
 
 def make_env(cars, seconds=60):
@@ -35,13 +39,17 @@ def rows(found):
     removed = ablations(2, len(SECTIONS))
     env = make_env(2 * len(removed))
     episodes = drive_ablated(env, FOLLOW, TRACK_SECTIONS, EVALUATION, removed, found.advice.mean(0))
-    return table_by_section(found, TRACK_SECTIONS, EVALUATION, dict(zip(removed, episodes, strict=True)))
+    return table_by_section(
+        found, TRACK_SECTIONS, EVALUATION, dict(zip(removed, episodes, strict=True))
+    )
 
 
 def test_every_state_of_every_episode_is_measured(found):
     assert found.guides == ["spline", "random"]
     assert all(episode["completed"] for episode in found.result.episodes)
-    assert [episode["case"] for episode in found.result.episodes] == [track.name for track in TRACKS] * 2
+    assert [episode["case"] for episode in found.result.episodes] == [
+        track.name for track in TRACKS
+    ] * 2
     steps = np.array([episode["steps"] for episode in found.result.episodes])
     assert np.bincount(found.step).tolist() == [(steps > step).sum() for step in range(max(steps))]
     count = steps.sum()
@@ -61,7 +69,11 @@ def test_removing_an_unused_guide_costs_nothing_and_the_followed_one_the_lap(row
         if row["guide"] == "random":
             assert row["lost"] == pytest.approx(0, abs=1e-3)
             assert row["completed"] == 1
-    assert (rows[0]["guide"], rows[0]["section"], rows[0]["completed"]) == ("spline", "everywhere", 0)
+    assert (rows[0]["guide"], rows[0]["section"], rows[0]["completed"]) == (
+        "spline",
+        "everywhere",
+        0,
+    )
     assert rows[0]["lost"] > 100
 
 
@@ -69,16 +81,22 @@ def test_advice_is_replaced_in_its_section_only():
     history = []
 
     def act(advice, pose, track):
-        place = TRACK_SECTIONS.locate(TensorDict({"info": {"track": track, "pose": pose}}, pose.shape[:1]))
+        place = TRACK_SECTIONS.locate(
+            TensorDict({"info": {"track": track, "pose": pose}}, pose.shape[:1])
+        )
         history.append((TRACK_SECTIONS.section(place), advice[:, 0, 0]))
         return advice[:, 1]
 
     keys = ["guide_action", ("info", "pose"), ("info", "track")]
     agent = TensorDictModule(act, in_keys=keys, out_keys=["action"])
     env = ConeTrackEnv(TRACKS, 4, rate=6, laps=1, time_limit=15, assignment="cyclic")
-    env = TransformedEnv(env, GuideActions({"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()}))
+    env = TransformedEnv(
+        env, GuideActions({"noise": RandomGuide(0.5, 1.0), "spline": SplineGuide()})
+    )
     left, replacement = SECTIONS.index("left"), torch.tensor([[0.25], [0.0]])
-    drive_ablated(env, agent, TRACK_SECTIONS, EVALUATION, [Ablation(0, left), Ablation(0)], replacement)
+    drive_ablated(
+        env, agent, TRACK_SECTIONS, EVALUATION, [Ablation(0, left), Ablation(0)], replacement
+    )
     section, advice = (torch.stack(column) for column in zip(*history, strict=True))
     assert ((advice[:, :2] == 0.25) == (section[:, :2] == left)).all()
     assert (section[:, :2] == left).any()
@@ -91,7 +109,9 @@ def test_rows_by_section_add_up_to_the_first_one(found, rows):
         assert everywhere["section"] == "everywhere"
         assert sum(row["share"] for row in parts) == pytest.approx(1)
         for measure in found.measures:
-            assert sum(row["share"] * row[measure] for row in parts) == pytest.approx(everywhere[measure], abs=1e-6)
+            assert sum(row["share"] * row[measure] for row in parts) == pytest.approx(
+                everywhere[measure], abs=1e-6
+            )
 
 
 def test_rows_along_the_track_contain_every_state_once(found):
@@ -105,11 +125,15 @@ def test_rows_along_the_track_contain_every_state_once(found):
             assert total == pytest.approx(float(found.measures[measure][:, slot].sum()), rel=1e-4)
     lines, values = sections.measure_on_lines(found, rows, "agreement")
     assert [len(line) for line in lines] == [len(row) for row in values["random"]]
-    assert set(values["random"][0].tolist()) <= {row["agreement"] for row in rows if row["guide"] == "random"}
+    assert set(values["random"][0].tolist()) <= {
+        row["agreement"] for row in rows if row["guide"] == "random"
+    }
 
 
 def test_rows_must_be_a_multiple_of_the_ablations_and_have_advice():
     with pytest.raises(ValueError, match="4 rows cannot be divided among 3 ablations"):
-        drive_ablated(make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, ablations(2, 5)[:3], torch.zeros(2, 1))
+        drive_ablated(
+            make_env(4), FOLLOW, TRACK_SECTIONS, EVALUATION, ablations(2, 5)[:3], torch.zeros(2, 1)
+        )
     with pytest.raises(ValueError, match="nothing writes guide_action"):
         survey(ConeTrackEnv(TRACKS, 2), FOLLOW, TRACK_SECTIONS, EVALUATION)

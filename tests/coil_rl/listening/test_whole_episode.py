@@ -18,9 +18,13 @@ from coil_rl.transforms import GuideActions
 LENGTHS = [250, 3, 7, 120]
 SECTIONS = WholeEpisode()
 EVALUATION = Evaluation(["a", "b"], {}, {})
-FOLLOW = TensorDictModule(lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"])
+FOLLOW = TensorDictModule(
+    lambda advice: advice[:, 0], in_keys=["guide_action"], out_keys=["action"]
+)
 CHOOSE = TensorDictModule(
-    lambda advice: (advice[:, 0] > 0).to(advice.dtype), in_keys=["guide_action"], out_keys=["action"]
+    lambda advice: (advice[:, 0] > 0).to(advice.dtype),
+    in_keys=["guide_action"],
+    out_keys=["action"],
 )
 FILES = {"listening.csv", "listening.png", "listening_agreement.png", "listening_gradient.png"}
 
@@ -30,7 +34,9 @@ def world(copies=1):
     lengths = torch.tensor(LENGTHS * copies)
     time = torch.linspace(-1, 1, 256)[:, None, None].repeat(1, len(lengths), 1)
     guides = {
-        name: TensorDictModule(lambda seen, sign=sign: sign * seen, in_keys=["time"], out_keys=["action"])
+        name: TensorDictModule(
+            lambda seen, sign=sign: sign * seen, in_keys=["time"], out_keys=["action"]
+        )
         for name, sign in (("time", 1), ("opposite", -1))
     }
     return TransformedEnv(Script(lengths, torch.ones_like(time), time=time), GuideActions(guides))
@@ -45,7 +51,9 @@ def test_every_state_is_measured_in_no_section(found):
     assert found.guides == ["time", "opposite"]
     assert [episode["case"] for episode in found.result.episodes] == ["a", "b", "a", "b"]
     assert [episode["steps"] for episode in found.result.episodes] == LENGTHS
-    assert found.step.tolist() == [step for step in range(max(LENGTHS)) for steps in LENGTHS if step < steps]
+    assert found.step.tolist() == [
+        step for step in range(max(LENGTHS)) for steps in LENGTHS if step < steps
+    ]
     assert (found.section == 0).all()
     assert found.section.shape == found.step.shape
     assert found.place == {}
@@ -61,7 +69,9 @@ def test_pictures_and_numbers_are_along_the_steps(found, tmp_path):
     assert [row["guide"] for row in rows] == [name for name in found.guides for _ in range(84)]
     for slot, guide in enumerate(found.guides):
         own = [row for row in rows if row["guide"] == guide]
-        assert [int(row["from"]) for row in own] == list(range(0, 250, 3)), "at most 100 points, of whole steps"
+        assert [int(row["from"]) for row in own] == list(range(0, 250, 3)), (
+            "at most 100 points, of whole steps"
+        )
         for row in own:
             within = (found.step >= int(row["from"])) & (found.step < int(row["from"]) + 3)
             assert int(row["states"]) == within.sum()
@@ -84,7 +94,9 @@ def test_guides_are_removed_everywhere_only(found):
     removed = ablations(2, len(SECTIONS.names))
     assert removed == [Ablation(0), Ablation(1)]
     agent = TensorDictModule(act, in_keys=["guide_action"], out_keys=["action"])
-    episodes = drive_ablated(world(2), agent, SECTIONS, EVALUATION, removed, torch.tensor([[0.25], [0.5]]))
+    episodes = drive_ablated(
+        world(2), agent, SECTIONS, EVALUATION, removed, torch.tensor([[0.25], [0.5]])
+    )
     advice = torch.stack(seen).squeeze(-1)
     assert (advice[:, :4, 0] == 0.25).all()
     assert (advice[:, 4:, 1] == 0.5).all()
@@ -92,8 +104,9 @@ def test_guides_are_removed_everywhere_only(found):
 
     rows = table_by_section(found, SECTIONS, EVALUATION, dict(zip(removed, episodes, strict=True)))
     assert [(row["guide"], row["section"], row["share"], row["lost"]) for row in rows] == [
-        ("time", "everywhere", 1, 0), ("opposite", "everywhere", 1, 0),
-    ]  # fmt: skip
+        ("time", "everywhere", 1, 0),
+        ("opposite", "everywhere", 1, 0),
+    ]
     assert all("completed" not in row for row in rows)
     for slot, row in enumerate(rows):
         for measure, values in found.measures.items():
@@ -104,6 +117,8 @@ def test_completed_share_is_shown_if_it_is_measured(found):
     measures = {"completed": Measure("reward", "sum", at_least=100)}
     evaluation = Evaluation(["a", "b"], measures, {})
     intact = survey(world(), FOLLOW, SECTIONS, evaluation, donors=2)
-    (episodes,) = drive_ablated(world(), FOLLOW, SECTIONS, evaluation, [Ablation(0)], torch.zeros(2, 1))
+    (episodes,) = drive_ablated(
+        world(), FOLLOW, SECTIONS, evaluation, [Ablation(0)], torch.zeros(2, 1)
+    )
     (row,) = table_by_section(intact, SECTIONS, evaluation, {Ablation(0): episodes})
     assert row["completed"] == 0.5

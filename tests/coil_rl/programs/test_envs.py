@@ -14,22 +14,41 @@ REPLAYS = ["mcap_replay"]  # for coil-replay alone
 # Envs of other libraries, without tracks and guides.
 OTHERS = {
     "gym": ["env.id=Pendulum-v1", "env.max_steps=12"],
-    "torchrl": ["env.of._target_=torchrl.envs.PendulumEnv", "env.max_steps=12", "observes=[th,thdot]"],
+    "torchrl": [
+        "env.of._target_=torchrl.envs.PendulumEnv",
+        "env.max_steps=12",
+        "observes=[th,thdot]",
+    ],
 }
 SMALL_CASES = ["evaluation.cases=3", "evaluation.curve.num_envs=2", "evaluation.gif=false"]
 TRACKED = ["cone_track", "driving_tasks", "simulated_robot"]
-TINY = ["evaluation.repeats=1", "logger=none", "checkpoint_every=1", "budget.frames=256", "budget.num_envs=4",
-        "budget.steps=16"]  # fmt: skip
+TINY = [
+    "evaluation.repeats=1",
+    "logger=none",
+    "checkpoint_every=1",
+    "budget.frames=256",
+    "budget.num_envs=4",
+    "budget.steps=16",
+]
 OWN = {env: ["env.laps=1", "env.time_limit=1"] for env in TRACKED}
 OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
 REPLAY = ["learner.capacity=1000", "learner.starts=64", "learner.batch_size=32", "learner.ratio=1"]
-PROXY = ["proxy.budget.frames=64", "proxy.budget.num_envs=2", "proxy.budget.steps=16",
-         "proxy.learner.regressor.epochs=1"]  # fmt: skip
+PROXY = [
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+    "proxy.learner.regressor.epochs=1",
+]
 LEARNERS = {
     "ppo": ["method=ppo", *PPO],
     "guide": ["method=guide"],
-    "forest": ["method=oil", "learner=forest", "learner.regressor.estimator.n_estimators=5", "learner.validate=false"],
+    "forest": [
+        "method=oil",
+        "learner=forest",
+        "learner.regressor.estimator.n_estimators=5",
+        "learner.validate=false",
+    ],
     "linear": ["method=dagger", "learner=linear"],
     "dynamic_coil": ["method=dynamic_coil_sequential", "guide=[spline,constant]", *PPO, *PROXY],
     "dqn": ["method=coil", "learner=dqn", *REPLAY],
@@ -69,7 +88,9 @@ def test_env_trains_and_is_evaluated_in_its_own_cases(env, tmp_path):
         rows = list(csv.DictReader(file))
     cases = {row["case"] for row in rows} - {"mean"}
     assert (cases == {"0", "1", "2"}) == (env in OTHERS)
-    assert ("completed" in rows[0]) == ("guide" in {row["driver"] for row in rows}) == (env in TRACKED)
+    assert (
+        ("completed" in rows[0]) == ("guide" in {row["driver"] for row in rows}) == (env in TRACKED)
+    )
 
 
 @pytest.mark.slow
@@ -96,8 +117,13 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("env", REPLAYS)
 def test_env_without_rows_is_refused_before_the_training(env, learner, tmp_path):
-    done = called("train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2)
-    assert "McapReplayEnv has no key num_envs, so no policy can act in it; choose another env" in done.stderr
+    done = called(
+        "train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2
+    )
+    assert (
+        "McapReplayEnv has no key num_envs, so no policy can act in it; choose another env"
+        in done.stderr
+    )
     assert len(done.stderr.splitlines()) == 1
     assert not any(tmp_path.iterdir())
 
@@ -118,7 +144,10 @@ def test_env_without_rows_is_refused_before_the_training(env, learner, tmp_path)
             ],
             "evaluation.pictures=info.pose is no entry of the env; it has done, episode_reward",
         ),
-        (["env=simulated_robot", "method=oil"], "track.train gives one track, which cannot be left out to validate"),
+        (
+            ["env=simulated_robot", "method=oil"],
+            "track.train gives one track, which cannot be left out to validate",
+        ),
     ],
 )
 def test_env_that_cannot_be_evaluated_or_validated_is_refused(overrides, words, tmp_path):

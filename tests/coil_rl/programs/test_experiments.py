@@ -12,17 +12,39 @@ from coil_rl.train.check import check
 CONF = Path(__file__).parents[3] / "conf"
 EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 NEEDS_RUNS = ["driving_tasks"]
-TINY = ["track=generated", "track.train.count=2", "track.test.count=2", "env.laps=1", "env.time_limit=1", "env.rate=12",
-        "evaluation.repeats=1", "logger=none", "budget.num_envs=4", "budget.steps=16", "budget.frames=128",
-        "proxy.budget.frames=64", "proxy.budget.num_envs=2", "proxy.budget.steps=16"]  # fmt: skip
+TINY = [
+    "track=generated",
+    "track.train.count=2",
+    "track.test.count=2",
+    "env.laps=1",
+    "env.time_limit=1",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+]
 
 
 def first(experiment, run_dir):
     """Return a very small configuration of the first run of the sweep."""
     # A file that inherits its sweep has no params of its own.
-    params = OmegaConf.select(OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml"), "hydra.sweeper.params") or {}
+    params = (
+        OmegaConf.select(
+            OmegaConf.load(CONF / "experiment" / f"{experiment}.yaml"), "hydra.sweeper.params"
+        )
+        or {}
+    )
     values = {key: str(value).split(",") for key, value in params.items()}
-    chosen = [f"{key}={value[0].strip()}" for key, value in values.items() if not key.startswith("budget.")]
+    chosen = [
+        f"{key}={value[0].strip()}"
+        for key, value in values.items()
+        if not key.startswith("budget.")
+    ]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose("train", [f"+experiment={experiment}", *chosen, *TINY, f"run_dir={run_dir}"])
 

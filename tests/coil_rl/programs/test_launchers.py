@@ -6,8 +6,15 @@ import pytest
 
 from tests.programs import TINY, called, program
 
-SWEEP = [*TINY, "method=coil,guide", "seed=0", "existing=resume", "evaluation.gif=false", "hydra.sweep.dir=sweep",
-         "hydra.sweep.subdir=${label}_seed${seed}"]  # fmt: skip
+SWEEP = [
+    *TINY,
+    "method=coil,guide",
+    "seed=0",
+    "existing=resume",
+    "evaluation.gif=false",
+    "hydra.sweep.dir=sweep",
+    "hydra.sweep.subdir=${label}_seed${seed}",
+]
 LAUNCHERS = {  # extra and overrides of each
     "joblib": ("joblib", ["hydra.launcher.n_jobs=2"]),
     "submitit_local": ("slurm", []),
@@ -29,14 +36,21 @@ def in_this_process(tmp_path_factory):
 
 
 @pytest.mark.parametrize("launcher", LAUNCHERS)
-def test_sweep_gives_the_same_results_and_repeats_only_missing_runs(tmp_path, in_this_process, launcher):
+def test_sweep_gives_the_same_results_and_repeats_only_missing_runs(
+    tmp_path, in_this_process, launcher
+):
     extra, overrides = LAUNCHERS[launcher]
-    if importlib.util.find_spec(f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher") is None:
+    if (
+        importlib.util.find_spec(f"hydra_plugins.hydra_{launcher.partition('_')[0]}_launcher")
+        is None
+    ):
         pytest.skip(f"it is not installed: pip install 'coil-rl[{extra}]'")
     sweep = ["-m", f"hydra/launcher={launcher}", *overrides, *SWEEP]
     program("train", *sweep, cwd=tmp_path)
     assert tables(tmp_path) == in_this_process
-    kept, lost = (tmp_path / "sweep" / name / "evaluation.csv" for name in ("guide_seed0", "coil_seed0"))
+    kept, lost = (
+        tmp_path / "sweep" / name / "evaluation.csv" for name in ("guide_seed0", "coil_seed0")
+    )
     lost.unlink()
     before = kept.stat().st_mtime_ns
     program("train", *sweep, cwd=tmp_path)

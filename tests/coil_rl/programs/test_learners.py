@@ -10,25 +10,46 @@ from coil_rl.train.build import build_env, build_learner
 from coil_rl.train.check import check
 from coil_rl.train.rollout import Rollout
 
-METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
+METHODS = sorted(
+    file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
+)
 DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]
 IMITATION = ["dagger", "oil"]
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.num_envs=4", "budget.steps=8"]
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "budget.num_envs=4",
+    "budget.steps=8",
+]
 OFF_POLICY = ["learner.starts=16", "learner.batch_size=8", "learner.ratio=1", "learner.hidden=[8]"]
-GIVEN = {"dqn": OFF_POLICY, "sac": OFF_POLICY, "ppo": ["learner.epochs=1", "learner.minibatches=2", "action=choices"]}
+GIVEN = {
+    "dqn": OFF_POLICY,
+    "sac": OFF_POLICY,
+    "ppo": ["learner.epochs=1", "learner.minibatches=2", "action=choices"],
+}
 
-REFUSED = {method: "needs a learner that imitates a guide, such as learner=forest, but" for method in IMITATION}
-REFUSED |= {method: "needs a learner that improves its guides, such as learner=dynamic_coil, but" for method in DYNAMIC}
+REFUSED = {
+    method: "needs a learner that imitates a guide, such as learner=forest, but"
+    for method in IMITATION
+}
+REFUSED |= {
+    method: "needs a learner that improves its guides, such as learner=dynamic_coil, but"
+    for method in DYNAMIC
+}
 OTHER_LEARNER = r"learner: (DQN|PPO|IBRL|Advisor) takes no \w+; it takes env, in_keys,"
 REFUSED_BY = {
     "dqn": dict.fromkeys(
-        ["advisor", "cheq", "ibrl", "imitate_then_ppo", "kickstart", "q_filter", "rlpd", "wsrl"], OTHER_LEARNER
+        ["advisor", "cheq", "ibrl", "imitate_then_ppo", "kickstart", "q_filter", "rlpd", "wsrl"],
+        OTHER_LEARNER,
     ),
     "sac": {"advisor": OTHER_LEARNER},
     "ppo": dict.fromkeys(["cheq", "ibrl", "q_filter", "rlpd", "wsrl"], OTHER_LEARNER),
 }
 for without_replay in ("dqn", "sac"):
-    REFUSED_BY[without_replay]["mixing"] = "learner: weight of MixedAction changes over the run, so stored steps would"
+    REFUSED_BY[without_replay]["mixing"] = (
+        "learner: weight of MixedAction changes over the run, so stored steps would"
+    )
 BY_GUIDE = ["jump_start", "policy_decorator"]  # its steps may be none that the agent could take
 
 
@@ -43,13 +64,25 @@ def refusal(method, learner):
 
 PAIRS = [(method, learner) for method in METHODS if method != "guide" for learner in GIVEN]
 # The other pairs are refused for the same reasons.
-REFUSED_FAST = [("oil", "ppo"), ("dagger", "dqn"), ("dynamic_coil_sequential", "sac"), ("kickstart", "dqn"),
-                ("mixing", "sac"), ("ibrl", "ppo"), ("advisor", "sac"), ("rlpd", "dqn")]  # fmt: skip
+REFUSED_FAST = [
+    ("oil", "ppo"),
+    ("dagger", "dqn"),
+    ("dynamic_coil_sequential", "sac"),
+    ("kickstart", "dqn"),
+    ("mixing", "sac"),
+    ("ibrl", "ppo"),
+    ("advisor", "sac"),
+    ("rlpd", "dqn"),
+]
 
 
 @pytest.mark.parametrize(
     ("method", "learner"),
-    [pytest.param(*pair, marks=[] if pair in REFUSED_FAST else pytest.mark.slow) for pair in PAIRS if refusal(*pair)],
+    [
+        pytest.param(*pair, marks=[] if pair in REFUSED_FAST else pytest.mark.slow)
+        for pair in PAIRS
+        if refusal(*pair)
+    ],
 )
 def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
@@ -57,14 +90,29 @@ def test_incompatible_method_and_learner_are_refused(method, learner, tmp_path):
         check(config)
 
 
-FAST = [("coil_rfc", "dqn"), ("residual_coil", "dqn"), ("jump_start", "dqn"), ("coil", "sac"), ("residual", "sac"),
-        ("coil_multi", "ppo"), ("kickstart", "sac"), ("policy_decorator", "dqn"), ("advisor", "ppo"),
-        ("coil_anchored", "dqn"), ("coil_anchored", "sac"), ("coil_dropout", "sac")]  # fmt: skip
+FAST = [
+    ("coil_rfc", "dqn"),
+    ("residual_coil", "dqn"),
+    ("jump_start", "dqn"),
+    ("coil", "sac"),
+    ("residual", "sac"),
+    ("coil_multi", "ppo"),
+    ("kickstart", "sac"),
+    ("policy_decorator", "dqn"),
+    ("advisor", "ppo"),
+    ("coil_anchored", "dqn"),
+    ("coil_anchored", "sac"),
+    ("coil_dropout", "sac"),
+]
 
 
 @pytest.mark.parametrize(
     ("method", "learner"),
-    [pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow) for pair in PAIRS if not refusal(*pair)],
+    [
+        pytest.param(*pair, marks=[] if pair in FAST else pytest.mark.slow)
+        for pair in PAIRS
+        if not refusal(*pair)
+    ],
 )
 def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
@@ -81,13 +129,28 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
 @pytest.mark.parametrize(
     ("overrides", "sentence"),
     [
-        ("learner=dqn action=continuous", "DQN needs discrete actions, but this env has continuous ones"),
-        ("learner=sac action=choices", "SAC needs continuous actions, but this env has discrete ones"),
-        ("method=ppo learner=dynamic_coil", "such as learner=ppo, but DynamicCoil is one that improves its guides"),
+        (
+            "learner=dqn action=continuous",
+            "DQN needs discrete actions, but this env has continuous ones",
+        ),
+        (
+            "learner=sac action=choices",
+            "SAC needs continuous actions, but this env has discrete ones",
+        ),
+        (
+            "method=ppo learner=dynamic_coil",
+            "such as learner=ppo, but DynamicCoil is one that improves its guides",
+        ),
         ("method=dynamic_coil_sequential action=choices", "Dynamic COIL needs continuous actions"),
         ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
-        ("learner=dqn action.choices=[0.0,2.0]", r"choices=\[0.0, 2.0\] must lie between the action's bounds -1.0"),
-        ("learner=dqn learner.capacity=10", "learner: capacity=10 must be at least 1 and at least starts=5000"),
+        (
+            "learner=dqn action.choices=[0.0,2.0]",
+            r"choices=\[0.0, 2.0\] must lie between the action's bounds -1.0",
+        ),
+        (
+            "learner=dqn learner.capacity=10",
+            "learner: capacity=10 must be at least 1 and at least starts=5000",
+        ),
     ],
 )
 def test_other_incompatible_choices_are_refused(overrides, sentence, tmp_path):
@@ -100,5 +163,9 @@ def test_off_policy_learners_set_their_action_and_batch(tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         dqn, sac, ppo = (compose("train", [f"learner={name}"]) for name in ("dqn", "sac", "ppo"))
     assert (dqn.action.choices, dict(sac.action), dict(ppo.action)) == (5, {}, {})
-    assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [512, 512, 6_144]
+    assert [config.budget.num_envs * config.budget.steps for config in (dqn, sac, ppo)] == [
+        512,
+        512,
+        6_144,
+    ]
     assert len({config.budget.frames for config in (dqn, sac, ppo)}) == 1

@@ -7,9 +7,13 @@ from run_folders import make_untrained_run
 TRACKS = ["track=generated", "track.test.count=1", "track.train.count=1"]
 FEW = [*TRACKS, "evaluation.repeats=1", "donors=2"]
 FILES = {
-    "listening.csv", "listening.md", "listening.png", "listening_agreement.png", "listening_gradient.png",
+    "listening.csv",
+    "listening.md",
+    "listening.png",
+    "listening_agreement.png",
+    "listening_gradient.png",
     "listening_sections.csv",
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +55,10 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
 
 def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_path):
     listen(tmp_path, f"run={runs / 'anchored'}", *FEW, "hydra.run.dir=out")
-    assert "Weight of the anchor: spline 1.00, random 0.00." in (tmp_path / "out" / "listening.md").read_text()
+    assert (
+        "Weight of the anchor: spline 1.00, random 0.00."
+        in (tmp_path / "out" / "listening.md").read_text()
+    )
     everywhere = {
         row["guide"]: float(row["gradient"])
         for row in read_csv(tmp_path / "out" / "listening_sections.csv")
@@ -63,7 +70,9 @@ def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_pat
 
 def test_discrete_actions_are_equal_or_different(runs, tmp_path):
     out, _ = listen(tmp_path, f"run={runs / 'dqn'}", *FEW, "hydra.run.dir=out")
-    assert out.splitlines()[-1].startswith("coil_dqn depends most on spline: other advice of it changes the action by")
+    assert out.splitlines()[-1].startswith(
+        "coil_dqn depends most on spline: other advice of it changes the action by"
+    )
     assert "gradient" not in out
     files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
     assert files == FILES - {"listening_gradient.png"}
@@ -84,12 +93,20 @@ def test_numbers_are_reproducible(runs, tmp_path):
     ("arguments", "message"),
     [
         ("", "run must be given: write run=VALUE"),
-        ("run={runs}/ppo", "does not use advice: the policy does not read guide_action; it reads observation"),
+        (
+            "run={runs}/ppo",
+            "does not use advice: the policy does not read guide_action; it reads observation",
+        ),
         ("run={runs}/guide", "has no agent, only a guide"),
-        ("run={runs}/coil evaluation.sections.bin=0", "evaluation.sections: bin=0 must be at least 0.1"),
+        (
+            "run={runs}/coil evaluation.sections.bin=0",
+            "evaluation.sections: bin=0 must be at least 0.1",
+        ),
     ],
 )
-def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(arguments, message, runs, tmp_path):
+def test_mistakes_are_one_sentence_with_exit_code_2_and_leave_no_file(
+    arguments, message, runs, tmp_path
+):
     _, error = listen(tmp_path, *arguments.format(runs=runs).split(), *TRACKS, code=2)
     (sentence,) = error.splitlines()
     assert sentence.startswith("listen: ")

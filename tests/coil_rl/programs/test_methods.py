@@ -15,18 +15,48 @@ from coil_rl.programs.train import resume, train
 from coil_rl.train import checkpoint, fallback
 from coil_rl.train.check import check
 
-METHODS = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml"))
+METHODS = sorted(
+    file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
+)
 # Their parts are also tested with another method.
 SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc"]
-SLOW += ["dynamic_coil_agent_only", "dynamic_coil_guide_only", "dynamic_coil_joint", "dynamic_coil_stochastic"]
+SLOW += [
+    "dynamic_coil_agent_only",
+    "dynamic_coil_guide_only",
+    "dynamic_coil_joint",
+    "dynamic_coil_stochastic",
+]
 TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
-TINY = [*TRACKS, "env.laps=1", "env.time_limit=1", "env.rate=12", "evaluation.repeats=1", "evaluation.gif=false",
-        "logger=none", "checkpoint_every=1", "budget.num_envs=4", "budget.steps=16", "budget.frames=128"]  # fmt: skip
+TINY = [
+    *TRACKS,
+    "env.laps=1",
+    "env.time_limit=1",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "checkpoint_every=1",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+]
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
-SMALL_PROXY = [*PPO, "guide=[zero,constant]", "proxy.budget.frames=64", "proxy.budget.num_envs=2",
-               "proxy.budget.steps=16", "proxy.learner.regressor.epochs=1"]  # fmt: skip
+SMALL_PROXY = [
+    *PPO,
+    "guide=[zero,constant]",
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+    "proxy.learner.regressor.epochs=1",
+]
 SMALL = {"oil": ["learner=linear", "learner.validate=false"], "dagger": ["learner=linear"]}
-REPLAY = ["learner.batch_size=8", "learner.ratio=1", "learner.starts=16", "learner.hidden=[8]", "learner.critics=3"]
+REPLAY = [
+    "learner.batch_size=8",
+    "learner.ratio=1",
+    "learner.starts=16",
+    "learner.hidden=[8]",
+    "learner.critics=3",
+]
 SMALL |= {
     "coil_anchored": [*PPO, "learner.anchor.cases=4"],
     "cheq": REPLAY,
@@ -58,7 +88,8 @@ def proxies(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    "method", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in METHODS]
+    "method",
+    [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in METHODS],
 )
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
     run = trained(tmp_path / "run", method, proxies)
@@ -68,7 +99,11 @@ def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_pat
         (stopped / name).unlink(missing_ok=True)
     resume(stopped)
     for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
-        assert (run / name).exists() == (stopped / name).exists() == (method != "guide" or name[0] == "e")
+        assert (
+            (run / name).exists()
+            == (stopped / name).exists()
+            == (method != "guide" or name[0] == "e")
+        )
         if (run / name).exists() and not (name == "policy_last.pt" and method in SKLEARN):
             assert (run / name).read_bytes() == (stopped / name).read_bytes()
     assert method == "guide" or "continues after update 1" in capsys.readouterr().err
@@ -86,7 +121,11 @@ def plain(tmp_path_factory):
 
 def rows(folder, **where):
     with (folder / "evaluation.csv").open(newline="") as file:
-        return [row for row in csv.DictReader(file) if all(row[key] == value for key, value in where.items())]
+        return [
+            row
+            for row in csv.DictReader(file)
+            if all(row[key] == value for key, value in where.items())
+        ]
 
 
 def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
@@ -94,18 +133,29 @@ def test_existing_resume_does_not_repeat_a_finished_run(residual, capsys):
     trained(residual, "residual", "label=mine", "existing=resume")
     assert {file: file.stat().st_mtime_ns for file in before} == before
     assert "mine: mean test reward" in capsys.readouterr().out
-    with pytest.raises(UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9; choose another"):
+    with pytest.raises(
+        UserError, match=r"residual holds a run with learner.gamma=0.99, not 0.9; choose another"
+    ):
         trained(residual, "residual", "label=mine", "existing=resume", "learner.gamma=0.9")
 
 
 def test_trained_agent_is_evaluated_with_other_advice(residual, tmp_path):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("evaluate", [*TRACKS, f"run={residual}", "evaluation.repeats=1", f"run_dir={tmp_path}",
-                                      "degrade=[zeroed,adversarial]"])  # fmt: skip
+        config = compose(
+            "evaluate",
+            [
+                *TRACKS,
+                f"run={residual}",
+                "evaluation.repeats=1",
+                f"run_dir={tmp_path}",
+                "degrade=[zeroed,adversarial]",
+            ],
+        )
     evaluate.evaluate(config)
     assert {row["driver"] for row in rows(tmp_path)} == {"guide", "mine"}
     normal, zeroed, adversarial = (
-        rows(tmp_path, driver="mine", actions="deterministic", advice=name) for name in ("", "zeroed", "adversarial")
+        rows(tmp_path, driver="mine", actions="deterministic", advice=name)
+        for name in ("", "zeroed", "adversarial")
     )
     trained_rows = rows(residual, driver="mine", actions="deterministic")
     assert [row["reward"] for row in normal] == [row["reward"] for row in trained_rows]
@@ -126,7 +176,9 @@ def test_rfc_logs_the_reward_of_the_task_alone(tmp_path, plain):
 
 def test_jump_start_without_steps_is_ppo_to_the_bit(tmp_path, plain):
     jumped = trained(tmp_path / "jump", "jump_start", "method.transforms.jump_start.horizon=0")
-    first, other = (torch.load(run / "policy_last.pt", weights_only=True) for run in (jumped, plain))
+    first, other = (
+        torch.load(run / "policy_last.pt", weights_only=True) for run in (jumped, plain)
+    )
     assert all(torch.equal(first[key], other[key]) for key in other)
 
 
@@ -147,8 +199,16 @@ def test_first_round_of_dagger_collects_the_data_of_oil(tmp_path):
 
 def test_every_one_of_several_guides_is_evaluated(tmp_path):
     run = trained(tmp_path / "run", "coil_multi", "guide=[zero,spline]")
-    assert [row["driver"] for row in rows(run)][::3] == ["guide zero", "guide spline", "coil_multi", "coil_multi"]
-    assert list(json.loads((run / "guide_return.json").read_text())) == ["guide zero", "guide spline"]
+    assert [row["driver"] for row in rows(run)][::3] == [
+        "guide zero",
+        "guide spline",
+        "coil_multi",
+        "coil_multi",
+    ]
+    assert list(json.loads((run / "guide_return.json").read_text())) == [
+        "guide zero",
+        "guide spline",
+    ]
     alone = trained(tmp_path / "alone", "guide")
     assert rows(run, driver="guide spline")[0]["reward"] == rows(alone)[0]["reward"]
     degraded = trained(tmp_path / "degraded", "guide", "degrade=[adversarial]")
@@ -157,12 +217,22 @@ def test_every_one_of_several_guides_is_evaluated(tmp_path):
 
 def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_path, plain):
     run = trained(tmp_path / "run", "coil")
-    overrides = [*TRACKS, f"run={run}", "evaluation.repeats=1", f"run_dir={tmp_path}", "evaluation.fallback=true"]
+    overrides = [
+        *TRACKS,
+        f"run={run}",
+        "evaluation.repeats=1",
+        f"run_dir={tmp_path}",
+        "evaluation.fallback=true",
+    ]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         evaluate.evaluate(compose("evaluate", overrides))
     text = (tmp_path / "evaluation.md").read_text()
     assert "With fallback the guide acted in " in text
     assert "Not worse than guide on these 2 cases: " in text
     assert len(rows(tmp_path, driver="coil or guide")) == 3
-    with pytest.raises(UserError, match=r"evaluation.fallback=true has no effect on .*ppo: its agent has no guide"):
-        fallback.build_fallback(composed("ppo", plain, "evaluation.fallback=true"), plain, torch.nn.Module())
+    with pytest.raises(
+        UserError, match=r"evaluation.fallback=true has no effect on .*ppo: its agent has no guide"
+    ):
+        fallback.build_fallback(
+            composed("ppo", plain, "evaluation.fallback=true"), plain, torch.nn.Module()
+        )

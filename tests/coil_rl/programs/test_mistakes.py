@@ -23,7 +23,13 @@ from coil_rl.train import checkpoint, evaluate_run
 from coil_rl.train.build import build_env, build_learner
 from coil_rl.train.check import check
 
-TINY = ["budget.num_envs=8", "budget.steps=32", "track=generated", "track.train.count=1", "track.test.count=1"]
+TINY = [
+    "budget.num_envs=8",
+    "budget.steps=32",
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+]
 
 
 @pytest.fixture
@@ -58,83 +64,210 @@ def refusal(name, *arguments):
         # keys
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("sed=1", "resume; did you mean seed?"),
-        ("budget.step=1", "no key budget.step; budget has frames, num_envs, steps, minibatches; did you mean steps?"),
-        ("learner.learning_rat=1", "+learner.learning_rat=VALUE adds it; did you mean learning_rate?"),
+        (
+            "budget.step=1",
+            "no key budget.step; budget has frames, num_envs, steps, minibatches; did you mean steps?",
+        ),
+        (
+            "learner.learning_rat=1",
+            "+learner.learning_rat=VALUE adds it; did you mean learning_rate?",
+        ),
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),
-        ("+budget.frame=1", "there is no key frame; budget has frames, num_envs, steps, minibatches"),
-        ("training.env.laps=1", "there is no key training.env.laps; training.env has none; +training"),
-        ("+watch.epsode.a=[reward]", "no key watch.epsode; watch has episode, step; did you mean episode?"),
+        (
+            "+budget.frame=1",
+            "there is no key frame; budget has frames, num_envs, steps, minibatches",
+        ),
+        (
+            "training.env.laps=1",
+            "there is no key training.env.laps; training.env has none; +training",
+        ),
+        (
+            "+watch.epsode.a=[reward]",
+            "no key watch.epsode; watch has episode, step; did you mean episode?",
+        ),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
         ("seed=abc", "seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
         ("budget=5", "budget=5: Invalid type assigned: int is not a subclass of BudgetConfig"),
-        ("method.observes=5", "method.observes=5: Invalid value assigned: int is not a ListConfig, list or tuple"),
+        (
+            "method.observes=5",
+            "method.observes=5: Invalid value assigned: int is not a ListConfig, list or tuple",
+        ),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("learner.gamma=nan", "learner.gamma=nan must be a finite number"),
         ("learner.hidden=[64,a]", "learner.hidden[1]='a' must be a valid integer"),
-        ("proxy.method=x", "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig"),
+        (
+            "proxy.method=x",
+            "proxy.method=x: Invalid type assigned: str is not a subclass of MethodConfig",
+        ),
         # values
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
-        ("budget.num_envs=100000 budget.steps=10000", "budget.num_envs x budget.steps=1000000000 must be at most"),
+        (
+            "budget.num_envs=100000 budget.steps=10000",
+            "budget.num_envs x budget.steps=1000000000 must be at most",
+        ),
         ("device=tpu", "device=tpu must be cpu, cuda, or one GPU such as cuda:0"),
         ("preset.rate=1e23", "env: rate=1e+23 must be more than 0 and at most 1000"),
         ("env.time_limit=1e300", "env: time_limit=1e+300 must be more than 0 and at most 1000000"),
-        ("env.laps=999999999999999999", "env: laps=999999999999999999 must be more than 0 and at most 1000000"),
-        ("learner.hidden=[99999999]", "learner: hidden=99999999 must be at least 1 and at most 4096"),
-        (f"learner.hidden={[8] * 17}".replace(" ", ""), "learner: hidden_layers=17 must be at least 0 and at most 16"),
+        (
+            "env.laps=999999999999999999",
+            "env: laps=999999999999999999 must be more than 0 and at most 1000000",
+        ),
+        (
+            "learner.hidden=[99999999]",
+            "learner: hidden=99999999 must be at least 1 and at most 4096",
+        ),
+        (
+            f"learner.hidden={[8] * 17}".replace(" ", ""),
+            "learner: hidden_layers=17 must be at least 0 and at most 16",
+        ),
         ("proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
         ("env.cone_bonus=all", "env.cone_bonus='all' must be 'first_sighting' or 'every_sighting'"),
         ("track.train.count=0", "count=0 of random_tracks must be from 1 to 10000"),
         ("method.observes=[lidar]", "the env has no entry lidar to observe; it has observation"),
         ("watch.step.reward_finish=1e-300", "watch.step.reward_finish=1e-300 must be a list"),
-        ("evaluation.measures.clearance.format=nan", "format='nan' must be a format of numbers, such as .1f"),
-        ("watch.step.smoothness=null", "watch.step.smoothness=None must be a list, such as [info, lap]"),
+        (
+            "evaluation.measures.clearance.format=nan",
+            "format='nan' must be a format of numbers, such as .1f",
+        ),
+        (
+            "watch.step.smoothness=null",
+            "watch.step.smoothness=None must be a list, such as [info, lap]",
+        ),
         ("+watch.step.r=reward", "watch.step.r=reward must be a list"),
         ("watch.step.smoothness=[info,smoothnes]", "is no entry of the env; it has cone_count"),
-        ("evaluation.measures.crashed.entry=[info,crash]", "evaluation.measures.crashed=info.crash is no entry of the"),
-        ("evaluation.measures.laps.where=[info,flag]", "evaluation.measures.laps=info.flag is no entry of the env"),
-        ("evaluation.measures.laps.reduction=median", "evaluation.measures.laps.reduction='median' must be 'mean'"),
-        ("+evaluation.measures.laps.unit=s", "there is no key unit; evaluation.measures.laps has entry, red"),
-        ("evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2", "at_least and at_most cannot both"),
-        ("evaluation.pictures.lines._target_=coil_rl.report.Nope", "evaluation.pictures.lines: there is no 'coil_rl"),
-        ("~evaluation.curve.cases.selection", "evaluation.curve.cases has evaluation; give evaluation and selection"),
+        (
+            "evaluation.measures.crashed.entry=[info,crash]",
+            "evaluation.measures.crashed=info.crash is no entry of the",
+        ),
+        (
+            "evaluation.measures.laps.where=[info,flag]",
+            "evaluation.measures.laps=info.flag is no entry of the env",
+        ),
+        (
+            "evaluation.measures.laps.reduction=median",
+            "evaluation.measures.laps.reduction='median' must be 'mean'",
+        ),
+        (
+            "+evaluation.measures.laps.unit=s",
+            "there is no key unit; evaluation.measures.laps has entry, red",
+        ),
+        (
+            "evaluation.measures.laps.at_least=1 evaluation.measures.laps.at_most=2",
+            "at_least and at_most cannot both",
+        ),
+        (
+            "evaluation.pictures.lines._target_=coil_rl.report.Nope",
+            "evaluation.pictures.lines: there is no 'coil_rl",
+        ),
+        (
+            "~evaluation.curve.cases.selection",
+            "evaluation.curve.cases has evaluation; give evaluation and selection",
+        ),
         ("label=guide", "label=guide cannot be used"),
         ("guide=constant guide.constant.value=[1,2]", "has the shape [1, 2], but must have [1, 1]"),
         # targets
-        ("guide.spline._target_=coil_rl.guides.Nope", "guide.spline: there is no 'coil_rl.guides.Nope'; check"),
+        (
+            "guide.spline._target_=coil_rl.guides.Nope",
+            "guide.spline: there is no 'coil_rl.guides.Nope'; check",
+        ),
         ("guide.spline._target_=coil_rl.guides.spline.FAR", "is 1000.0, which cannot be called"),
         ("guide=zero guide.zero._target_=builtins.dict", "makes dict, not TensorDictModuleBase"),
-        ("guide=zero guide.zero._target_=subprocess.run", "guide.zero: Target 'subprocess.run' is blocklisted"),
+        (
+            "guide=zero guide.zero._target_=subprocess.run",
+            "guide.zero: Target 'subprocess.run' is blocklisted",
+        ),
         # groups
-        ("guide=splin", "no guide=splin; guide can be authors, bot, centre_fast, constant, controller"),
-        ("+guide=random", "Multiple values for guide. To override a value use 'override guide: random'"),
+        (
+            "guide=splin",
+            "no guide=splin; guide can be authors, bot, centre_fast, constant, controller",
+        ),
+        (
+            "+guide=random",
+            "Multiple values for guide. To override a value use 'override guide: random'",
+        ),
         ("+experiment=nope", "no experiment=nope; experiment can be advice, advice_better_guide"),
-        ("hydra/launcher=submitit_slurm", "is not installed: python -m pip install 'coil-rl[slurm]'"),
-        ("+degrade=${pid:}", "the command line cannot be composed; give each group a name, GROUP=CHOICE"),
+        (
+            "hydra/launcher=submitit_slurm",
+            "is not installed: python -m pip install 'coil-rl[slurm]'",
+        ),
+        (
+            "+degrade=${pid:}",
+            "the command line cannot be composed; give each group a name, GROUP=CHOICE",
+        ),
         (f"method={'x' * 300}", "... cannot be used (File name too long); choose a shorter name"),
         ("experiment=coil_vs_ppo", "To append to your default list use +experiment=coil_vs_ppo"),
         # combinations
-        ("evaluation.measures.laps.entry=1", "evaluation.measures.laps: 1 is no entry; name one, as in reward or"),
-        ("guide=linear_feedback", "guide.linear_feedback: it cannot act on the observations of this env (The size of"),
-        ("degrade=[noisy] degrade.noisy.sigma=-1", "degrade.noisy: sigma=-1 must be a finite number of at least 0"),
-        ("method=coil degrade=[shuffled] track.train.count=2", "each case of the evaluation has one row, 1 in all: "),
-        ("method=coil +degrade@evaluation.advice.other=shuffled", "1 in all: method.transforms: ShuffledAdvice"),
-        ("method=oil", "track.train gives one track, which cannot be left out to validate; set learner.group_key=null"),
-        ("method=dynamic_coil_joint proxy.learner.regressor.epochs=-1", "guide.spline: learner: epochs=-1 must"),
-        ("method=dynamic_coil_joint proxy.method.observes=null", "proxy.method.observes: a proxy needs observations"),
-        ("observes=[] method=ppo", "observes=[]: the agent has no observations; give the entries of the env"),
-        ("guide=none", "guide: there is none, but method=coil needs one; give guide=NAME, or method=ppo"),
-        ("method=dynamic_coil_joint ~proxy.method.transforms.advice", "guide.spline: method.transforms.advice="),
-        ("guide=learned guide.learned.run=nowhere", "guide.learned: run=nowhere is not the folder of a run"),
-        ("method=rfc +method.transforms.coupling.guide=1", "method.transforms: RewardCoupling reads row 1 of"),
+        (
+            "evaluation.measures.laps.entry=1",
+            "evaluation.measures.laps: 1 is no entry; name one, as in reward or",
+        ),
+        (
+            "guide=linear_feedback",
+            "guide.linear_feedback: it cannot act on the observations of this env (The size of",
+        ),
+        (
+            "degrade=[noisy] degrade.noisy.sigma=-1",
+            "degrade.noisy: sigma=-1 must be a finite number of at least 0",
+        ),
+        (
+            "method=coil degrade=[shuffled] track.train.count=2",
+            "each case of the evaluation has one row, 1 in all: ",
+        ),
+        (
+            "method=coil +degrade@evaluation.advice.other=shuffled",
+            "1 in all: method.transforms: ShuffledAdvice",
+        ),
+        (
+            "method=oil",
+            "track.train gives one track, which cannot be left out to validate; set learner.group_key=null",
+        ),
+        (
+            "method=dynamic_coil_joint proxy.learner.regressor.epochs=-1",
+            "guide.spline: learner: epochs=-1 must",
+        ),
+        (
+            "method=dynamic_coil_joint proxy.method.observes=null",
+            "proxy.method.observes: a proxy needs observations",
+        ),
+        (
+            "observes=[] method=ppo",
+            "observes=[]: the agent has no observations; give the entries of the env",
+        ),
+        (
+            "guide=none",
+            "guide: there is none, but method=coil needs one; give guide=NAME, or method=ppo",
+        ),
+        (
+            "method=dynamic_coil_joint ~proxy.method.transforms.advice",
+            "guide.spline: method.transforms.advice=",
+        ),
+        (
+            "guide=learned guide.learned.run=nowhere",
+            "guide.learned: run=nowhere is not the folder of a run",
+        ),
+        (
+            "method=rfc +method.transforms.coupling.guide=1",
+            "method.transforms: RewardCoupling reads row 1 of",
+        ),
         ("method=rfc ~method.transforms.advice", "but there is no advice; put GuideActions with"),
     ],
-)  # fmt: skip
+)
 def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, message):
     monkeypatch.chdir(tmp_path)
-    errors = (UserError, OmegaConfBaseException, HydraException, ValueError, OSError, AssertionError)
-    with initialize_config_module("coil_rl.conf", version_base="1.3"), pytest.raises(errors) as caught:
+    errors = (
+        UserError,
+        OmegaConfBaseException,
+        HydraException,
+        ValueError,
+        OSError,
+        AssertionError,
+    )
+    with (
+        initialize_config_module("coil_rl.conf", version_base="1.3"),
+        pytest.raises(errors) as caught,
+    ):
         check(compose("train", [*TINY, "run_dir=run", *arguments.split()]))
     text = sentence(caught.value)
     assert message in text
@@ -149,12 +282,18 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
-        ("guide=splin", "no guide=splin; guide can be authors, bot, centre_fast, constant, controller"),
+        (
+            "guide=splin",
+            "no guide=splin; guide can be authors, bot, centre_fast, constant, controller",
+        ),
         # command line
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
         ("=3", "'=3' has no key, write KEY=VALUE"),
         ("seed=1,2", "Ambiguous value for argument 'seed=1,2'"),
-        ("env.rate=${nope}", "env.rate refers to nope, which does not exist; choose another env, or give env.rate="),
+        (
+            "env.rate=${nope}",
+            "env.rate refers to nope, which does not exist; choose another env, or give env.rate=",
+        ),
         ("--nope", "unrecognized arguments: --nope"),
         ("--config-dir=nope", "nope' not found"),
         # folders
@@ -166,10 +305,14 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("track=folder track.dir=/nowhere", "/nowhere cannot be read (No such file or directory)"),
         ("-m seed=-1,0", "seed=-1 must be greater than or equal to 0"),
     ],
-)  # fmt: skip
-def test_mistake_ends_the_program_with_exit_code_2_and_leaves_no_folder(started, arguments, message):
+)
+def test_mistake_ends_the_program_with_exit_code_2_and_leaves_no_folder(
+    started, arguments, message
+):
     overrides = [*TINY[: 2 if "track=" in arguments else None], *arguments.split()]
-    assert message in refusal("train", *sorted(overrides, key=lambda override: not override.startswith("-")))
+    assert message in refusal(
+        "train", *sorted(overrides, key=lambda override: not override.startswith("-"))
+    )
     assert not started
 
 
@@ -197,7 +340,9 @@ def run(tmp_path_factory):
         config = compose("train", [*TINY, "logger=none", f"run_dir={folder}"])
     policy = build_learner(config, build_env(config)).policy
     checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
-    OmegaConf.save(OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml")
+    OmegaConf.save(
+        OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml"
+    )
     return folder
 
 
@@ -238,18 +383,35 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
 
 
 @pytest.mark.parametrize("name", ["evaluate", "listen"])
-@pytest.mark.parametrize("change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"])
+@pytest.mark.parametrize(
+    "change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"]
+)
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
-    assert f"{change} has no effect: run={run} has its own configuration; what can be changed is run, track" in sentence
+    assert (
+        f"{change} has no effect: run={run} has its own configuration; what can be changed is run, track"
+        in sentence
+    )
 
 
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
-        ("evaluate", "method=ppo", "method=ppo has no effect: a guide is evaluated without an agent"),
-        ("distill", "degrade=[noisy]", "degrade=[noisy] has no effect: a proxy is trained as the key proxy says"),
-        ("distill", "proxy.budget.frames=-5", "proxy.budget.frames=-5 must be greater than or equal to 1"),
+        (
+            "evaluate",
+            "method=ppo",
+            "method=ppo has no effect: a guide is evaluated without an agent",
+        ),
+        (
+            "distill",
+            "degrade=[noisy]",
+            "degrade=[noisy] has no effect: a proxy is trained as the key proxy says",
+        ),
+        (
+            "distill",
+            "proxy.budget.frames=-5",
+            "proxy.budget.frames=-5 must be greater than or equal to 1",
+        ),
         (
             "distill",
             "proxy.learner._target_=coil_rl.learners.PPO",
@@ -267,7 +429,9 @@ def test_missing_extra_is_named(monkeypatch):
     # What an earlier test has imported needs Box2D no more.
     for module in [module for module in sys.modules if module.startswith("gymnasium.envs.box2d")]:
         monkeypatch.delitem(sys.modules, module)
-    assert refusal("train", "env=lunar_lander").endswith("is not installed: python -m pip install 'coil-rl[gym]'")
+    assert refusal("train", "env=lunar_lander").endswith(
+        "is not installed: python -m pip install 'coil-rl[gym]'"
+    )
 
 
 def test_env_with_the_guide_of_another_one_is_refused():
@@ -276,7 +440,9 @@ def test_env_with_the_guide_of_another_one_is_refused():
 
 
 # The first is imported before the program begins, the second by its check of the configuration.
-@pytest.mark.parametrize("module", [b"omegaconf.errors", pytest.param(b"torch.nn.functional", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "module", [b"omegaconf.errors", pytest.param(b"torch.nn.functional", marks=pytest.mark.slow)]
+)
 def test_interrupt_while_importing_is_one_line(tmp_path, module):
     python, *arguments = command("train", *TINY)
     verbose = [python, "-X", "importtime", *arguments]  # a line on standard error for each module
@@ -298,24 +464,54 @@ def leaves(node, path=""):
     for key in node:
         name = f"{path}.{key}".lstrip(".")
         value = node._get_node(key)
-        yield from leaves(value, name) if isinstance(value, DictConfig) and not value._is_interpolation() else [name]
+        yield from (
+            leaves(value, name)
+            if isinstance(value, DictConfig) and not value._is_interpolation()
+            else [name]
+        )
 
 
 with initialize_config_module("coil_rl.conf", version_base="1.3"):
     LEAVES = sorted(leaves(compose("train", TINY)))
 
 JUNK = [
-    "abc", "''", "null", "true", "-1", "0", "1.5", "nan", "inf", "-inf", "1e400", "1e-300", "123456789012345678901234",
-    "[]", "[1,a]", "{}", "{a:1}", "???", "${seed}", "${nope}", "${env}", "{_target_:subprocess.run}", "../..",
-]  # fmt: skip
+    "abc",
+    "''",
+    "null",
+    "true",
+    "-1",
+    "0",
+    "1.5",
+    "nan",
+    "inf",
+    "-inf",
+    "1e400",
+    "1e-300",
+    "123456789012345678901234",
+    "[]",
+    "[1,a]",
+    "{}",
+    "{a:1}",
+    "???",
+    "${seed}",
+    "${nope}",
+    "${env}",
+    "{_target_:subprocess.run}",
+    "../..",
+]
 VALUES = st.sampled_from(JUNK) | st.text(max_size=8).filter(lambda text: "\0" not in text)
 
 
 # All examples of a test share its folder.
 @pytest.mark.parametrize("examples", [10, pytest.param(150, marks=pytest.mark.slow)])
 def test_any_value_is_accepted_or_refused_in_one_sentence(started, examples):
-    @settings(max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow])
-    @given(key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"), value=VALUES)
+    @settings(
+        max_examples=examples, phases=[Phase.generate], suppress_health_check=[HealthCheck.too_slow]
+    )
+    @given(
+        key=st.sampled_from(LEAVES) | st.sampled_from(LEAVES).map(lambda key: key + "x"),
+        value=VALUES,
+    )
     def change_one_value(key, value):
         before = files()
         done = called("train", *TINY, f"{key}={value}", code=None)
@@ -332,8 +528,13 @@ def test_any_value_is_accepted_or_refused_in_one_sentence(started, examples):
 def test_folder_in_place_of_the_lock_is_named(tmp_path):
     lock = tmp_path / "run" / ".lock"
     lock.mkdir(parents=True)
-    ended = called("train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY, cwd=tmp_path, code=2)
-    assert ended.stderr == f"train: {lock} is a folder, but must be a file that locks the run; remove it\n"
+    ended = called(
+        "train", "method=guide", f"hydra.run.dir={tmp_path}/run", *TINY, cwd=tmp_path, code=2
+    )
+    assert (
+        ended.stderr
+        == f"train: {lock} is a folder, but must be a file that locks the run; remove it\n"
+    )
 
 
 def test_folder_in_place_of_a_file_is_named(tmp_path):

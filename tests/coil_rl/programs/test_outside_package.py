@@ -37,7 +37,15 @@ def runs(site, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
         for env in ("room", "rooms"):
-            called("train", *CONF, f"env={env}", "method=coil", *TINY, f"hydra.run.dir={env}", cwd=folder)
+            called(
+                "train",
+                *CONF,
+                f"env={env}",
+                "method=coil",
+                *TINY,
+                f"hydra.run.dir={env}",
+                cwd=folder,
+            )
     return folder
 
 
@@ -80,7 +88,11 @@ def test_batched_env_is_the_same_room(installed):
 @pytest.mark.parametrize("env", ["room", "rooms"])
 def test_run_has_cases_measures_and_a_line_of_the_guide(env, runs):
     file = runs / env / "evaluation.csv"
-    assert [row["case"] for row in table(file, driver="coil", actions="deterministic")] == [0, 1, "mean"]
+    assert [row["case"] for row in table(file, driver="coil", actions="deterministic")] == [
+        0,
+        1,
+        "mean",
+    ]
     [guide] = table(file, driver="guide", case="mean")
     [agent] = table(file, driver="coil", case="mean", actions="deterministic")
     assert guide["reward"] > 75 > 60 > agent["reward"]
@@ -91,9 +103,15 @@ def test_run_has_cases_measures_and_a_line_of_the_guide(env, runs):
 
 
 @pytest.mark.parametrize("env", ["room", "rooms"])
-def test_finished_run_is_evaluated_and_listened_to_without_its_yaml_files(env, runs, installed, tmp_path):
-    called("evaluate", f"run={runs / env}", "evaluation.repeats=1", "hydra.run.dir=again", cwd=tmp_path)
-    assert (tmp_path / "again" / "evaluation.csv").read_bytes() == (runs / env / "evaluation.csv").read_bytes()
+def test_finished_run_is_evaluated_and_listened_to_without_its_yaml_files(
+    env, runs, installed, tmp_path
+):
+    called(
+        "evaluate", f"run={runs / env}", "evaluation.repeats=1", "hydra.run.dir=again", cwd=tmp_path
+    )
+    assert (tmp_path / "again" / "evaluation.csv").read_bytes() == (
+        runs / env / "evaluation.csv"
+    ).read_bytes()
     listen = ["evaluation.repeats=1", "donors=2", "hydra.run.dir=listening"]
     called("listen", f"run={runs / env}", *listen, cwd=tmp_path)
     [row] = table(tmp_path / "listening" / "listening_sections.csv")
@@ -109,12 +127,22 @@ def test_each_kind_of_controller_is_a_guide(guide, at_least, installed, tmp_path
     chosen = ["guide=controller", f"guide.controller.of={name}"]
     if guide == "KnowsTheDay":
         chosen = [f"+env.controllers.day={name}", "guide=entry", "guide.entry.key=[controller,day]"]
-    called("evaluate", *CONF, "env=room", *chosen, "evaluation.cases=5", "hydra.run.dir=alone", cwd=tmp_path)
+    called(
+        "evaluate",
+        *CONF,
+        "env=room",
+        *chosen,
+        "evaluation.cases=5",
+        "hydra.run.dir=alone",
+        cwd=tmp_path,
+    )
     [mean] = table(tmp_path / "alone" / "evaluation.csv", driver="guide", case="mean")
     assert at_least < mean["reward"] < 90
 
 
-@pytest.mark.parametrize("command", [["evaluate", "run=run"], ["listen", "run=run"], ["train", "resume=run"]])
+@pytest.mark.parametrize(
+    "command", [["evaluate", "run=run"], ["listen", "run=run"], ["train", "resume=run"]]
+)
 def test_package_that_is_not_declared_is_refused_by_name(command, runs, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(SOURCE)  # not installed
     (tmp_path / "run").mkdir()
@@ -128,7 +156,9 @@ def test_package_that_is_not_declared_can_be_trusted(runs, tmp_path, monkeypatch
     monkeypatch.syspath_prepend(SOURCE)
     trusted = ["trust=[thermostat]", "evaluation.repeats=1", "hydra.run.dir=again"]
     called("evaluate", f"run={runs / 'room'}", *trusted, cwd=tmp_path)
-    assert (tmp_path / "again" / "evaluation.csv").read_bytes() == (runs / "room" / "evaluation.csv").read_bytes()
+    assert (tmp_path / "again" / "evaluation.csv").read_bytes() == (
+        runs / "room" / "evaluation.csv"
+    ).read_bytes()
 
 
 @pytest.fixture
@@ -161,8 +191,13 @@ def finished(process, code=0):
 def test_killed_run_ends_like_an_uninterrupted_one(env, script, tmp_path):
     run = [*CONF, f"env={env}", "method=coil", *TINY, "budget.frames=640"]
     finished(script("coil-train", *run, "hydra.run.dir=whole"))
-    killed, metrics = script("coil-train", *run, "hydra.run.dir=killed"), tmp_path / "killed" / "metrics.csv"
-    while killed.poll() is None and not (metrics.exists() and metrics.read_bytes().count(b"\n") > 8):
+    killed, metrics = (
+        script("coil-train", *run, "hydra.run.dir=killed"),
+        tmp_path / "killed" / "metrics.csv",
+    )
+    while killed.poll() is None and not (
+        metrics.exists() and metrics.read_bytes().count(b"\n") > 8
+    ):
         time.sleep(0.002)
     killed.kill()
     assert killed.wait() == -signal.SIGKILL
@@ -170,15 +205,27 @@ def test_killed_run_ends_like_an_uninterrupted_one(env, script, tmp_path):
     output = finished(script("coil-train", "resume=killed"))
     assert "new ones begin" not in output
     for name in FILES:
-        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name
+        assert (tmp_path / "killed" / name).read_bytes() == (
+            tmp_path / "whole" / name
+        ).read_bytes(), name
 
 
 @pytest.mark.slow
 def test_sweep_report_distillation_and_learned_guide(script, tmp_path):
     package = "hydra.searchpath=[pkg://thermostat.conf]"  # instead of --config-dir
-    sweep = ["-m", package, "env=room", "method=coil,ppo", "seed=0,1", *TINY, "hydra.sweep.dir=sweep"]
+    sweep = [
+        "-m",
+        package,
+        "env=room",
+        "method=coil,ppo",
+        "seed=0,1",
+        *TINY,
+        "hydra.sweep.dir=sweep",
+    ]
     assert "not available" not in finished(script("coil-train", *sweep))
-    assert "All 4 runs that were started are finished." in finished(script("coil-report", "folder=sweep"))
+    assert "All 4 runs that were started are finished." in finished(
+        script("coil-report", "folder=sweep")
+    )
     means = table(tmp_path / "sweep" / "report.csv")
     assert {row["driver"] for row in means} == {"guide", "coil", "ppo"}
     finished(script("coil-distill", *CONF, "env=room", *PROXY, "proxy.folder=proxies"))
@@ -186,7 +233,10 @@ def test_sweep_report_distillation_and_learned_guide(script, tmp_path):
     learned = ["guide=learned", "guide.learned.run=sweep/2_ppo_seed0", "method=coil", *TINY]
     finished(script("coil-train", *CONF, "env=room", *learned, "hydra.run.dir=second"))
     [first] = table(
-        tmp_path / "sweep" / "2_ppo_seed0" / "evaluation.csv", driver="ppo", actions="deterministic", case="mean"
+        tmp_path / "sweep" / "2_ppo_seed0" / "evaluation.csv",
+        driver="ppo",
+        actions="deterministic",
+        case="mean",
     )
     [guide] = table(tmp_path / "second" / "evaluation.csv", driver="guide", case="mean")
     assert guide["reward"] == pytest.approx(first["reward"])

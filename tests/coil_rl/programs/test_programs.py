@@ -21,8 +21,17 @@ def test_train_prints_a_table_and_writes_all_files(run):
     assert [line.split("|")[1].strip() for line in lines[2:-1]] == ["guide"] * 2 + ["coil"] * 4
     assert lines[-1].startswith("coil: mean test reward")
     files = {file.name for file in (folder / "run").iterdir()}
-    assert files >= {"config.yaml", "versions.json", "metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt",
-                     "lines.png", "lines.gif", "learning_curve.png"}  # fmt: skip
+    assert files >= {
+        "config.yaml",
+        "versions.json",
+        "metrics.csv",
+        "evaluation.csv",
+        "episodes.csv",
+        "policy_last.pt",
+        "lines.png",
+        "lines.gif",
+        "learning_curve.png",
+    }
     assert json.loads((folder / "run" / "versions.json").read_text())["torchrl"] == "0.14.1"
 
 
@@ -33,7 +42,9 @@ def test_evaluate_repeats_the_numbers_of_train(run):
 
 
 def test_guide_alone_can_be_trained_and_evaluated(tmp_path):
-    done = called("train", *TINY, STILL, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path)
+    done = called(
+        "train", *TINY, STILL, "method=guide", "guide=zero", "hydra.run.dir=run", cwd=tmp_path
+    )
     assert "guide: mean test reward" in done.stdout
     assert not (tmp_path / "run" / "metrics.csv").exists()
     alone = called("evaluate", "guide=zero", *LAP, STILL, "hydra.run.dir=alone", cwd=tmp_path)
@@ -44,12 +55,16 @@ def test_folder_with_a_run_is_refused(run):
     folder, _ = run
     done = called("train", *TINY, "hydra.run.dir=run", cwd=folder, code=2)
     (sentence,) = done.stderr.splitlines()
-    assert sentence.startswith(f"train: {folder / 'run'} already holds a run; resume it with coil-train resume=")
+    assert sentence.startswith(
+        f"train: {folder / 'run'} already holds a run; resume it with coil-train resume="
+    )
 
 
 def test_finished_run_prints_its_evaluation_again(run):
     folder, done = run
-    before = {file: file.stat().st_mtime_ns for file in (folder / "run").iterdir() if file.name != ".lock"}
+    before = {
+        file: file.stat().st_mtime_ns for file in (folder / "run").iterdir() if file.name != ".lock"
+    }
     again = called("train", "resume=run", cwd=folder)
     assert again.stdout == done.stdout
     assert {file: file.stat().st_mtime_ns for file in before} == before
@@ -62,15 +77,23 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
     first = subprocess.Popen(train, cwd=tmp_path, env=environment(tmp_path), **pipes)
     while first.poll() is None and not (tmp_path / "run" / "policy_best.pt").exists():
         time.sleep(0.01)
-    first.send_signal(signal.SIGSTOP)  # its evaluation may take less time than the start of another process
+    first.send_signal(
+        signal.SIGSTOP
+    )  # its evaluation may take less time than the start of another process
     second = called("train", "resume=run", cwd=tmp_path, code=2)
     (sentence,) = second.stderr.splitlines()
-    assert sentence == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
+    assert (
+        sentence
+        == f"train: another process is running in {tmp_path / 'run'}; wait until it ends, or end it"
+    )
     first.terminate()
     first.send_signal(signal.SIGCONT)
     _, stderr = first.communicate(timeout=60)
     assert first.returncode == 130
-    assert stderr.splitlines()[-1] == f"train: interrupted; continue with: coil-train resume={tmp_path / 'run'}"
+    assert (
+        stderr.splitlines()[-1]
+        == f"train: interrupted; continue with: coil-train resume={tmp_path / 'run'}"
+    )
     assert "guide=" in stderr
     assert "Warning" not in stderr
     assert "Traceback" not in stderr
@@ -78,15 +101,27 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
 
     (tmp_path / "run").rename(tmp_path / "moved")
     called("train", "resume=moved", cwd=tmp_path)
-    for name in ("metrics.csv", "evaluation.csv", "episodes.csv", "policy_last.pt", "policy_best.pt"):
-        assert (tmp_path / "moved" / name).read_bytes() == (folder / "run" / name).read_bytes(), name
+    for name in (
+        "metrics.csv",
+        "evaluation.csv",
+        "episodes.csv",
+        "policy_last.pt",
+        "policy_best.pt",
+    ):
+        assert (tmp_path / "moved" / name).read_bytes() == (folder / "run" / name).read_bytes(), (
+            name
+        )
     assert not (tmp_path / "run").exists(), "the logger wrote into the old folder"
 
 
 @pytest.mark.parametrize(
     ("name", "arguments", "words"),
     [
-        ("evaluate", ["run=/nowhere"], "run=/nowhere is not the folder of a run: it has no config.yaml"),
+        (
+            "evaluate",
+            ["run=/nowhere"],
+            "run=/nowhere is not the folder of a run: it has no config.yaml",
+        ),
         (
             "train",
             ["-m", "resume=run,other"],

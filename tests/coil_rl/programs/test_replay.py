@@ -37,7 +37,9 @@ POLICIES = ["spline", "coil_seed0", "coil_seed1"]
 def folder(tmp_path_factory):
     """A drive of the spline guide, and runs, two of them with the same label."""
     folder = tmp_path_factory.mktemp("replay")
-    record_drives(SimulatedRobotEnv(time_limit=SCANS / 5.5, seed=4), SplineGuide(), [folder / "drive.mcap"])
+    record_drives(
+        SimulatedRobotEnv(time_limit=SCANS / 5.5, seed=4), SplineGuide(), [folder / "drive.mcap"]
+    )
     for seed in (0, 1):
         make_untrained_run(folder / f"coil_{seed}", "method=coil", f"seed={seed}", *TRACK)
     make_untrained_run(folder / "guide", "method=guide", *TRACK[:2])
@@ -63,7 +65,9 @@ def rows(done):
 def messages(done):
     """The messages of each topic, read by another library."""
     found = {}
-    with AnyReader([done[1] / "annotated.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+    with AnyReader(
+        [done[1] / "annotated.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
+    ) as reader:
         for channel, _, data in reader.messages():
             found.setdefault(channel.topic, []).append(reader.deserialize(data, channel.msgtype))
     return found
@@ -87,10 +91,16 @@ def test_annotated_recording_agrees_with_the_csv(messages, rows):
     assert len(rows) == SCANS
     for policy in POLICIES:
         steering = [float(row[f"{policy}/steering"]) * math.radians(80) for row in rows]
-        assert [message.data for message in messages[f"/coil/{policy}/steering"]] == pytest.approx(steering)
+        assert [message.data for message in messages[f"/coil/{policy}/steering"]] == pytest.approx(
+            steering
+        )
         omega = [float(row[f"{policy}/omega"]) for row in rows]
-        assert [message.angular.z for message in messages[f"/coil/{policy}/cmd_vel"]] == pytest.approx(omega)
-    assert [message.data for message in messages["/coil/valid"]] == [row["valid"] == "1" for row in rows]
+        assert [
+            message.angular.z for message in messages[f"/coil/{policy}/cmd_vel"]
+        ] == pytest.approx(omega)
+    assert [message.data for message in messages["/coil/valid"]] == [
+        row["valid"] == "1" for row in rows
+    ]
     expected = [float(row["recorded/omega"]) for row in rows]
     assert [float(row["spline/omega"]) for row in rows] == pytest.approx(expected, abs=1e-3)
 
@@ -105,8 +115,12 @@ def test_annotated_recording_notes_its_inputs(done, folder):
     expected = {"input": (folder / "drive.mcap").read_bytes(), "config": attached["config.yaml"]}
     for n in (0, 1):
         expected[f"coil_seed{n}_config"] = attached[f"coil_seed{n}/config.yaml"]
-        expected[f"coil_seed{n}_checkpoint"] = (folder / f"coil_{n}" / "policy_last.pt").read_bytes()
-    assert notes["coil"] == {f"{key}_sha256": hashlib.sha256(value).hexdigest() for key, value in expected.items()}
+        expected[f"coil_seed{n}_checkpoint"] = (
+            folder / f"coil_{n}" / "policy_last.pt"
+        ).read_bytes()
+    assert notes["coil"] == {
+        f"{key}_sha256": hashlib.sha256(value).hexdigest() for key, value in expected.items()
+    }
 
 
 def test_topics_of_the_foxglove_layout_are_in_the_recording(done, messages):
@@ -123,7 +137,9 @@ def test_same_replay_makes_the_same_bytes(done, folder):
     torch.rand(3)  # earlier draws have no effect
     replayed(folder, "runs=[coil_0,coil_1]", out="again")
     for name in FILES:
-        assert (folder / "again" / name).read_bytes() == (folder / "results" / name).read_bytes(), name
+        assert (folder / "again" / name).read_bytes() == (folder / "results" / name).read_bytes(), (
+            name
+        )
 
 
 def test_each_of_several_recordings_has_a_folder(tmp_path):
@@ -131,12 +147,25 @@ def test_each_of_several_recordings_has_a_folder(tmp_path):
         drive(tmp_path / name / "drive.mcap", scans)
     drive(tmp_path / "c.mcap", 4)
     paths = "[a/drive.mcap,c.mcap,b/drive.mcap]"
-    out = called("replay", f"recording={paths}", "guide=zero", "hydra.run.dir=results", cwd=tmp_path).stdout
-    assert {path.name for path in (tmp_path / "results").iterdir()} == {"drive_1", "c", "drive_2", "replay.md"}
+    out = called(
+        "replay", f"recording={paths}", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    ).stdout
+    assert {path.name for path in (tmp_path / "results").iterdir()} == {
+        "drive_1",
+        "c",
+        "drive_2",
+        "replay.md",
+    }
     for name, scans in (("drive_1", 3), ("c", 4), ("drive_2", 5)):
-        assert {path.name for path in (tmp_path / "results" / name).iterdir()} == FILES - {"replay.md"}
+        assert {path.name for path in (tmp_path / "results" / name).iterdir()} == FILES - {
+            "replay.md"
+        }
         assert len(read_recording(tmp_path / "results" / name / "annotated.mcap").ranges) == scans
-    assert [line.split(":")[0] for line in out.splitlines()[-3:]] == ["a/drive.mcap", "c.mcap", "b/drive.mcap"]
+    assert [line.split(":")[0] for line in out.splitlines()[-3:]] == [
+        "a/drive.mcap",
+        "c.mcap",
+        "b/drive.mcap",
+    ]
 
 
 def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
@@ -144,25 +173,37 @@ def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
     with RecordingWriter(tmp_path / "room.mcap") as writer:
         for time in range(3):
             writer.add("/scan", SCAN, time * 10**8, {**scan, "ranges": np.full(360, 0.8)})
-    done = called("replay", "recording=room.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path)
+    done = called(
+        "replay", "recording=room.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    )
     sentence = done.stderr.splitlines()[-1]
     assert sentence.startswith(
         "replay: room.mcap: no scan shows both boundaries and 100% of the clusters in sight are unlike any cone of the "
         "training, so the actions mean little; check env.perception, or train the classifier"
     )
-    assert f"Warning: {sentence.removeprefix('replay: ')}." in (tmp_path / "results" / "replay.md").read_text()
+    assert (
+        f"Warning: {sentence.removeprefix('replay: ')}."
+        in (tmp_path / "results" / "replay.md").read_text()
+    )
 
 
 def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
     whole = uncompressed(drive(tmp_path / "whole.mcap", 200)).read_bytes()
     (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 6 // 10])
-    done = called("replay", "recording=cut.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path)
+    done = called(
+        "replay", "recording=cut.mcap", "guide=zero", "hydra.run.dir=results", cwd=tmp_path
+    )
     scans = len(read_recording(tmp_path / "results" / "annotated.mcap").ranges)
     assert 60 < scans < 120
     assert f"the file is cut off: {scans} scans can be read" in done.stdout
     assert "Warning" not in done.stderr
-    refused = called("replay", "recording=cut.mcap", "strict=true", "hydra.run.dir=no", cwd=tmp_path, code=2)
-    assert f"replay: env: cut.mcap is cut off: {scans} scans can be read; copy it again" in refused.stderr
+    refused = called(
+        "replay", "recording=cut.mcap", "strict=true", "hydra.run.dir=no", cwd=tmp_path, code=2
+    )
+    assert (
+        f"replay: env: cut.mcap is cut off: {scans} scans can be read; copy it again"
+        in refused.stderr
+    )
     assert not (tmp_path / "no").exists()
 
 
@@ -170,10 +211,15 @@ def test_recorded_steering_is_that_of_table_6(tmp_path):
     """A robot at another speed than the replay's, with stamped commands between its scans, and two scanners."""
     commands = [twist(0.3, 0.4 * math.sin(number)) for number in range(40)]
     stamped = [{"header": header(START, "base_link"), "twist": each} for each in commands]
-    messages = [("/cmd_vel", TWIST_STAMPED, START + 60_000_000 * n, each) for n, each in enumerate(stamped)]
+    messages = [
+        ("/cmd_vel", TWIST_STAMPED, START + 60_000_000 * n, each) for n, each in enumerate(stamped)
+    ]
     for number in range(12):
         time = START + number * PERIOD
-        messages += [("/scan", SCAN, time + n, scan(number, header=header(time, f"laser_{n}"))) for n in (0, 1)]
+        messages += [
+            ("/scan", SCAN, time + n, scan(number, header=header(time, f"laser_{n}")))
+            for n in (0, 1)
+        ]
     messages += [("/odom", "geometry_msgs/msg/PoseStamped", START, {})]
     rosbag_of(tmp_path / "drive", *messages)
     arguments = "recording=drive guide=zero frame=laser_1 hydra.run.dir=results"
@@ -213,16 +259,40 @@ def test_equal_labels_are_distinguished_by_seed_and_then_by_number():
         ("recording=[drive.mcap,drive.mcap]", "drive.mcap twice; leave one out"),
         ("recording=text.mcap", "text.mcap is not an MCAP file"),
         ("recording=silent.mcap", "silent.mcap has no scans of a LiDAR"),
-        ("recording=drive.mcap frame=rear", "topic /scan has no scan with the frame rear; give frame=laser"),
-        ("recording=drive.mcap env.scan=/lidar", "has no topic /lidar; give the topic of the LiDAR, here /scan"),
-        ("recording=drive.mcap guide=[]", "there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]"),
-        ("recording=drive.mcap guide=constant guide.constant.value=[1,2]", "its action has the shape [1, 2]"),
-        ("recording=drive.mcap runs=[nowhere]", "runs=nowhere is not the folder of a run: it has no config.yaml"),
+        (
+            "recording=drive.mcap frame=rear",
+            "topic /scan has no scan with the frame rear; give frame=laser",
+        ),
+        (
+            "recording=drive.mcap env.scan=/lidar",
+            "has no topic /lidar; give the topic of the LiDAR, here /scan",
+        ),
+        (
+            "recording=drive.mcap guide=[]",
+            "there is no policy; give a guide, as in guide=spline, or runs=[FOLDER]",
+        ),
+        (
+            "recording=drive.mcap guide=constant guide.constant.value=[1,2]",
+            "its action has the shape [1, 2]",
+        ),
+        (
+            "recording=drive.mcap runs=[nowhere]",
+            "runs=nowhere is not the folder of a run: it has no config.yaml",
+        ),
         ("recording=drive.mcap runs=[guide]", "guide has no agent: its guide drives alone"),
         ("recording=drive.mcap runs=[coil_0,./coil_0]", "coil_0 twice; leave one out"),
-        ("recording=drive.mcap runs=[coil_0] policy=best", "there is no file coil_0/policy_best.pt"),
-        ("recording=drive.mcap runs=[coil_0] guide=zero +guide.coil=${guide.zero}", "policies would be called coil"),
-        ("recording=drive.mcap guide=zero +guide.recorded=${guide.zero}", "two policies would be called recorded"),
+        (
+            "recording=drive.mcap runs=[coil_0] policy=best",
+            "there is no file coil_0/policy_best.pt",
+        ),
+        (
+            "recording=drive.mcap runs=[coil_0] guide=zero +guide.coil=${guide.zero}",
+            "policies would be called coil",
+        ),
+        (
+            "recording=drive.mcap guide=zero +guide.recorded=${guide.zero}",
+            "two policies would be called recorded",
+        ),
     ],
 )
 def test_errors_are_one_sentence_and_leave_no_files(arguments, words, folder, tmp_path):

@@ -43,12 +43,20 @@ def test_report_prints_the_page_and_writes_its_files_again_and_again(sweep):
 
 def test_files_have_full_precision(sweep):
     report("folder=sweep", "actions=both")
-    rows = {(row["actions"], row["driver"], row["advice"]): row for row in read_csv(sweep / "report.csv")}
+    rows = {
+        (row["actions"], row["driver"], row["advice"]): row
+        for row in read_csv(sweep / "report.csv")
+    }
     assert len(rows) == 7
     coil = rows["deterministic", "coil", ""]
     assert float(coil["reward"]) == pytest.approx(571)
     assert float(coil["low"]) < 571 / 550 + 1e-3 < float(coil["high"])
-    assert (coil["better"], coil["needs_guide"], coil["guide"], coil["seeds"]) == ("0.0", "True", "guide", "3")
+    assert (coil["better"], coil["needs_guide"], coil["guide"], coil["seeds"]) == (
+        "0.0",
+        "True",
+        "guide",
+        "3",
+    )
     cases = {tuple(row.values())[:5]: row["reward"] for row in read_csv(sweep / "report_cases.csv")}
     assert cases["sampled", "ppo", "", "3", "b"] == "615.0"
     text = (sweep / "report.md").read_text()
@@ -67,7 +75,9 @@ def test_several_folders_make_one_report_in_the_first(sweep):
     assert "better than" not in report("folder=[sweep/0_coil,sweep/1_coil]")[1], "no ppo"
     (make_run(Path("guides/zero"), "zero", 0, rows[:3], needs_guide=None) / "metrics.csv").unlink()
     assert report("folder=guides", "against=guide")[0] == 0
-    assert {file.name for file in Path("guides").iterdir()} == FILES - {"report_curves.png"} | {"zero"}
+    assert {file.name for file in Path("guides").iterdir()} == FILES - {"report_curves.png"} | {
+        "zero"
+    }
 
 
 @pytest.mark.parametrize(
@@ -78,9 +88,15 @@ def test_several_folders_make_one_report_in_the_first(sweep):
         ("folder=empty", "folder=empty holds no run of coil-train"),
         ("folder=[]", "folder=[] must be a folder, or a list of them"),
         ("folder=[sweep,3]", "must be a folder, or a list of them"),
-        ("folder=[sweep/6_coil,sweep/7_ppo]", "is finished; continue one with coil-train resume=sweep/6_coil"),
+        (
+            "folder=[sweep/6_coil,sweep/7_ppo]",
+            "is finished; continue one with coil-train resume=sweep/6_coil",
+        ),
         ("folder=sweep against=pop", "there are coil, ppo, guide; did you mean ppo?"),
-        ("folder=sweep actions=sample", "actions='sample' must be 'deterministic', 'sampled' or 'both'"),
+        (
+            "folder=sweep actions=sample",
+            "actions='sample' must be 'deterministic', 'sampled' or 'both'",
+        ),
         ("foldr=sweep", "no key foldr; the configuration has folder, actions, against"),
         ("-m folder=sweep,empty", "leave out -m"),
         ("folder=sweep,empty", "Ambiguous value for argument 'folder=sweep,empty'"),
@@ -108,9 +124,16 @@ def test_report_reads_the_runs_of_coil_train(tmp_path):
     assert "All 2 runs that were started are finished." in done.stdout
     assert done.stderr == ""
     assert {file.name for file in (tmp_path / "sweep").iterdir()} > FILES
-    reward = {row["driver"]: float(row["reward"]) for row in read_csv(tmp_path / "sweep" / "report.csv")[:3]}
+    reward = {
+        row["driver"]: float(row["reward"])
+        for row in read_csv(tmp_path / "sweep" / "report.csv")[:3]
+    }
     for run in (tmp_path / "sweep").glob("*_seed0"):
-        means = [row for row in read_csv(run / "evaluation.csv") if row["case"] == "mean" and not row["advice"]]
+        means = [
+            row
+            for row in read_csv(run / "evaluation.csv")
+            if row["case"] == "mean" and not row["advice"]
+        ]
         guide, agent = means[0], means[1]
         assert reward["guide"] == pytest.approx(float(guide["reward"]))
         assert reward[agent["driver"]] == pytest.approx(float(agent["reward"]))

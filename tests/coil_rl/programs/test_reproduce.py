@@ -26,7 +26,9 @@ def outcome(*arguments):
 def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
     code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
     files = {path.name for path in Path("run").iterdir()}
-    made = {f"{name}.{ending}" for name in ("table_1", "figure_6") for ending in ("md", "csv", "png")}
+    made = {
+        f"{name}.{ending}" for name in ("table_1", "figure_6") for ending in ("md", "csv", "png")
+    }
     assert code == 0
     assert files == made | {"RESULTS.md"}
     pages = [Path("run", f"{name}.md").read_text() for name in ("table_1", "figure_6")]
@@ -38,17 +40,27 @@ def test_every_figure_of_the_paper_is_either_reproduced_or_named():
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("reproduce")
     named = [number for numbers in config.other_figures.values() for number in numbers]
-    made = [int(name.removeprefix("figure_")) for name in config.results if name.startswith("figure_")]
+    made = [
+        int(name.removeprefix("figure_")) for name in config.results if name.startswith("figure_")
+    ]
     assert sorted(named + made) == list(range(1, 33))
 
 
 def test_options_reach_the_result_and_the_command_on_its_page():
     other_options = ("~results.table_5.worlds", "+results.table_4.labels=[]")
-    assert outcome("figure=6", "results.figure_6.iterations=7", *other_options, "hydra.run.dir=run")[0] == 0
+    assert (
+        outcome("figure=6", "results.figure_6.iterations=7", *other_options, "hydra.run.dir=run")[0]
+        == 0
+    )
     assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
-    assert "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`" in Path("run/figure_6.md").read_text()
+    assert (
+        "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`"
+        in Path("run/figure_6.md").read_text()
+    )
     text = Path("run/RESULTS.md").read_text()
-    everything = "results.figure_6.iterations=7 '~results.table_5.worlds' '+results.table_4.labels=[]'"
+    everything = (
+        "results.figure_6.iterations=7 '~results.table_5.worlds' '+results.table_4.labels=[]'"
+    )
     assert f"`coil-reproduce all=true budget=paper {everything}` writes this file" in text
 
 
@@ -76,7 +88,9 @@ def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
     code, out, _ = outcome(*arguments, "hydra.run.dir=run")
     assert code == 0
     assert "reproduce: table_6 made" in out
-    assert {path.name for path in Path("run").iterdir()} == {f"table_6.{end}" for end in ("md", "csv", "png")} | {INDEX}
+    assert {path.name for path in Path("run").iterdir()} == {
+        f"table_6.{end}" for end in ("md", "csv", "png")
+    } | {INDEX}
     text = Path("run", INDEX).read_text()
     assert text.count("## Table 6: the robot") == text.count("### Table 7, measured") == 1
     again, *_ = outcome("table=7", *arguments[1:], "hydra.run.dir=again")
@@ -108,7 +122,10 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     arguments += [f"results.figure_22.{choice}" for choice in choices]
     code, out, _ = outcome(*arguments)
     assert (code, started) == (0, [])
-    assert "2 runs with the seeds 0, made at commit `unknown`. Training frames: 20,000 (coil, ppo)." in out
+    assert (
+        "2 runs with the seeds 0, made at commit `unknown`. Training frames: 20,000 (coil, ppo)."
+        in out
+    )
     assert outcome(*arguments)[1] == out
     (sweep.all_folders[1] / "evaluation.csv").unlink()
     code, _, error = outcome(*arguments, "hydra/launcher=basic")
@@ -130,7 +147,10 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
         ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
         ("table=1 results.table_1._target_=builtins.dict", "builtins.dict makes dict, not Result"),
         ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
-        ("table=1 budgets.paper.seeds=0", "budgets.paper.seeds=0 must be greater than or equal to 1"),
+        (
+            "table=1 budgets.paper.seeds=0",
+            "budgets.paper.seeds=0 must be greater than or equal to 1",
+        ),
         ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
     ],
 )
@@ -147,7 +167,10 @@ def test_a_mistake_is_one_sentence_and_leaves_no_file(arguments, message):
 def test_every_budget_fits_every_experiment(budget):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("reproduce", ["table=1"])
-        results, chosen = instantiate(config.results, _convert_="all").values(), config.budgets[budget]
+        results, chosen = (
+            instantiate(config.results, _convert_="all").values(),
+            config.budgets[budget],
+        )
         experiments = {name for result in results for name in result.experiments}
         plans = [
             sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
@@ -166,7 +189,10 @@ def test_a_figure_trains_its_runs_and_a_lost_run_again():
     arguments = ["figure=22", "budget=smoke", "~results.figure_22.worlds", f"train={tiny}"]
     arguments += [f"results.figure_22.{choice}" for choice in choices]
     program("reproduce", *arguments, cwd=Path())
-    pages = [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")]
+    pages = [
+        Path(f"outputs/reproduce/smoke/{name}").read_text()
+        for name in ("figure_22.md", "figure_22.csv")
+    ]
     evaluated = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
     assert len(evaluated) == 4
     assert "> **Smoke test at the smallest budget" in pages[0]
@@ -175,4 +201,7 @@ def test_a_figure_trains_its_runs_and_a_lost_run_again():
     program("reproduce", *arguments, cwd=Path())
     again = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
     assert {path for path in evaluated if evaluated[path] != again[path]} == {lost}
-    assert [Path(f"outputs/reproduce/smoke/{name}").read_text() for name in ("figure_22.md", "figure_22.csv")] == pages
+    assert [
+        Path(f"outputs/reproduce/smoke/{name}").read_text()
+        for name in ("figure_22.md", "figure_22.csv")
+    ] == pages

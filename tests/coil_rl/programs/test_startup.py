@@ -30,12 +30,16 @@ print(json.dumps(results))
 def start(cwd, *commands):
     """Return exit code, standard output, standard error and imported heavy modules of each command."""
     command = [sys.executable, "-c", SCRIPT, json.dumps(commands)]
-    done = subprocess.run(command, cwd=cwd, env=environment(cwd), capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        command, cwd=cwd, env=environment(cwd), capture_output=True, text=True, check=True
+    )
     return [(*rest, HEAVY & set(modules)) for *rest, modules in json.loads(done.stdout)]
 
 
 # Hydra takes more than a second for each help text.
-@pytest.mark.parametrize("names", [["train", "report"], pytest.param(PROGRAMS, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "names", [["train", "report"], pytest.param(PROGRAMS, marks=pytest.mark.slow)]
+)
 def test_help_begins_with_examples_and_imports_nothing_heavy(names, tmp_path):
     results = start(tmp_path, *([name, "--help"] for name in names))
     for name, (code, out, _, heavy) in zip(names, results, strict=True):
@@ -46,7 +50,11 @@ def test_help_begins_with_examples_and_imports_nothing_heavy(names, tmp_path):
 
 def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     commands = [[name, "seeed=1"] for name in PROGRAMS]
-    commands += [["train", "learner=nope"], ["evaluate", "evaluation.repeat=1"], ["distill", "seed=abc"]]
+    commands += [
+        ["train", "learner=nope"],
+        ["evaluate", "evaluation.repeat=1"],
+        ["distill", "seed=abc"],
+    ]
     for command, (code, _, error, heavy) in zip(commands, start(tmp_path, *commands), strict=True):
         assert (command, code, heavy) == (command, 2, set())
         (sentence,) = error.splitlines()

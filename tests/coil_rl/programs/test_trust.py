@@ -38,11 +38,18 @@ def with_guide(run, target):
 def test_command_runs_no_code_from_a_folder(command, received, tmp_path):
     shutil.copytree(received, tmp_path, dirs_exist_ok=True)
     config = OmegaConf.load(tmp_path / "run" / "config.yaml")
-    config.method.transforms.x = {"_target_": "builtins.open", "file": str(tmp_path / "marker"), "mode": "w"}
+    config.method.transforms.x = {
+        "_target_": "builtins.open",
+        "file": str(tmp_path / "marker"),
+        "mode": "w",
+    }
     OmegaConf.save(config, tmp_path / "run" / "config.yaml")
     stderr = called(command.split()[0], *COMMANDS[command], cwd=tmp_path, code=2).stderr
     sentence = stderr.splitlines()[-1]
-    assert "run/config.yaml: method.transforms.x._target_ names 'builtins.open', which is no part of a run" in sentence
+    assert (
+        "run/config.yaml: method.transforms.x._target_ names 'builtins.open', which is no part of a run"
+        in sentence
+    )
     assert "Traceback" not in stderr
     assert not (tmp_path / "marker").exists()
     assert {path.name for path in tmp_path.iterdir()} <= {"run", "drive.mcap", "outputs"}
@@ -60,9 +67,17 @@ def test_outside_part_of_a_run_needs_trust_on_the_command_line(received, tmp_pat
     refused = called("evaluate", "run=run", cwd=tmp_path, code=2).stderr
     assert "allow it with trust=[neighbours_package] on the command line" in refused
     assert not (tmp_path / "marker").exists()
-    small = ["track=generated", "track.test.count=1", "evaluation.repeats=1", "trust=[neighbours_package]"]
+    small = [
+        "track=generated",
+        "track.test.count=1",
+        "evaluation.repeats=1",
+        "trust=[neighbours_package]",
+    ]
     called("evaluate", "run=run", *small, cwd=tmp_path)
     assert (tmp_path / "marker").exists()
     assert "allow it with trust" in called("train", "resume=run", cwd=tmp_path, code=2).stderr
-    assert "functions of os run any code" in called("train", "resume=run", "trust=[os]", cwd=tmp_path, code=2).stderr
+    assert (
+        "functions of os run any code"
+        in called("train", "resume=run", "trust=[os]", cwd=tmp_path, code=2).stderr
+    )
     trust.trust_packages([])

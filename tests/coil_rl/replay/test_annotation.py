@@ -18,7 +18,13 @@ from coil_rl.replay.annotation import annotate
 from coil_rl.replay.open_loop import open_loop
 
 SCANS = 6
-TOPICS = ["/coil/boundary", "/coil/cones", "/coil/spline/cmd_vel", "/coil/spline/steering", "/coil/valid"]
+TOPICS = [
+    "/coil/boundary",
+    "/coil/cones",
+    "/coil/spline/cmd_vel",
+    "/coil/spline/steering",
+    "/coil/valid",
+]
 
 
 def perception(ranges, angles):
@@ -43,7 +49,13 @@ def annotated(folder, name, notes=(), **options):
             writer.describe(note, {"about": "it"})
     env = McapReplayEnv(source, perception)
     [result] = open_loop(env, {"spline": (env, SplineGuide())})
-    options = {"topics": ["/scan", "/odom"], "speed": 0.15, "scale": 7.0, "about": {}, "attachments": {}} | options
+    options = {
+        "topics": ["/scan", "/odom"],
+        "speed": 0.15,
+        "scale": 7.0,
+        "about": {},
+        "attachments": {},
+    } | options
     annotate(result, folder / name, **options)
     return result, folder / name
 
@@ -60,7 +72,12 @@ def by_another_library(path):
 
 def test_markers_have_the_stamp_and_the_frame_of_the_scan(tmp_path):
     messages = [
-        ("/scan", SCAN, START + number * PERIOD, scan(number, header=header(7 + number * PERIOD, "lidar")))
+        (
+            "/scan",
+            SCAN,
+            START + number * PERIOD,
+            scan(number, header=header(7 + number * PERIOD, "lidar")),
+        )
         for number in range(SCANS)
     ]
     env = McapReplayEnv(rosbag_of(tmp_path / "drive", *messages), perception)
@@ -77,7 +94,9 @@ def test_markers_have_the_stamp_and_the_frame_of_the_scan(tmp_path):
 def test_copies_keep_the_qos_definitions_metadata_and_attachments(tmp_path):
     scans = [("/scan", SCAN, START + number * PERIOD, scan(number)) for number in range(SCANS)]
     transforms = [("/tf_static", "tf2_msgs/msg/TFMessage", START, {})]
-    source = next(rosbag_of(tmp_path / "drive", *scans, *transforms, latched=["/tf_static"]).glob("*.mcap"))
+    source = next(
+        rosbag_of(tmp_path / "drive", *scans, *transforms, latched=["/tf_static"]).glob("*.mcap")
+    )
     contents = read_messages(source)
     with RecordingWriter(source) as writer:
         for message in itertools.chain(*contents.messages.values()):
@@ -87,10 +106,14 @@ def test_copies_keep_the_qos_definitions_metadata_and_attachments(tmp_path):
     env = McapReplayEnv(source, perception)
     [result] = open_loop(env, {"spline": (env, SplineGuide())})
     options = {"topics": ["/scan"], "speed": 0.15, "scale": 7.0, "about": {}}
-    annotate(result, tmp_path / "annotated.mcap", **options, attachments={"config.yaml": b"seed: 0"})
+    annotate(
+        result, tmp_path / "annotated.mcap", **options, attachments={"config.yaml": b"seed: 0"}
+    )
     with AnyReader([source]) as original, AnyReader([tmp_path / "annotated.mcap"]) as copy:
         for topic in ("/scan", "/tf_static"):
-            [one], [other] = ([c for c in reader.connections if c.topic == topic] for reader in (original, copy))
+            [one], [other] = (
+                [c for c in reader.connections if c.topic == topic] for reader in (original, copy)
+            )
             assert (one.ext, one.msgdef, one.digest) == (other.ext, other.msgdef, other.digest)
         assert other.ext.offered_qos_profiles[0].durability.name == "TRANSIENT_LOCAL"
     with (tmp_path / "annotated.mcap").open("rb") as stream:
@@ -99,12 +122,19 @@ def test_copies_keep_the_qos_definitions_metadata_and_attachments(tmp_path):
         attached = {record.name: record for record in reader.iter_attachments()}
     assert set(attached) == {"calibration.yaml", "config.yaml"}
     copied = attached["calibration.yaml"]
-    assert (copied.create_time, copied.log_time, copied.media_type, copied.data) == (3, 5, "text/yaml", b"yaw: 0")
+    assert (copied.create_time, copied.log_time, copied.media_type, copied.data) == (
+        3,
+        5,
+        "text/yaml",
+        b"yaw: 0",
+    )
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return annotated(tmp_path_factory.mktemp("replay"), "annotated.mcap", notes=["simulated", "rosbag2"])
+    return annotated(
+        tmp_path_factory.mktemp("replay"), "annotated.mcap", notes=["simulated", "rosbag2"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +148,10 @@ def test_messages_have_the_times_of_the_scans_and_recorded_topics_are_copied(mad
     assert all(times[topic] == times["/scan"] for topic in TOPICS)
     result, path = made
     topics = ["/scan", "/odom"]
-    assert read_messages(path, topics).messages == read_messages(result.recording.path, topics).messages
+    assert (
+        read_messages(path, topics).messages
+        == read_messages(result.recording.path, topics).messages
+    )
     assert set(read_messages(path).notes) == {"simulated", "coil"}
 
 
@@ -142,13 +175,26 @@ def test_remembered_boundary_is_faded_and_one_never_valid_is_missing(read):
         points = [(point.x * 7, point.y * 7) for point in lines["right"].points]
         np.testing.assert_allclose(points, [(x, -1) for x in (2, 2.5, 3, 3.5, 4)], atol=1e-5)
         assert (lines["right"].color.a == 1) == (number < 4)
-    assert [message.data for message in read[0]["/coil/valid"]] == [False, False, True, True, False, False]
+    assert [message.data for message in read[0]["/coil/valid"]] == [
+        False,
+        False,
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_markers_are_in_the_frame_of_a_lidar_that_points_to_the_left(read, tmp_path):
-    turned, _ = by_another_library(annotated(tmp_path, "turned.mcap", laser_yaw=math.radians(90))[1])
+    turned, _ = by_another_library(
+        annotated(tmp_path, "turned.mcap", laser_yaw=math.radians(90))[1]
+    )
     for topic in ("/coil/cones", "/coil/boundary"):
         for straight, left in zip(read[0][topic], turned[topic], strict=True):
             for one, other in zip(straight.markers[1:], left.markers[1:], strict=True):
-                for a, b in zip(one.points or [one.pose.position], other.points or [other.pose.position], strict=True):
+                for a, b in zip(
+                    one.points or [one.pose.position],
+                    other.points or [other.pose.position],
+                    strict=True,
+                ):
                     assert (b.x, b.y) == pytest.approx((a.y, -a.x), abs=1e-6)

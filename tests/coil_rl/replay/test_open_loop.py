@@ -25,9 +25,14 @@ def recording(omegas=(), times=(), scans=4, period=100, **options):
     """A recording of scans at 0, 100, 200 ... ns with commands at other times."""
     scan_times, ones = np.arange(scans) * period, np.ones(scans)
     if len(omegas):
-        options["commands"] = np.stack([np.full(len(omegas), 0.15), omegas], axis=1), np.array(times)
+        options["commands"] = (
+            np.stack([np.full(len(omegas), 0.15), omegas], axis=1),
+            np.array(times),
+        )
     ranges, points = np.ones((scans, 9), np.float32), ones.astype(int) * 9
-    return Recording(Path("drive.mcap"), scan_times, scan_times, ranges, points, -ones, ones / 9, **options)
+    return Recording(
+        Path("drive.mcap"), scan_times, scan_times, ranges, points, -ones, ones / 9, **options
+    )
 
 
 def run(recordings, *guides, **options):
@@ -82,7 +87,9 @@ def test_scans_before_the_first_command_are_left_out_and_a_stop_is_straight():
 
 def test_random_draws_of_a_policy_depend_on_the_seed_alone():
     def drawing():
-        return TensorDictModule(lambda x: torch.rand(len(x), 1), in_keys=["observation"], out_keys=["action"])
+        return TensorDictModule(
+            lambda x: torch.rand(len(x), 1), in_keys=["observation"], out_keys=["action"]
+        )
 
     [both], [other] = (run(recording(), drawing(), drawing(), seed=seed) for seed in (0, 1))
     np.testing.assert_array_equal(both.steering["0"].action, both.steering["1"].action)
@@ -94,7 +101,10 @@ def test_random_draws_of_a_policy_depend_on_the_seed_alone():
 
 def result_of(remarks=(), **actions):
     """A result with given actions; both sides are valid in the first and the last of 4 scans."""
-    steering = {name: Steering(a, a / 2, np.abs(a) / 4) for name, a in ((n, np.array(x)) for n, x in actions.items())}
+    steering = {
+        name: Steering(a, a / 2, np.abs(a) / 4)
+        for name, a in ((n, np.array(x)) for n, x in actions.items())
+    }
     valid = np.array([[1, 1], [1, 0], [0, 0], [1, 1]], dtype=bool)
     one = recording(period=10**9, notes={"simulated": {}})
     vars(one)["remarks"] = remarks
@@ -104,7 +114,9 @@ def result_of(remarks=(), **actions):
 
 @pytest.fixture
 def result():
-    return result_of(left=[1.0] * 4, both=[1.0, -1.0, 1.0, -1.0], recorded=[math.nan, 0.0, 0.0, 0.5])
+    return result_of(
+        left=[1.0] * 4, both=[1.0, -1.0, 1.0, -1.0], recorded=[math.nan, 0.0, 0.0, 0.5]
+    )
 
 
 def test_disagreement_is_a_mean_over_the_scans_with_both_known(result):
@@ -121,11 +133,24 @@ def test_table_has_a_row_and_a_column_per_policy(result):
     text = describe(result)
     assert "## drive.mcap (simulated)" in text
     assert "4 scans in 3.0 s; both boundaries valid in 50% of them." in text
-    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("|")]
-    assert rows[0] == ["policy", "smoothness", "omega (rad/s)", "from left", "from both", "from recorded"]
+    rows = [
+        [cell.strip() for cell in line.split("|")[1:-1]]
+        for line in text.splitlines()
+        if line.startswith("|")
+    ]
+    assert rows[0] == [
+        "policy",
+        "smoothness",
+        "omega (rad/s)",
+        "from left",
+        "from both",
+        "from recorded",
+    ]
     assert rows[2:] == [
         ["left", "0.250", "0.500", "-", "1.000", "0.833"],
         ["both", "0.250", "0.500", "1.000", "-", "1.167"],
         ["recorded", "0.042", "0.083", "0.833", "1.167", "-"],
     ]
-    assert extent(result_of(["is cut off", "is odd"])).endswith("50% of them; the file is cut off; the file is odd")
+    assert extent(result_of(["is cut off", "is odd"])).endswith(
+        "50% of them; the file is cut off; the file is odd"
+    )

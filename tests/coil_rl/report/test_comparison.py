@@ -45,7 +45,11 @@ def test_numbers_are_those_of_the_runs(sweep):
     assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
     assert math.isnan(zeroed["lap_time"])
     assert math.isnan(rows["guide", ""]["low"])
-    assert (coil["better"], rows["guide", ""]["better"], rows["ppo", ""]["better"]) == (0, None, None)
+    assert (coil["better"], rows["guide", ""]["better"], rows["ppo", ""]["better"]) == (
+        0,
+        None,
+        None,
+    )
     assert coil["difference"] == pytest.approx(-(20 / 500 + 20 / 600) / 2)
     assert [row["better"] for row in table(sweep, against="guide").values()] == [None, 1, 1, 0]
     cases = compare(read_runs([sweep])).case_table()
@@ -60,20 +64,31 @@ def test_numbers_are_those_of_the_runs(sweep):
 
 def test_completion_ranks_before_the_mean(tmp_path):
     rewards = {"a": 900.0, "b": 900.0}
-    make_run(tmp_path / "0", "fast", 0, driven("guide", CASES) + driven("fast", rewards, completed=0.9, crashed=0.1))
+    make_run(
+        tmp_path / "0",
+        "fast",
+        0,
+        driven("guide", CASES) + driven("fast", rewards, completed=0.9, crashed=0.1),
+    )
     make_run(tmp_path / "1", "safe", 0, driven("guide", CASES) + driven("safe", CASES))
     assert list(table(tmp_path)) == [("guide", ""), ("safe", ""), ("fast", "")]
 
 
-@pytest.mark.parametrize("failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}])
+@pytest.mark.parametrize(
+    "failure", [{"rewards": {"b": -1.0}}, {"rewards": {"b": 9.0}, "crashed": 1.0}]
+)
 def test_where_the_guide_fails_its_mean_over_the_other_cases_is_the_reference(failure, tmp_path):
     guide = driven("guide", {"a": 500.0, "c": 300.0})[:2] + driven("guide", **failure)[:1]
-    make_run(tmp_path / "0", "agent", 0, guide + driven("agent", {"a": 500.0, "c": 600.0, "b": 200.0}))
+    make_run(
+        tmp_path / "0", "agent", 0, guide + driven("agent", {"a": 500.0, "c": 600.0, "b": 200.0})
+    )
     assert compare(read_runs([tmp_path])).agents[0].scores.tolist() == [[1, 2, 0.5]]
 
 
 def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
-    make_run(tmp_path / "0", "agent", 0, driven("guide", {"a": -1.0, "b": 0.0}) + driven("agent", CASES))
+    make_run(
+        tmp_path / "0", "agent", 0, driven("guide", {"a": -1.0, "b": 0.0}) + driven("agent", CASES)
+    )
     comparison = compare(read_runs([tmp_path]))
     assert not comparison.normalised
     assert comparison.agents[0].score.mean == 550
@@ -81,7 +96,10 @@ def test_scores_are_rewards_if_no_guide_earns_anything(tmp_path):
 
 def test_every_case_counts_as_much_however_much_it_pays(tmp_path):
     guide = {"a": 10.0, "b": 1000.0}
-    for label, rewards in {"small": {"a": 15.0, "b": 1000.0}, "large": {"a": 10.0, "b": 1400.0}}.items():
+    for label, rewards in {
+        "small": {"a": 15.0, "b": 1000.0},
+        "large": {"a": 10.0, "b": 1400.0},
+    }.items():
         make_run(tmp_path / label, label, 0, driven("guide", guide) + driven(label, rewards))
     rows = table(tmp_path)
     assert list(rows) == [("guide", ""), ("small", ""), ("large", "")]
@@ -89,7 +107,9 @@ def test_every_case_counts_as_much_however_much_it_pays(tmp_path):
 
 
 def test_clearance_is_the_smallest_and_lap_time_the_mean_of_completed_laps(tmp_path):
-    make_run(tmp_path / "0", "coil", 0, driven("guide", CASES) + driven("coil", CASES, clearance=0.2))
+    make_run(
+        tmp_path / "0", "coil", 0, driven("guide", CASES) + driven("coil", CASES, clearance=0.2)
+    )
     slow = driven("coil", CASES, lap_time=math.nan, clearance=0.05, completed=0.0)
     make_run(tmp_path / "1", "coil", 1, driven("guide", CASES) + slow)
     row = table(tmp_path)["coil", ""]
@@ -100,7 +120,9 @@ def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
     worse = {case: reward - 100 for case, reward in CASES.items()}
     for index, label in enumerate("abcde"):
         guide = driven("guide", worse if label == "e" else CASES)
-        make_run(tmp_path / str(index), label, 0, guide + driven(label, {"a": 550.0 - index, "b": 0.0}))
+        make_run(
+            tmp_path / str(index), label, 0, guide + driven(label, {"a": 550.0 - index, "b": 0.0})
+        )
     rows = table(tmp_path)
     assert list(rows)[:3] == [("guide (a, b and 2 more)", ""), ("guide (e)", ""), ("a", "")]
     assert rows["e", ""]["guide"] == "guide (e)"
@@ -108,7 +130,9 @@ def test_labels_are_appended_to_guides_of_the_same_name(tmp_path):
 
 
 def test_guide_with_random_actions_has_an_interval_over_its_different_evaluations(tmp_path):
-    for index, (label, seed) in enumerate([("ppo", 0), ("ppo", 1), ("coil", 0), ("coil", 1), ("coil", 2)]):
+    for index, (label, seed) in enumerate(
+        [("ppo", 0), ("ppo", 1), ("coil", 0), ("coil", 1), ("coil", 2)]
+    ):
         guide = driven("guide", {case: reward + 10 * seed for case, reward in CASES.items()})
         make_run(tmp_path / str(index), label, seed, guide + driven(label, CASES))
     guide = table(tmp_path)["guide", ""]
@@ -121,14 +145,27 @@ def test_agents_and_guides_may_be_alone(tmp_path):
     make_run(tmp_path / "agents" / "0", "alone", 0, driven("alone", CASES), needs_guide=False)
     guide = driven("guide", CASES)
     rows = table(tmp_path / "agents", against="guide")
-    assert (rows["alone", ""]["guide"], rows["alone", ""]["better"], rows["alone", ""]["seeds"]) == (None, None, 1)
+    assert (
+        rows["alone", ""]["guide"],
+        rows["alone", ""]["better"],
+        rows["alone", ""]["seeds"],
+    ) == (None, None, 1)
     make_run(tmp_path / "guides" / "0", "spline", 0, guide, needs_guide=None)
-    make_run(tmp_path / "guides" / "1", "zero", 0, driven("guide", {"a": 1.0, "b": 2.0}), needs_guide=None)
+    make_run(
+        tmp_path / "guides" / "1",
+        "zero",
+        0,
+        driven("guide", {"a": 1.0, "b": 2.0}),
+        needs_guide=None,
+    )
     assert list(table(tmp_path / "guides")) == [("guide (spline)", ""), ("guide (zero)", "")]
 
 
 def test_best_of_several_guides_is_the_reference(tmp_path):
-    good, bad = driven("guide spline", CASES), driven("guide random", {case: -100.0 for case in CASES})
+    good, bad = (
+        driven("guide spline", CASES),
+        driven("guide random", {case: -100.0 for case in CASES}),
+    )
     make_run(tmp_path / "multi", "multi", 0, bad + good + driven("multi", CASES))
     make_run(tmp_path / "other", "other", 0, good + driven("other", CASES))
     rows = table(tmp_path)
@@ -138,18 +175,26 @@ def test_best_of_several_guides_is_the_reference(tmp_path):
 
 def test_label_with_the_same_seed_twice_or_with_different_cases_is_an_error(tmp_path):
     for name in ("one", "two"):
-        make_run(tmp_path / "same" / name, "coil", 7, driven("guide", CASES) + driven("coil", CASES))
+        make_run(
+            tmp_path / "same" / name, "coil", 7, driven("guide", CASES) + driven("coil", CASES)
+        )
     with pytest.raises(UserError, match=r"one and .*two are both seed 7 of coil; remove one"):
         compare(read_runs([tmp_path / "same"]))
     for seed, case in enumerate("ab"):
-        make_run(tmp_path / case, "coil", seed, driven("guide", {"a": 1.0}) + driven("coil", {case: 1.0}))
-    with pytest.raises(UserError, match=r"runs of coil were evaluated in different cases \(a, and b\)"):
+        make_run(
+            tmp_path / case, "coil", seed, driven("guide", {"a": 1.0}) + driven("coil", {case: 1.0})
+        )
+    with pytest.raises(
+        UserError, match=r"runs of coil were evaluated in different cases \(a, and b\)"
+    ):
         compare(read_runs([tmp_path / "a", tmp_path / "b"]))
 
 
 def test_labels_in_different_cases_are_not_compared(tmp_path):
     for label in "ab":
-        make_run(tmp_path / label, label, 0, driven("guide", {label: 1.0}) + driven(label, {label: 1.0}))
+        make_run(
+            tmp_path / label, label, 0, driven("guide", {label: 1.0}) + driven(label, {label: 1.0})
+        )
     assert table(tmp_path, against="b")["a", ""]["better"] is None
     groups = groups_by_title(tmp_path)
     assert paired(groups["a"], groups["b"]) is None
@@ -177,4 +222,6 @@ def test_guide_is_paired_with_every_seed(sweep, tmp_path):
     assert paired(groups["coil"], groups["ppo"], "smoothness").difference.mean == pytest.approx(0.1)
     assert paired(groups["coil, zeroed"], groups["coil"], "lap_time") is None, "no completed lap"
     make_run(tmp_path / "other" / "9", "coil", 9, driven("coil", CASES))
-    assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, "no common seed"
+    assert paired(groups_by_title(tmp_path / "other")["coil"], groups["ppo"]) is None, (
+        "no common seed"
+    )

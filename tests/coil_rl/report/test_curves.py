@@ -13,7 +13,10 @@ from coil_rl.report.runs import RETURN
 def run(seed, rows=40):
     rng = np.random.default_rng(seed)
     values = [300 * (1 - math.exp(-index / 10)) + float(rng.normal()) for index in range(rows)]
-    return [{"frames": 50_000 * (n + 1), RETURN: value if n else math.nan} for n, value in enumerate(values)]
+    return [
+        {"frames": 50_000 * (n + 1), RETURN: value if n else math.nan}
+        for n, value in enumerate(values)
+    ]
 
 
 def phase_rows(updates=24):
@@ -22,13 +25,19 @@ def phase_rows(updates=24):
     for update in range(updates):
         phase = update // 4
         guide = -1 if phase % 2 == 0 else phase // 2 % 2
-        rows.append({
-            "frames": 1000.0 * (update + 1), RETURN: math.nan if update < 5 else 10.0 * update,
-            "learner/guide": guide, "learner/learning_rate": 1e-3 * 0.9**phase if guide < 0 else 0.0,
-            "learner/guide_learning_rate": 0.0 if guide < 0 else 1e-4,
-            "learner/moved_a": 0.01 * phase, "learner/moved_b": 0.005 * phase,
-            "guide/a": 200.0 if update in (0, 23) else math.nan, "guide/b": 100.0 if update == 0 else math.nan,
-        })  # fmt: skip
+        rows.append(
+            {
+                "frames": 1000.0 * (update + 1),
+                RETURN: math.nan if update < 5 else 10.0 * update,
+                "learner/guide": guide,
+                "learner/learning_rate": 1e-3 * 0.9**phase if guide < 0 else 0.0,
+                "learner/guide_learning_rate": 0.0 if guide < 0 else 1e-4,
+                "learner/moved_a": 0.01 * phase,
+                "learner/moved_b": 0.005 * phase,
+                "guide/a": 200.0 if update in (0, 23) else math.nan,
+                "guide/b": 100.0 if update == 0 else math.nan,
+            }
+        )
     return rows
 
 
@@ -37,7 +46,11 @@ def phase_rows(updates=24):
     [
         {"COIL": [run(0), run(1), run(2)], "PPO": [run(3, rows=20)]},
         {str(index): [run(index)] for index in range(8)},
-        {"no values": [[{"frames": 0, RETURN: None}, {"frames": 100}, {"frames": 200, RETURN: math.nan}]]},
+        {
+            "no values": [
+                [{"frames": 0, RETURN: None}, {"frames": 100}, {"frames": 200, RETURN: math.nan}]
+            ]
+        },
         {"no common frames": [run(0, rows=3), [{**row, "frames": 1e9} for row in run(1, rows=3)]]},
     ],
 )
@@ -64,7 +77,10 @@ def test_phases_are_drawn_for_guides_in_turn_and_together(tmp_path):
 
 
 def test_single_run_is_its_own_mean_and_interval():
-    rows = [{"frames": f, RETURN: v} for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))]
+    rows = [
+        {"frames": f, RETURN: v}
+        for f, v in ((20, 2.0), (10, np.float32(1)), (30, math.nan), (40, 4.0))
+    ]
     frames, *curves = mean_curve([rows], RETURN)
     np.testing.assert_array_equal(frames, [10, 20, 40])
     for curve in curves:
@@ -77,13 +93,17 @@ def test_runs_are_averaged_over_their_common_frames():
     frames, mean, low, high = mean_curve([first, second, []], RETURN)
     np.testing.assert_array_equal(frames, [5, 10, 15, 20, 25])
     half = t.ppf(0.975, 1) * frames
-    np.testing.assert_allclose([mean, low, high], [2 * frames, 2 * frames - half, 2 * frames + half])
+    np.testing.assert_allclose(
+        [mean, low, high], [2 * frames, 2 * frames - half, 2 * frames + half]
+    )
 
 
 def test_interval_of_the_mean_has_its_coverage():
     hits = 0
     for values in np.random.default_rng(0).normal(size=(100, 20)):
-        _, _, low, high = mean_curve([[{"frames": 1, RETURN: float(value)}] for value in values], RETURN)
+        _, _, low, high = mean_curve(
+            [[{"frames": 1, RETURN: float(value)}] for value in values], RETURN
+        )
         hits += bool(low[0] <= 0 <= high[0])
     assert 0.88 < hits / 100 < 0.98
 

@@ -18,10 +18,14 @@ def test_panel_shows_the_given_values():
     assert ([650.0, 670.0], [0, 0]) in drawn
     assert ([649.0, 660.0, 671.0], [0, 0, 0]) in drawn
     guides = [(x, y) for x, y in drawn if len(x) == 2 and x[0] == x[1]]
-    assert guides == [([630, 630], [-0.5, 1.5]), ([600, 600], [1.5, 2.5])], "adjacent rows share the line of a guide"
+    assert guides == [([630, 630], [-0.5, 1.5]), ([600, 600], [1.5, 2.5])], (
+        "adjacent rows share the line of a guide"
+    )
     assert any(math.isnan(x[0]) for x, _ in drawn), "no bar without an interval"
 
 
 def test_panels_share_their_rows(tmp_path):
-    draw_intervals({"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", measure="reward", title="Placebo")
+    draw_intervals(
+        {"one": ROWS, "other": ROWS[:2]}, tmp_path / "plot.png", measure="reward", title="Placebo"
+    )
     assert (tmp_path / "plot.png").exists()

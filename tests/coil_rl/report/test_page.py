@@ -22,23 +22,54 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     assert heading == "## Results"
     titles, guide, ppo, coil, zeroed = cells(drivers)
     assert titles[:6] == [
-        "driver", "advice", "seeds", "completed", "seeds with a crash (95 %)", "reward / guide's (95 %)",
-    ]  # fmt: skip
+        "driver",
+        "advice",
+        "seeds",
+        "completed",
+        "seeds with a crash (95 %)",
+        "reward / guide's (95 %)",
+    ]
     assert guide[:6] == ["guide", "", "-", "100%", "0 of 2 cases", "1.000"]
     assert coil == [
-        "coil", "", "3", "100%", "0 of 3 (0% to 71%)", "1.038 (1.034 to 1.043)", "-0.037 (-0.037 to -0.037)", "0.000",
-        "0%", "571.0", "50.00", "0.200", "0.30", "yes",
-    ]  # fmt: skip
-    assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (["-", "-", "-"], "no", ["coil", "zeroed"], "-")
+        "coil",
+        "",
+        "3",
+        "100%",
+        "0 of 3 (0% to 71%)",
+        "1.038 (1.034 to 1.043)",
+        "-0.037 (-0.037 to -0.037)",
+        "0.000",
+        "0%",
+        "571.0",
+        "50.00",
+        "0.200",
+        "0.30",
+        "yes",
+    ]
+    assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (
+        ["-", "-", "-"],
+        "no",
+        ["coil", "zeroed"],
+        "-",
+    )
     assert cells(rewards)[0] == ["mean reward", "a", "b"]
     assert cells(rewards)[-1] == ["coil, zeroed", "-100.0 (0% completed)", "-201.0 (0% completed)"]
 
 
 def test_terms_of_the_reward_are_beside_the_sum(tmp_path):
     rows = driven("guide", {"a": 1.0}, reward_cone=2.0, reward_smooth=-1.0)
-    make_run(tmp_path / "run", "coil", 0, rows + driven("coil", {"a": 2.5}, reward_cone=2.75, reward_smooth=-0.25))
+    make_run(
+        tmp_path / "run",
+        "coil",
+        0,
+        rows + driven("coil", {"a": 2.5}, reward_cone=2.75, reward_smooth=-0.25),
+    )
     terms = cells(section(tmp_path).split("\n\n")[2])
-    assert terms == [["term of the reward", "cone", "smooth"], ["guide", "2.0", "-1.0"], ["coil", "2.8", "-0.2"]]
+    assert terms == [
+        ["term of the reward", "cone", "smooth"],
+        ["guide", "2.0", "-1.0"],
+        ["coil", "2.8", "-0.2"],
+    ]
 
 
 def test_tasks_have_their_own_table(tmp_path):
@@ -47,15 +78,27 @@ def test_tasks_have_their_own_table(tmp_path):
         rows += driven("coil", {"a": 2.0}, per_step_left=left, per_step_right=-0.125)
         make_run(tmp_path / f"run_{seed}", "coil", seed, rows)
     tasks = cells(section(tmp_path).split("\n\n")[2])
-    assert tasks == [["reward of a step", "left", "right"], ["guide", "0.250", "-"], ["coil", "0.750", "-0.125"]]
+    assert tasks == [
+        ["reward of a step", "left", "right"],
+        ["guide", "0.250", "-"],
+        ["coil", "0.750", "-0.125"],
+    ]
 
 
 def test_returns_of_trained_guides_are_shown_before_and_after(tmp_path):
     for seed, label in enumerate(["dynamic", "dynamic", "coil"]):
-        run = make_run(tmp_path / str(seed), label, seed, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
+        run = make_run(
+            tmp_path / str(seed),
+            label,
+            seed,
+            driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}),
+        )
         if label == "dynamic":
             returns = [10.0 + seed, math.nan, 20.0 + seed, 40.0 + seed]
-            write_csv([{"frames": n, "guide/spline": value} for n, value in enumerate(returns)], run / "metrics.csv")
+            write_csv(
+                [{"frames": n, "guide/spline": value} for n, value in enumerate(returns)],
+                run / "metrics.csv",
+            )
     (table,) = page.guide_training(read_runs([tmp_path]))
     assert cells(table)[1:] == [["dynamic", "2", "10.5 to 40.5"]]
     assert page.guide_training(read_runs([tmp_path / "2"])) == []
@@ -66,7 +109,10 @@ def test_training_is_summarised_by_the_evaluation_curve(tmp_path):
     curves = {"late": [0.0, "nan", 100.0, 300.0], "early": [200.0, 250.0, 400.0, 300.0]}
     for label, returns in curves.items():
         folder = make_run(tmp_path / label, label, 0, rows, guide=200.0)
-        lines = [{"frames": 1000 * n, "evaluation/return": x, "selection/return": -n} for n, x in enumerate(returns)]
+        lines = [
+            {"frames": 1000 * n, "evaluation/return": x, "selection/return": -n}
+            for n, x in enumerate(returns)
+        ]
         write_csv(lines, folder / "metrics.csv")
     (tmp_path / "late" / "training_time.json").write_text('{"seconds": 12.4}')
     make_run(tmp_path / "never", "late", 1, rows, guide=1000.0)

@@ -15,9 +15,15 @@ TRACKS = [ring_track("small", 5.0), ring_track("large", 8.0)]
 
 def drive(rate=2.0, **measures):
     """Return episodes of half a round on each track."""
-    episodes = [{"case": name, "reward": 10.0 * number, "steps": 30} | measures for number, name in enumerate("ab")]
+    episodes = [
+        {"case": name, "reward": 10.0 * number, "steps": 30} | measures
+        for number, name in enumerate("ab")
+    ]
     turn = np.linspace(0, np.pi, 30)
-    poses = [np.stack([radius * np.cos(turn), radius * np.sin(turn), turn], axis=1) for radius in (5.0, 8.0)]
+    poses = [
+        np.stack([radius * np.cos(turn), radius * np.sin(turn), turn], axis=1)
+        for radius in (5.0, 8.0)
+    ]
     return EvaluationResult(episodes, {"pose": poses}, rate)
 
 

@@ -18,12 +18,21 @@ def test_every_run_of_a_folder_is_read(sweep):
     assert [run.needs_guide for run in runs[2:4]] == [True, False]
     drives = runs[1].evaluation.groupby(["driver", "advice", "actions"], sort=False)
     assert list(drives.groups) == [
-        ("guide", "", "deterministic"), ("coil", "", "deterministic"), ("coil", "", "sampled"),
+        ("guide", "", "deterministic"),
+        ("coil", "", "deterministic"),
+        ("coil", "", "sampled"),
         ("coil", "zeroed", "deterministic"),
-    ]  # fmt: skip
+    ]
     agent = drives.get_group(("coil", "", "deterministic"))
-    assert agent[["case", "reward", "smoothness"]].to_numpy().tolist() == [["a", 521, 0.2], ["b", 621, 0.2]]
-    assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == ({"guide": 300}, 1000, 20)
+    assert agent[["case", "reward", "smoothness"]].to_numpy().tolist() == [
+        ["a", 521, 0.2],
+        ["b", 621, 0.2],
+    ]
+    assert (runs[1].guide_returns, runs[1].curve[0]["frames"], len(runs[1].curve)) == (
+        {"guide": 300},
+        1000,
+        20,
+    )
 
 
 def test_numbers_keep_every_digit(tmp_path):
@@ -36,7 +45,11 @@ def test_runs_are_found_once_at_any_depth(sweep):
     (sweep / "0_coil" / ".hydra").mkdir()
     (sweep / "0_coil" / ".hydra" / "config.yaml").write_text("seed: 0")
     make_run(sweep / "0_coil" / "proxies" / "spline", "proxy", 0, None)
-    assert len(read_runs([sweep.parent])) == len(read_runs([sweep, sweep / "0_coil", sweep.parent])) == 8
+    assert (
+        len(read_runs([sweep.parent]))
+        == len(read_runs([sweep, sweep / "0_coil", sweep.parent]))
+        == 8
+    )
     assert [run.label for run in read_runs([sweep / "3_ppo", sweep / "0_coil"])] == ["ppo", "coil"]
 
 
@@ -54,17 +67,37 @@ ROW = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,c
 @pytest.mark.parametrize(
     ("file", "text", "message"),
     [
-        ("evaluation.csv", "", r"is damaged \(No columns.*\); remove the file and write it again by coil-train"),
+        (
+            "evaluation.csv",
+            "",
+            r"is damaged \(No columns.*\); remove the file and write it again by coil-train",
+        ),
         ("evaluation.csv", ROW.splitlines()[0] + "\n", r"is damaged \(no rows\)"),
         ("evaluation.csv", "driver,actions\nguide,sampled\n", r"\['advice', .*not in index"),
-        ("evaluation.csv", ROW.replace("lap_time,", "") + "1,1,1,1,1\n", r"is damaged \(no column lap_time\)"),
+        (
+            "evaluation.csv",
+            ROW.replace("lap_time,", "") + "1,1,1,1,1\n",
+            r"is damaged \(no column lap_time\)",
+        ),
         ("evaluation.csv", ROW + "much,1,1,1,1,1\n", "could not convert .* 'much'"),
         ("evaluation.csv", ROW + "1,1,1,1,1,1,1", "more values than columns"),
         ("evaluation.csv", b"\xff\xfe", "codec can't decode"),
-        ("metrics.csv", "frames,evaluation/return\n1,2\n3,\n", r"metrics.csv is damaged .*; restore the file"),
-        ("metrics.csv", "1,2\n3,4\n", r"metrics.csv is damaged \(not every row has its number of frames\)"),
+        (
+            "metrics.csv",
+            "frames,evaluation/return\n1,2\n3,\n",
+            r"metrics.csv is damaged .*; restore the file",
+        ),
+        (
+            "metrics.csv",
+            "1,2\n3,4\n",
+            r"metrics.csv is damaged \(not every row has its number of frames\)",
+        ),
         ("guide_return.json", "[1", "guide_return.json is damaged"),
-        ("config.yaml", "seed: 0\n", r"no valid label, seed and method.needs_guide \(Missing key label\)"),
+        (
+            "config.yaml",
+            "seed: 0\n",
+            r"no valid label, seed and method.needs_guide \(Missing key label\)",
+        ),
         ("config.yaml", "- 1\n", r"\(a list\); restore the file"),
         ("config.yaml", "seed: [\n", "remove the run from the folder"),
     ],
@@ -77,7 +110,9 @@ def test_error_names_the_damaged_file(sweep, file, text, message):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(("name", "message"), [("", "holds no run of coil-train"), ("nowhere", "does not exist")])
+@pytest.mark.parametrize(
+    ("name", "message"), [("", "holds no run of coil-train"), ("nowhere", "does not exist")]
+)
 def test_folder_without_runs_is_an_error(name, message, tmp_path):
     with pytest.raises(UserError, match=message):
         read_runs([tmp_path / name])

@@ -15,7 +15,11 @@ def test_few_seeds_have_interval_and_p_of_a_t_test():
     expected = stats.ttest_1samp(values, 0)
     found = estimate(values)
     assert found[1:3] == pytest.approx(tuple(expected.confidence_interval(0.95)))
-    assert (found.mean, found.seeds, found.p) == (pytest.approx(2.8), 5, pytest.approx(expected.pvalue))
+    assert (found.mean, found.seeds, found.p) == (
+        pytest.approx(2.8),
+        5,
+        pytest.approx(expected.pvalue),
+    )
 
 
 @pytest.mark.parametrize("shift", [0.3, -0.6])
@@ -34,8 +38,13 @@ def test_p_of_many_seeds_is_reproducible():
 @pytest.mark.parametrize("seeds", [3, 5, 12])
 def test_interval_has_its_coverage(seeds):
     samples = np.random.default_rng(1).normal(7, size=(1000, seeds))
-    hits = sum(low <= 7 <= high for _, low, high, *_ in map(estimate, samples[: 100 if seeds >= 10 else 1000]))
-    assert hits / (100 if seeds >= 10 else 1000) == pytest.approx(0.95, abs=0.05 if seeds >= 10 else 0.02)
+    hits = sum(
+        low <= 7 <= high
+        for _, low, high, *_ in map(estimate, samples[: 100 if seeds >= 10 else 1000])
+    )
+    assert hits / (100 if seeds >= 10 else 1000) == pytest.approx(
+        0.95, abs=0.05 if seeds >= 10 else 0.02
+    )
 
 
 def test_estimates_without_spread_or_numbers():
@@ -43,7 +52,12 @@ def test_estimates_without_spread_or_numbers():
     assert estimate([0.0, 0.0]).p == 1
     single = estimate([2.0])
     assert (single.mean, single.seeds) == (2, 1)
-    assert all(map(math.isnan, (single.low, single.high, single.p, estimate([]).mean, estimate([1.0, math.nan]).mean)))
+    assert all(
+        map(
+            math.isnan,
+            (single.low, single.high, single.p, estimate([]).mean, estimate([1.0, math.nan]).mean),
+        )
+    )
 
 
 def test_cells_show_the_interval_if_there_is_one():
@@ -53,7 +67,9 @@ def test_cells_show_the_interval_if_there_is_one():
 
 
 def test_holm_corrects_known_p_values():
-    np.testing.assert_allclose(holm([0.01, 0.04, math.nan, 0.03, 0.9]), [0.04, 0.09, math.nan, 0.09, 0.9])
+    np.testing.assert_allclose(
+        holm([0.01, 0.04, math.nan, 0.03, 0.9]), [0.04, 0.09, math.nan, 0.09, 0.9]
+    )
     assert len(holm([])) == 0
 
 

@@ -23,8 +23,14 @@ def test_the_page_has_the_accuracy_of_the_saved_classifier(drives, tmp_path):
     tested = labelled_drive(read_recording(drives["both"][0]))
     shares = accuracy(load_classifier(tmp_path / "cones.json"), label_clusters([tested]))
     for name, share in shares.items():
-        assert re.search(rf"\| accuracy +\| {re.escape(name)} +\| +{share.share:.4f} \|.*\| +{share.total} \|", page)
-    assert re.search(r"\| paper, its own robot +\| all +\| 0\.9877 \| +0\.964\d \| 0\.995\d \| +3 \| +243 \|", page)
+        assert re.search(
+            rf"\| accuracy +\| {re.escape(name)} +\| +{share.share:.4f} \|.*\| +{share.total} \|",
+            page,
+        )
+    assert re.search(
+        r"\| paper, its own robot +\| all +\| 0\.9877 \| +0\.964\d \| 0\.995\d \| +3 \| +243 \|",
+        page,
+    )
     assert "| recall of thin cones " in page
     assert "| recall" not in Figure25(drives["left"], drives["right"]).make(tmp_path / "untested")
     assert (tmp_path / "figure_25.png").exists()
@@ -61,7 +67,9 @@ def drive_with_varying_scans(path, sides, seed):
     drives = [simulated_drive(sides, seed, lidar=SimulatedLidar(beams)) for beams in (250, 470)]
     for number, drive in enumerate(drives):
         save_drive(drive, path.with_suffix(f".{number}"))
-    contents = [read_messages(path.with_suffix(f".{n}"), {"/scan": SCAN, "/odom": ODOMETRY}) for n in (0, 1)]
+    contents = [
+        read_messages(path.with_suffix(f".{n}"), {"/scan": SCAN, "/odom": ODOMETRY}) for n in (0, 1)
+    ]
     with RecordingWriter(path) as writer:
         for name, entries in contents[0].notes.items():
             writer.describe(name, entries)
@@ -77,13 +85,21 @@ def test_each_scan_is_measured_by_its_own_bearings(tmp_path):
     varying = labelled_drive(recording)
     for number, drive in enumerate(drives):
         scans, beams = slice(number, len(varying.ranges), 2), len(drive.angles)
-        assert np.array_equal(varying.ranges[scans, :beams], drive.ranges[scans][: len(varying.ranges[scans])])
-        assert (varying.hit[scans, :beams] == drive.hit[scans][: len(varying.ranges[scans])]).float().mean() > 0.999
+        assert np.array_equal(
+            varying.ranges[scans, :beams], drive.ranges[scans][: len(varying.ranges[scans])]
+        )
+        assert (
+            varying.hit[scans, :beams] == drive.hit[scans][: len(varying.ranges[scans])]
+        ).float().mean() > 0.999
         assert (varying.hit[scans, beams:] == -1).all()
-        difference = varying.visibility[scans] - drive.visibility[scans][: len(varying.ranges[scans])]
+        difference = (
+            varying.visibility[scans] - drive.visibility[scans][: len(varying.ranges[scans])]
+        )
         assert difference.abs().mean() < 1e-3
-    every_second = [clusters_in_range([(drive.ranges[n::2].numpy(), drive.angles.numpy())])[0]
-                    for n, drive in enumerate(drives)]  # fmt: skip
+    every_second = [
+        clusters_in_range([(drive.ranges[n::2].numpy(), drive.angles.numpy())])[0]
+        for n, drive in enumerate(drives)
+    ]
     features, _ = clusters_in_range([(recording.ranges, recording.angles(slice(None)))])
     expected = np.concatenate(every_second)
     np.testing.assert_allclose(np.sort(features, axis=0), np.sort(expected, axis=0), atol=1e-6)
@@ -98,7 +114,9 @@ def test_drives_with_varying_scans_train_and_test_the_classifier(tmp_path):
             drive_with_varying_scans(paths[side][-1], side, seed)
     Figure25(**paths).make(tmp_path / "figure_25")
     (measured,) = (
-        row for row in read_csv(tmp_path / "figure_25.csv") if row["measure"] == "accuracy" and row["of"] == "all"
+        row
+        for row in read_csv(tmp_path / "figure_25.csv")
+        if row["measure"] == "accuracy" and row["of"] == "all"
     )
     assert float(measured["share"]) > 0.96
 
@@ -107,7 +125,9 @@ def clusters(count=300, seed=0):
     rng = np.random.default_rng(seed)
     thick = rng.random(count) < 0.5
     width = np.where(thick, 0.08, 0.035) + rng.normal(0, 0.006, count)
-    return np.stack([width, rng.uniform(0, 0.02, count), 1.2 * width + rng.normal(0, 0.001, count)], axis=1), thick
+    return np.stack(
+        [width, rng.uniform(0, 0.02, count), 1.2 * width + rng.normal(0, 0.001, count)], axis=1
+    ), thick
 
 
 def test_components_are_the_eigenvectors_of_the_correlation_matrix_in_any_units():
@@ -125,5 +145,7 @@ def test_components_are_the_eigenvectors_of_the_correlation_matrix_in_any_units(
 def test_figure_is_written_with_and_without_errors(tmp_path):
     features, thick = clusters()
     for wrong in (None, np.arange(len(thick)) < 40):
-        draw_cone_features(features, thick, tmp_path / "plot.png", wrong=wrong, title="Clusters (simulated)")
+        draw_cone_features(
+            features, thick, tmp_path / "plot.png", wrong=wrong, title="Clusters (simulated)"
+        )
         assert (tmp_path / "plot.png").stat().st_size > 10_000

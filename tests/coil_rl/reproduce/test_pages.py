@@ -27,20 +27,32 @@ def test_the_origin_has_command_commits_seeds_and_frames(tmp_path):
         "Made by `coil-reproduce table=4` at commit `def` with local changes. 5 runs with the seeds 0, 1, made at "
         "commit `abc`, `abc` with local changes, `unknown`. Training frames: 4,000 (coil, ppo)."
     )
-    assert pages.origin("coil-reproduce table=1", "def") == "Made by `coil-reproduce table=1` at commit `def`."
+    assert (
+        pages.origin("coil-reproduce table=1", "def")
+        == "Made by `coil-reproduce table=1` at commit `def`."
+    )
 
 
 def test_results_md_has_the_claims_the_pages_and_the_missing_results():
     body = "## Table 9: something\n\ntable\n\n### What held up\n\n| more |"
     made = pages.page(body, "table_9", "A note.", "Made.")
     text = pages.all_results(
-        {"table_9": made, "figure_3": None}, {"table_9": "make table=9", "figure_3": "make figure=3"},
-        "make all=true", "A note.", ["One\n  problem."], ["One limit."],
-    )  # fmt: skip
+        {"table_9": made, "figure_3": None},
+        {"table_9": "make table=9", "figure_3": "make figure=3"},
+        "make all=true",
+        "A note.",
+        ["One\n  problem."],
+        ["One limit."],
+    )
     order = [
-        "> **A note.**", "`make all=true` writes this file", "| more |", "![Table 9: something](table_9.png)",
-        "- `make figure=3`", "- One problem.", "- One limit.",
-    ]  # fmt: skip
+        "> **A note.**",
+        "`make all=true` writes this file",
+        "| more |",
+        "![Table 9: something](table_9.png)",
+        "- `make figure=3`",
+        "- One problem.",
+        "- One limit.",
+    ]
     places = [text.index(part) for part in order]
     assert places == sorted(places)
     assert text.count("A note.") == text.count("| more |") == 1
@@ -50,7 +62,12 @@ def test_results_md_has_the_claims_the_pages_and_the_missing_results():
     ("number", "sign", "p", "cell"),
     [
         ((1.5, 1.0, 2.0, 3), 1, 0.049, "**held up**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.049"),
-        ((-1.5, -2.0, -1.0, 3), 1, 0.01, "**did not hold up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
+        (
+            (-1.5, -2.0, -1.0, 3),
+            1,
+            0.01,
+            "**did not hold up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010",
+        ),
         ((-1.5, -2.0, -1.0, 3), -1, 0.01, "**held up**: -1.5 (-2.0 to -1.0), 3 seeds, p 0.010"),
         ((1.5, 1.0, 2.0, 3), 1, 0.06, "**undecided**: +1.5 (+1.0 to +2.0), 3 seeds, p 0.060"),
         ((2.0,), 1, math.nan, "**undecided**: +2.0, 1 seed"),
@@ -67,10 +84,13 @@ def test_the_verdicts_of_a_world_are_one_family():
     assert 0.005 < alone.estimate.p < 0.025
     for others, word in [(1, "held up"), (8, "undecided")]:
         page = claims_section(
-            [{"claim": "first", "ours": alone}, *[{"claim": "other", "ours": undecided}] * others], {"ours": "ours"}
+            [{"claim": "first", "ours": alone}, *[{"claim": "other", "ours": undecided}] * others],
+            {"ours": "ours"},
         )
         assert row(page, "first")[1].startswith(f"**{word}**")
     elsewhere = [{"world": "rain", "claim": "other", "ours": undecided}] * 8
-    page = claims_section([{"world": "", "claim": "first", "ours": alone}, *elsewhere], {"ours": "ours"})
+    page = claims_section(
+        [{"world": "", "claim": "first", "ours": alone}, *elsewhere], {"ours": "ours"}
+    )
     assert row(page, "first")[1].startswith("**held up**")
     assert row(page, "other, rain")[1].startswith("**undecided**")

@@ -30,7 +30,12 @@ from coil_rl.train.evaluation import evaluate_policy
 def recordings(tmp_path_factory):
     """A crash of a robot with constant steering, and two drives of the guide."""
     folder = tmp_path_factory.mktemp("drives")
-    record_drives(SimulatedRobotEnv(seed=4), ConstantGuide(1.0), [folder / "crash.mcap"], {"policy": "constant"})
+    record_drives(
+        SimulatedRobotEnv(seed=4),
+        ConstantGuide(1.0),
+        [folder / "crash.mcap"],
+        {"policy": "constant"},
+    )
     env = SimulatedRobotEnv(num_envs=2, time_limit=20.0, seed=4)
     record_drives(env, SplineGuide(), [folder / "0.mcap", folder / "1.mcap"], {"policy": "guide"})
     return folder
@@ -48,7 +53,9 @@ def test_measures_of_recordings_equal_those_of_the_simulation(recordings, tmp_pa
         assert float(recorded["clearance"]) == pytest.approx(episode["clearance"], abs=1e-5)
         assert recorded["crashed"] == "False"
         assert float(recorded["off_centre"]) < 0.05
-    (crash,) = evaluate_policy(SimulatedRobotEnv(seed=4), ConstantGuide(1.0), measures=measured).episodes
+    (crash,) = evaluate_policy(
+        SimulatedRobotEnv(seed=4), ConstantGuide(1.0), measures=measured
+    ).episodes
     assert rows["crash.mcap"]["crashed"] == "True"
     assert float(rows["crash.mcap"]["clearance"]) == pytest.approx(crash["clearance"], abs=1e-5)
     assert row(page, "guide ")[:5] == ["guide", "-", "2", "0", "0"]
@@ -79,7 +86,9 @@ def test_another_robots_recording_is_measured_by_odometry_or_commands(tmp_path):
 def test_the_last_pose_is_in_the_recording(recordings):
     state = SimulatedRobotEnv(seed=4).rollout(200, ConstantGuide(1.0))
     poses, _, _ = read_recording(recordings / "crash.mcap").odometry
-    torch.testing.assert_close(torch.from_numpy(poses[-1]).float(), state["next", "info", "pose"][0, -1])
+    torch.testing.assert_close(
+        torch.from_numpy(poses[-1]).float(), state["next", "info", "pose"][0, -1]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,11 +107,19 @@ def test_without_recordings_the_guide_and_the_agents_drive_and_are_recorded_once
     assert table.experiments == ["mine"]
     page = table.make(tmp_path / "table_6", runs)
     rows = read_csv(tmp_path / "table_6.csv")
-    assert [(line["method"], line["seed"]) for line in rows] == [("guide", ""), ("ppo", "0"), ("coil", "1")]
+    assert [(line["method"], line["seed"]) for line in rows] == [
+        ("guide", ""),
+        ("ppo", "0"),
+        ("coil", "1"),
+    ]
     drives = {path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()}
     assert len(drives) == 3
-    assert Table6(["mine"], labels=["ppo", "coil"], repeats=1).make(tmp_path / "table_6", runs) == page
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()} == drives
+    assert (
+        Table6(["mine"], labels=["ppo", "coil"], repeats=1).make(tmp_path / "table_6", runs) == page
+    )
+    assert {
+        path: path.stat().st_mtime_ns for path in (tmp_path / "table_6_drives").iterdir()
+    } == drives
     again = Table6(["mine"], recordings=[str(tmp_path / "table_6_drives")])
     assert again.experiments == []
     again.make(tmp_path / "again")
@@ -128,7 +145,13 @@ def robots_of(run, folder):
 
 
 def test_own_runs_drive_with_any_label_and_again_with_other_weights(tmp_path):
-    options = ["guide=constant", "guide.constant.value=1", "track=generated", "track.train.count=1", "label=mine"]
+    options = [
+        "guide=constant",
+        "guide.constant.value=1",
+        "track=generated",
+        "track.train.count=1",
+        "label=mine",
+    ]
     run = make_untrained_run(tmp_path / "run", "method=coil", "seed=3", *options)
     first = robots_of(run, tmp_path)
     assert [line["method"] for line in read_csv(tmp_path / "own.csv")] == ["guide", "mine"]
@@ -141,8 +164,12 @@ def test_own_runs_drive_with_any_label_and_again_with_other_weights(tmp_path):
 
 def test_recorded_command_is_the_transformed_action(tmp_path):
     options = ["learner.action_gain=1.0", "track=generated", "track.train.count=1"]
-    recording = robots_of(make_untrained_run(tmp_path / "residual", "method=residual", *options), tmp_path)
-    guide = McapReplayEnv(recording, Perception(simulated_cone_classifier())).rollout(100, SplineGuide())
+    recording = robots_of(
+        make_untrained_run(tmp_path / "residual", "method=residual", *options), tmp_path
+    )
+    guide = McapReplayEnv(recording, Perception(simulated_cone_classifier())).rollout(
+        100, SplineGuide()
+    )
     turn_rate = torch.from_numpy(recording.commands[0][: guide.shape[1], 1])
     # An untrained residual agent adds little to its guide.
     advised = (guide["action"][0, :, 0] * torch.pi * 80 / 180).sin() * 0.15 / (2 / 7)
@@ -150,13 +177,28 @@ def test_recorded_command_is_the_transformed_action(tmp_path):
 
 
 def test_run_without_an_agent_is_refused(tmp_path):
-    run = make_untrained_run(tmp_path / "guide", "method=guide", "track=generated", "track.train.count=1")
+    run = make_untrained_run(
+        tmp_path / "guide", "method=guide", "track=generated", "track.train.count=1"
+    )
     with pytest.raises(UserError, match="has no agent"):
         robots_of(run, tmp_path)
 
 
-KNOWN = {"crashed": False, "laps": 3, "lap_time": 40.0, "corner_cut": 1.0, "off_centre": 0.02, "clearance": 0.04}
-LOST = {"laps": 0, "lap_time": math.nan, "corner_cut": math.nan, "crashed": True, "clearance": -0.01}
+KNOWN = {
+    "crashed": False,
+    "laps": 3,
+    "lap_time": 40.0,
+    "corner_cut": 1.0,
+    "off_centre": 0.02,
+    "clearance": 0.04,
+}
+LOST = {
+    "laps": 0,
+    "lap_time": math.nan,
+    "corner_cut": math.nan,
+    "crashed": True,
+    "clearance": -0.01,
+}
 
 
 def drive(method, seed=None, **others):
@@ -184,7 +226,11 @@ def test_a_method_has_the_means_of_its_drives_next_to_the_paper(page):
 
 def test_claims_have_a_verdict_by_seed(page):
     expected = "**held up**: -0.194 (-0.194 to -0.194), 3 seeds, p 0.000"
-    assert row(page, "PPO steers more smoothly than the guide")[1:] == ["-0.163", "3 of 3", expected]
+    assert row(page, "PPO steers more smoothly than the guide")[1:] == [
+        "-0.163",
+        "3 of 3",
+        expected,
+    ]
     assert (
         row(page, "COIL steers more smoothly than PPO")[3]
         == "**undecided**: -0.001 (-0.065 to +0.063), 2 seeds, p 1.000"
@@ -194,9 +240,17 @@ def test_claims_have_a_verdict_by_seed(page):
 
 
 def test_drives_without_a_complete_lap_are_compared_by_clearance_only(page):
-    assert row(page, "COIL's laps")[1:] == ["-0.61", "2 of 3", "**held up**: -1.00 (-1.00 to -1.00), 2 seeds, p 0.000"]
+    assert row(page, "COIL's laps")[1:] == [
+        "-0.61",
+        "2 of 3",
+        "**held up**: -1.00 (-1.00 to -1.00), 2 seeds, p 0.000",
+    ]
     expected = "**held up**: -0.195 (-0.259 to -0.131), 2 seeds, p 0.049"
-    assert row(page, "COIL steers more smoothly than its guide")[1:] == ["-0.183", "2 of 3", expected]
+    assert row(page, "COIL steers more smoothly than its guide")[1:] == [
+        "-0.183",
+        "2 of 3",
+        expected,
+    ]
     lost = page_of(drive("guide"), drive("ppo", "0", **LOST))
     assert row(lost, "PPO steers more smoothly")[2:] == ["0 of 1", "-"]
     assert row(lost, "PPO drives nearer")[2:] == ["1 of 1", "**undecided**: -0.050, 1 seed"]
@@ -213,7 +267,8 @@ def test_each_world_has_its_own_rows_and_claims():
 
 def test_an_agent_without_seed_leaves_claims_undecided_and_other_drivers_have_none():
     assert (
-        row(page_of(drive("guide"), drive("coil", smoothness=0.1)), "COIL steers")[3] == "**undecided**: -0.200, 1 seed"
+        row(page_of(drive("guide"), drive("coil", smoothness=0.1)), "COIL steers")[3]
+        == "**undecided**: -0.200, 1 seed"
     )
     assert "held up" not in page_of(drive("mine"), drive("guide"))
 

@@ -29,7 +29,9 @@ def test_scores_of_the_guides_are_ordered_and_at_most_optimal(made):
         if guide in ("optimal", "random"):
             np.testing.assert_allclose(own, guide == "optimal", atol=1e-9)
         assert (own.max(axis=1) == own.min(axis=1)).all()
-    worst, noisy = (column(groups["state", guide], "guide_score") for guide in ("worst", "noisy (20%)"))
+    worst, noisy = (
+        column(groups["state", guide], "guide_score") for guide in ("worst", "noisy (20%)")
+    )
     assert (worst < 0).all()
     assert ((noisy > 0) & (noisy < 1)).all()
 
@@ -46,7 +48,9 @@ def test_deterministic_advice_changes_nothing_with_the_whole_state(made):
 def test_optimal_advice_helps_with_partial_observations(made):
     _, groups, _ = made
     rows = groups["class", "optimal"]
-    assert column(rows, "coil_score")[:, -1].mean() > column(rows, "plain_score")[:, -1].mean() + 0.1
+    assert (
+        column(rows, "coil_score")[:, -1].mean() > column(rows, "plain_score")[:, -1].mean() + 0.1
+    )
 
 
 def test_the_page_counts_the_worlds_in_which_coil_reaches_its_guide(made):
@@ -62,7 +66,9 @@ def test_the_page_counts_the_worlds_in_which_coil_reaches_its_guide(made):
 
 
 def test_worlds_do_not_depend_on_their_number(made, tmp_path):
-    TabularCoil(worlds=1, states=6, actions=2, classes=2, steps=[50, 500, 5_000]).make(tmp_path / "c")
+    TabularCoil(worlds=1, states=6, actions=2, classes=2, steps=[50, 500, 5_000]).make(
+        tmp_path / "c"
+    )
     again = (tmp_path / "c.csv").read_text()
     assert made[2].with_suffix(".csv").read_text().startswith(again)
 

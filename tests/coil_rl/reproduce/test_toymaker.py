@@ -8,7 +8,12 @@ from coil_rl.reproduce.toymaker import Figure6, Table1, most_explained
 def test_table_1_solves_the_bellman_equation_next_to_the_paper(tmp_path):
     page = Table1().make(tmp_path / "t")
     # By hand: 7640/181 and 5840/181 with advertising.
-    exact = [6 + 0.95 * (7640 + 5840) / 2 / 181, 7640 / 181, -3 + 0.95 * (0.4 * 7640 + 0.6 * 5840) / 181, 5840 / 181]
+    exact = [
+        6 + 0.95 * (7640 + 5840) / 2 / 181,
+        7640 / 181,
+        -3 + 0.95 * (0.4 * 7640 + 0.6 * 5840) / 181,
+        5840 / 181,
+    ]
     rows = read_csv(tmp_path / "t.csv")
     assert [float(row["ours"]) for row in rows] == pytest.approx(exact, abs=1e-8)
     assert [float(row["paper"]) for row in rows] == [41.37, 42.21, 31.42, 32.26]
@@ -19,7 +24,12 @@ def test_table_1_solves_the_bellman_equation_next_to_the_paper(tmp_path):
 
 @pytest.mark.parametrize(
     ("differences", "explained"),
-    [([0.0, 0.0, 0.0], 3), ([0.1, 0.105, 0.3], 2), ([0.0, 0.02, 0.04], 1), ([0.0, 0.004, 0.008, 0.012], 3)],
+    [
+        ([0.0, 0.0, 0.0], 3),
+        ([0.1, 0.105, 0.3], 2),
+        ([0.0, 0.02, 0.04], 1),
+        ([0.0, 0.004, 0.008, 0.012], 3),
+    ],
 )
 def test_one_shift_explains_differences_within_rounding(differences, explained):
     assert most_explained(np.array(differences)) == explained

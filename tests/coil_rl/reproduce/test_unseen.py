@@ -11,7 +11,9 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("table_5")
     runs = {
         "main": make_runs(folder / "main", {"coil": 30.0, "ppo": 60.0, "coil_shuffled": 10.0}),
-        "imitation": make_runs(folder / "imitation", {"oil": 5.0}, sampled=False, completed=0.5, crashed=0.5),
+        "imitation": make_runs(
+            folder / "imitation", {"oil": 5.0}, sampled=False, completed=0.5, crashed=0.5
+        ),
         "other": make_runs(folder / "other", {"coil": 80.0, "ppo": 60.0}),
     }
     page = Table5(["main", "imitation"], {"another world": ["other"]}).make(folder / "t", runs)
@@ -35,7 +37,9 @@ def test_drivers_are_the_guide_and_then_the_agents_by_reward(made):
     assert deterministic["coil"]["reward / guide's (95 %)"] == "1.057 (1.052 to 1.061)"
 
     sampled = drivers(made[0], "Sampled actions")
-    assert list(sampled) == ["guide", "ppo", "coil", "coil_shuffled", "oil"], "oil has no sampled actions"
+    assert list(sampled) == ["guide", "ppo", "coil", "coil_shuffled", "oil"], (
+        "oil has no sampled actions"
+    )
 
 
 def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
@@ -47,11 +51,28 @@ def test_agents_are_compared_seed_by_seed_with_ppo_and_with_the_guide(made):
 
 
 def test_the_papers_drivers_are_next_to_the_paper(made):
-    table = [cells(line) for line in made[0].splitlines() if "| 609.4 |" in line or "| 632.9 |" in line]
-    assert [line[:2] for line in table] == [["guide", "the same"], ["coil", "sampled"], ["coil", "deterministic"]]
+    table = [
+        cells(line) for line in made[0].splitlines() if "| 609.4 |" in line or "| 632.9 |" in line
+    ]
+    assert [line[:2] for line in table] == [
+        ["guide", "the same"],
+        ["coil", "sampled"],
+        ["coil", "deterministic"],
+    ]
     assert table[2] == [
-        "coil", "deterministic", "50.00", "48.48", "0.100", "0.606", "581.0", "632.9", "1.056", "1.039", "0%", "0%",
-    ]  # fmt: skip
+        "coil",
+        "deterministic",
+        "50.00",
+        "48.48",
+        "0.100",
+        "0.606",
+        "581.0",
+        "632.9",
+        "1.056",
+        "1.039",
+        "0%",
+        "0%",
+    ]
     table = [cells(line) for line in made[0].splitlines()]
     assert ["oil", "506.0 (50% completed)", "606.0 (50% completed)"] in table
 
@@ -77,7 +98,11 @@ def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made)
 def test_the_csv_has_every_drive(made):
     _, numbers = made
     assert len(numbers) == 2 * (3 * 3 * 3 + 3 * 2 + 2 * 3 * 3)
-    drive = next(row for row in numbers if (row["label"], row["actions"], row["seed"]) == ("coil", "sampled", "2"))
+    drive = next(
+        row
+        for row in numbers
+        if (row["label"], row["actions"], row["seed"]) == ("coil", "sampled", "2")
+    )
     assert (drive["case"], float(drive["reward"]), float(drive["lap_time"])) == ("a", 482, 50)
 
 
@@ -85,6 +110,8 @@ def test_many_tracks_are_in_the_csv_only(tmp_path):
     runs = make_runs(tmp_path / "main", {"coil": 30.0, "ppo": 60.0}, seeds=2)
     for run in runs:
         first = run.evaluation[run.evaluation["case"] == "a"]
-        object.__setattr__(run, "evaluation", pd.concat([first.assign(case=name) for name in "abcdefghi"]))
+        object.__setattr__(
+            run, "evaluation", pd.concat([first.assign(case=name) for name in "abcdefghi"])
+        )
     page = Table5(["main"]).make(tmp_path / "t", {"main": runs})
     assert page.count("The rewards in each of the 9 cases are in t.csv.") == 2

@@ -50,8 +50,12 @@ def test_decision_equals_that_of_scikit_learn(training):
     features, thick, _ = cones()
     pipeline = make_pipeline(StandardScaler(), SVC(C=100.0)).fit(features, thick)
     known = make_pipeline(StandardScaler(), OneClassSVM(nu=UNUSUAL)).fit(features)
-    others = np.concatenate([np.random.default_rng(1).uniform(-0.02, 0.15, (500, 3)), cones(seed=1)[0]])
-    expected = np.stack([machine.decision_function(others) for machine in (pipeline, known)], axis=1)
+    others = np.concatenate(
+        [np.random.default_rng(1).uniform(-0.02, 0.15, (500, 3)), cones(seed=1)[0]]
+    )
+    expected = np.stack(
+        [machine.decision_function(others) for machine in (pipeline, known)], axis=1
+    )
     np.testing.assert_allclose(training.classifier.decision(others), expected, rtol=1e-9, atol=1e-9)
     classes = training.classifier.classify(others)
     assert (classes == np.where(known.predict(others) < 0, -1, pipeline.predict(others))).all()
@@ -91,9 +95,14 @@ NARROW = '{"mean": [0], "scale": [1], "support": [[0]], "weights": [[1], [1]], "
 
 @pytest.mark.parametrize(
     ("content", "words"),
-    [(None, "cannot be read"), ("nothing", "not a cone classifier"), ("{}", "not a cone classifier"),
-     (NARROW.replace('"gamma": 1', '"gamma": 0'), "more than 0"), (NARROW, "1 features instead of width")],
-)  # fmt: skip
+    [
+        (None, "cannot be read"),
+        ("nothing", "not a cone classifier"),
+        ("{}", "not a cone classifier"),
+        (NARROW.replace('"gamma": 1', '"gamma": 0'), "more than 0"),
+        (NARROW, "1 features instead of width"),
+    ],
+)
 def test_other_files_are_refused(tmp_path, content, words):
     if content is not None:
         (tmp_path / "cones.json").write_text(content)
@@ -107,7 +116,9 @@ def test_clusters_are_labelled_with_the_kind_of_their_cone(held_out):
     assert len(labelled.thick) > 2000
     assert labelled.distance.max() <= 1.0
     whole = labelled.visibility == 1
-    widths = [np.median(labelled.features[whole & (labelled.thick == kind), 0]) for kind in (False, True)]
+    widths = [
+        np.median(labelled.features[whole & (labelled.thick == kind), 0]) for kind in (False, True)
+    ]
     assert 0.02 < widths[0] < 0.04 < 0.06 < widths[1] < 0.09
     outliers = replace(held_out[0], hit=torch.full_like(held_out[0].hit, -1))
     assert not len(label_clusters([outliers]).thick)
@@ -117,16 +128,25 @@ def test_shipped_classifier_is_as_accurate_as_the_papers(held_out):
     shares = accuracy(simulated_cone_classifier(), label_clusters(held_out))
     assert 0.964 < shares["all"].share < 0.996
     assert shares["0.15-0.25 m"].share > shares["0.75-1 m"].share
-    assert shares["0.999-1 visible"].share > 0.98 > shares["0.5-0.999 visible"].share > shares["0-0.5 visible"].share
+    assert (
+        shares["0.999-1 visible"].share
+        > 0.98
+        > shares["0.5-0.999 visible"].share
+        > shares["0-0.5 visible"].share
+    )
     for found in recall(simulated_cone_classifier(), held_out).values():
         assert found["0.999-1 visible"].share > 0.97
         assert found["0-0.5 visible"].share < 0.6
         assert found["all"].total > 2000
-    assert sum(shares[name].total for name in shares if name.endswith("visible")) == shares["all"].total
+    assert (
+        sum(shares[name].total for name in shares if name.endswith("visible"))
+        == shares["all"].total
+    )
 
 
 @pytest.mark.parametrize(
-    ("beams", "accurate"), [(180, 0.94), (720, 0.97), pytest.param(1440, 0.97, marks=pytest.mark.slow)]
+    ("beams", "accurate"),
+    [(180, 0.94), (720, 0.97), pytest.param(1440, 0.97, marks=pytest.mark.slow)],
 )
 def test_shipped_classifier_knows_the_cones_of_other_scanners(beams, accurate):
     labelled = label_clusters([simulated_drive("both", 102, lidar=SimulatedLidar(beams))])

@@ -42,13 +42,17 @@ def test_transition_frequencies_match_the_probabilities():
         assert counts[~possible].sum() == 0
         expected = mdp.P[s, a, possible] / mdp.P[s, a, possible].sum() * len(next_states)
         assert chisquare(counts[possible], expected).pvalue > 1e-4
-    np.testing.assert_array_equal(sample.reward, mdp.R[sample.state, sample.action, sample.next_state])
+    np.testing.assert_array_equal(
+        sample.reward, mdp.R[sample.state, sample.action, sample.next_state]
+    )
     np.testing.assert_array_equal(sample.next_state[:-1], sample.state[1:])
 
 
 def test_transitions_and_q_depend_on_the_seed_only():
     mdp = garnet(5, 2, np.random.default_rng(1))
-    first, again, other = (sample_transitions(mdp, UNIFORM, 100, np.random.default_rng(seed)) for seed in (3, 3, 4))
+    first, again, other = (
+        sample_transitions(mdp, UNIFORM, 100, np.random.default_rng(seed)) for seed in (3, 3, 4)
+    )
     np.testing.assert_array_equal(first.state, again.state)
     assert (first.state != other.state).any()
     values = [learn(mdp, seed, 500).Q for seed in (1, 1, 2)]
@@ -58,8 +62,15 @@ def test_transitions_and_q_depend_on_the_seed_only():
 
 def test_an_episode_ends_at_a_terminal_state_or_after_its_steps():
     world, right = corridor(3), np.full(3, 1)
-    assert sample_transitions(world, right, 6, np.random.default_rng(0)).state.tolist() == [0, 1] * 3
-    assert sample_transitions(world, right, 3, np.random.default_rng(0), episode_steps=1).state.tolist() == [0] * 3
+    assert (
+        sample_transitions(world, right, 6, np.random.default_rng(0)).state.tolist() == [0, 1] * 3
+    )
+    assert (
+        sample_transitions(
+            world, right, 3, np.random.default_rng(0), episode_steps=1
+        ).state.tolist()
+        == [0] * 3
+    )
     with pytest.raises(ValueError, match="episode_steps=0 must be at least 1"):
         Simulator(world, np.random.default_rng(0), episode_steps=0)
 
@@ -91,7 +102,9 @@ def test_a_model_estimate_has_relative_frequencies_and_mean_rewards():
     np.testing.assert_array_equal(model.R[0, 1], [1.0, 4.0])
     np.testing.assert_array_equal(model.P[1, 0], [1.0, 0.0])
     assert np.isnan(model.P[0, 0]).all()
-    with pytest.raises(ValueError, match="action 0 has no sample in state 0, nor have 1 other pairs"):
+    with pytest.raises(
+        ValueError, match="action 0 has no sample in state 0, nor have 1 other pairs"
+    ):
         model.mdp(0.9)
 
 
@@ -135,7 +148,9 @@ def test_q_of_a_corridor_follows_equation_52():
     assert learned.Q[0, 1] == pytest.approx(2)
     assert 0.9 < learned.Q[0, 0] < 1
     assert learned.visits.sum() == learned.visits[0].sum() == 400
-    assert learn(toymaker(), observations=[0, 0], steps=500).Q.shape == (1, 2), "states share an observation"
+    assert learn(toymaker(), observations=[0, 0], steps=500).Q.shape == (1, 2), (
+        "states share an observation"
+    )
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from coil_rl.tabular import garnet, policy_evaluation, policy_iteration, solve, toymaker, value_iteration
+from coil_rl.tabular import (
+    garnet,
+    policy_evaluation,
+    policy_iteration,
+    solve,
+    toymaker,
+    value_iteration,
+)
 
 # The toymaker always advertises: V = r + gamma P V for that policy, by hand, with gamma = 19/20.
 GAMMA = Fraction(19, 20)
@@ -43,7 +50,9 @@ def test_the_toymaker_does_not_advertise_at_a_low_discount_factor(gamma, adverti
 @given(seeds)
 def test_value_and_policy_iteration_find_the_best_of_all_policies(seed):
     mdp = world(seed, states=4, actions=2)
-    best = np.max([solve(mdp, np.array(policy)) for policy in itertools.product(range(2), repeat=4)], axis=0)
+    best = np.max(
+        [solve(mdp, np.array(policy)) for policy in itertools.product(range(2), repeat=4)], axis=0
+    )
     for method in (value_iteration, policy_iteration):
         plan = method(mdp)
         np.testing.assert_allclose(plan.V, best, rtol=0, atol=1e-8)
@@ -54,7 +63,9 @@ def test_value_and_policy_iteration_find_the_best_of_all_policies(seed):
 def test_policy_evaluation_solves_the_linear_equations(seed, gamma):
     mdp, rng = world(seed, gamma=gamma), np.random.default_rng(seed)
     policy = rng.dirichlet(np.ones(3), size=6)
-    np.testing.assert_allclose(policy_evaluation(mdp, policy, 1e-7), solve(mdp, policy), rtol=0, atol=1e-7)
+    np.testing.assert_allclose(
+        policy_evaluation(mdp, policy, 1e-7), solve(mdp, policy), rtol=0, atol=1e-7
+    )
 
 
 @FEW
@@ -78,7 +89,9 @@ def test_iteration_ends_when_actions_are_tied_and_at_any_tolerance():
     mdp = world(0)
     mdp.P[:, 1], mdp.r[:, 1] = mdp.P[:, 0], mdp.r[:, 0]
     for first in range(3):
-        np.testing.assert_allclose(policy_iteration(mdp, np.full(6, first)).V, value_iteration(mdp).V, atol=1e-8)
+        np.testing.assert_allclose(
+            policy_iteration(mdp, np.full(6, first)).V, value_iteration(mdp).V, atol=1e-8
+        )
 
     assert np.abs(value_iteration(toymaker(0.99), 1e-300).V).max() < 1e6
     with pytest.raises(ValueError, match="tolerance=0 must be more than 0"):

@@ -26,7 +26,11 @@ class NotRuntimeCheckable(Protocol):
         (dict[str, float], [{}, {"a": 1}], [{"a": "b"}, [1], 1]),
         (Mapping, [{"a": "b"}], [[1]]),
         (float | Callable[[float], float], [1, {"_target_": "math.sqrt"}], ["sqrt"]),
-        (Sequence[Track], [{"_target_": "coil_rl.envs.shipped_tracks"}, [{"_target_": "x"}]], [5, [1, 2], "abc"]),
+        (
+            Sequence[Track],
+            [{"_target_": "coil_rl.envs.shipped_tracks"}, [{"_target_": "x"}]],
+            [5, [1, 2], "abc"],
+        ),
         (Any, [1, None, "a", []], []),
         (NotRuntimeCheckable, [1], []),
     ],
@@ -44,7 +48,9 @@ def test_value_is_checked_against_the_annotation(annotation, good, bad):
 
 
 class Base:
-    def __init__(self, needed: int, scale: float = 1.0, *, table: dict[str, float] | None = None, free=None):
+    def __init__(
+        self, needed: int, scale: float = 1.0, *, table: dict[str, float] | None = None, free=None
+    ):
         pass
 
 
@@ -62,7 +68,11 @@ Part.__module__ = "coil_rl.part"  # only classes of this project are known to pa
         ({}, (), r"part: Part needs needed; give part\.needed=VALUE"),
         ({"needed": 1, "scal": 1}, (), "Part takes no scal; it takes own, .*; did you mean scale?"),
         ({"needed": 1}, ("needed",), "needed of Part is set by the program; leave it out"),
-        ({"table": {"a": 1, "b": "x"}}, ("needed",), r"^part\.table\.b='x' must be a valid number$"),
+        (
+            {"table": {"a": 1, "b": "x"}},
+            ("needed",),
+            r"^part\.table\.b='x' must be a valid number$",
+        ),
         ({"own": [1, "x"]}, ("needed",), r"^part\.own\[1\]='x' must be a valid integer$"),
         ({"needed": 1, "_args_": [1]}, (), "Part takes no _args_"),
     ],

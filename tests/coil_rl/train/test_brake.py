@@ -19,7 +19,9 @@ FAST = Measure("reward", "min", at_most=-10.0)  # true for an episode that was e
 def configured(*overrides):
     """Return the configuration of a run and its learner."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("train", ["method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides])
+        config = compose(
+            "train", ["method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides]
+        )
     torch.manual_seed(0)
     return config, build_learner(config, build_env(config))
 
@@ -36,7 +38,12 @@ def built(*overrides, failure=None):
 
 @pytest.mark.parametrize(
     ("overrides", "cases"),
-    [("env=pendulum", 24), ("env=cone_track preset=paper", 96), ("env=cone_track", 224), ("learner.anchor.cases=7", 7)],
+    [
+        ("env=pendulum", 24),
+        ("env=cone_track preset=paper", 96),
+        ("env=cone_track", 224),
+        ("learner.anchor.cases=7", 7),
+    ],
 )
 def test_look_has_more_cases_where_failures_are_counted(overrides, cases):
     assert _probe(*configured(*overrides.split())).build(2).batch_size == (2 * cases,)
@@ -78,14 +85,19 @@ def test_guide_that_is_of_no_use_does_not_hold(degrade):
 def test_look_leaves_the_policy_and_the_random_numbers_alone_and_can_be_repeated():
     learner, brake, _ = built("learner.anchor.step=0", "learner.anchor.margin=0", failure=FAST)
     brake(0)
-    before, state = {name: value.clone() for name, value in learner.policy.state_dict().items()}, torch.get_rng_state()
+    before, state = (
+        {name: value.clone() for name, value in learner.policy.state_dict().items()},
+        torch.get_rng_state(),
+    )
     first, second = brake(1), brake(2)
     assert first == second
     assert first["look/return"] == first["look/lower_return"]
     assert first["look/failures"] == 5, "every episode begins far from upright"
     assert first["look/back"] == 0
     assert torch.equal(torch.get_rng_state(), state)
-    assert all(torch.equal(value, before[name]) for name, value in learner.policy.state_dict().items())
+    assert all(
+        torch.equal(value, before[name]) for name, value in learner.policy.state_dict().items()
+    )
 
 
 def test_weight_falls_where_the_network_does_what_the_guide_did_and_a_bad_policy_goes_back():
@@ -98,4 +110,6 @@ def test_weight_falls_where_the_network_does_what_the_guide_did_and_a_bad_policy
         value.data += 1
     learner.anchor.best += 1000
     assert brake(2)["look/back"] == 1
-    assert all(torch.equal(value, first[name]) for name, value in learner.policy.state_dict().items())
+    assert all(
+        torch.equal(value, first[name]) for name, value in learner.policy.state_dict().items()
+    )

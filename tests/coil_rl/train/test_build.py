@@ -20,7 +20,13 @@ from coil_rl.train.build import (
 from coil_rl.train.distillation import guides_with_untrained_proxies
 
 CONF = Path(__file__).parents[3] / "conf"
-SMALL = ["track=generated", "track.train.count=1", "track.test.count=1", "budget.num_envs=4", "run_dir=unused"]
+SMALL = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "budget.num_envs=4",
+    "run_dir=unused",
+]
 
 
 def composed(*overrides, name="train"):
@@ -40,12 +46,27 @@ def test_env_of_every_method_passes_check_env(preset, method):
     assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
 
 
-NOT_ALONE = {"controller", "entry", "learned", "recorded"}  # need a class, an entry, a run or a file
+NOT_ALONE = {
+    "controller",
+    "entry",
+    "learned",
+    "recorded",
+}  # need a class, an entry, a run or a file
 WITH_MEMORY = {"authors", "spline_memory"}
-OF_OTHER_ENVS = {"bot", "energy_pump", "lander", "linear_feedback", "oscillator", "swing_up", "walker"}
+OF_OTHER_ENVS = {
+    "bot",
+    "energy_pump",
+    "lander",
+    "linear_feedback",
+    "oscillator",
+    "swing_up",
+    "walker",
+}
 
 
-@pytest.mark.parametrize("guide", sorted({*choices("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS}))
+@pytest.mark.parametrize(
+    "guide", sorted({*choices("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
+)
 def test_every_guide_acts_on_the_observations_of_the_env(guide):
     config = composed(f"guide={guide}")
     (guide_module,), env = build_guides(config).values(), build_bare_env(config)
@@ -74,7 +95,9 @@ def lists_its_arguments(**options):
 
 def test_long_message_of_a_part_is_cut():
     node = {"_target_": f"{__name__}.lists_its_arguments", "numbers": list(range(9999))}
-    with pytest.raises(UserError, match=r"^env: unexpected {'numbers': \[0, 1, 2,[ 0-9,]{300,500} \.\.\.$"):
+    with pytest.raises(
+        UserError, match=r"^env: unexpected {'numbers': \[0, 1, 2,[ 0-9,]{300,500} \.\.\.$"
+    ):
         build(node, "env")
 
 
@@ -86,7 +109,9 @@ def test_guide_drives_with_degraded_advice():
 
 
 def test_advice_is_degraded_after_the_transforms_of_the_method():
-    config = composed("method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]")
+    config = composed(
+        "method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]"
+    )
     step = (env := build_env(config)).step(env.reset().set("action", torch.full((4, 1), 0.5)))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 
@@ -95,14 +120,18 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
 def test_every_learner_is_built(learner):
     config = composed(f"learner={learner}")
     env = build_env(config)
-    built = build_learner(config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None)
+    built = build_learner(
+        config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None
+    )
     assert built.policy(env.reset())["action"].shape == env.action_spec.shape
 
 
 SLOW_TRACKS = [pytest.param("unseen", marks=pytest.mark.slow)]  # many generated tracks
 
 
-@pytest.mark.parametrize("track", [*sorted({*choices("track")} - {"folder", "unseen"}), *SLOW_TRACKS])
+@pytest.mark.parametrize(
+    "track", [*sorted({*choices("track")} - {"folder", "unseen"}), *SLOW_TRACKS]
+)
 def test_every_track_group_has_tracks(track):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         node = compose("train", [f"track={track}", "run_dir=unused"]).track

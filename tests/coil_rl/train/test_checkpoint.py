@@ -81,10 +81,15 @@ def test_damaged_checkpoints_are_reported_or_refused(tmp_path, capsys):
         checkpoint.save_newest(number, tmp_path)
     (tmp_path / "checkpoint.pt").write_bytes(b"")
     assert checkpoint.load_newest(tmp_path) == 1
-    assert "checkpoint.pt is damaged: its checksum is wrong; using checkpoint_previous.pt" in capsys.readouterr().err
+    assert (
+        "checkpoint.pt is damaged: its checksum is wrong; using checkpoint_previous.pt"
+        in capsys.readouterr().err
+    )
     for name in ("checkpoint.pt", "checkpoint_previous.pt"):
         (tmp_path / name).write_bytes(b"")
-    with pytest.raises(UserError, match=r"both .*checkpoint\.pt and .*checkpoint_previous\.pt are damaged.* copy"):
+    with pytest.raises(
+        UserError, match=r"both .*checkpoint\.pt and .*checkpoint_previous\.pt are damaged.* copy"
+    ):
         checkpoint.load_newest(tmp_path)
 
 
@@ -108,7 +113,12 @@ def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
 
         with monkeypatch.context() as patch:
             # All writes to the disk; a killed process does not clean up either.
-            for owner, name in [(Path, "write_bytes"), (os, "fsync"), (Path, "replace"), (Path, "unlink")]:
+            for owner, name in [
+                (Path, "write_bytes"),
+                (os, "fsync"),
+                (Path, "replace"),
+                (Path, "unlink"),
+            ]:
                 patch.setattr(owner, name, dying(getattr(owner, name)))
             try:
                 checkpoint.save_newest(2, folder)
@@ -119,5 +129,8 @@ def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
         remove_unfinished(folder)
         checkpoint.save_newest(3, folder)
         assert checkpoint.load_newest(folder) == 3
-        assert {file.name for file in folder.iterdir()} <= {"checkpoint.pt", "checkpoint_previous.pt"}
+        assert {file.name for file in folder.iterdir()} <= {
+            "checkpoint.pt",
+            "checkpoint_previous.pt",
+        }
     assert not died

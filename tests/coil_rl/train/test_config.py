@@ -34,7 +34,10 @@ def test_label_is_the_method_and_an_unusual_learner(overrides, label):
         ("preset=paper", (1e-3, None, 0.3)),
         ("preset=authors", (1e-3, None, 0.1)),
         ("env=lunar_lander", (1e-3, None, 0.3)),
-        ("env=lunar_lander training.learning_rate=0.1 training.anchored.margin=0.2", (0.1, None, 0.2)),
+        (
+            "env=lunar_lander training.learning_rate=0.1 training.anchored.margin=0.2",
+            (0.1, None, 0.2),
+        ),
     ],
 )
 def test_learning_rate_and_looks_of_anchored_coil_are_those_of_the_world(overrides, values):
@@ -66,13 +69,21 @@ def test_correlation_of_the_noise_is_that_of_the_world(overrides, correlation):
 def test_fingerprint_depends_on_everything_that_changes_the_numbers():
     one = fingerprint(composed())
     assert one == fingerprint(composed("run_dir=elsewhere", "logger=none", "existing=resume"))
-    others = [("seed=1",), ("learner.gamma=0.98",), ("method=ppo",), ("track.train.split=test",), ("label=mine",)]
+    others = [
+        ("seed=1",),
+        ("learner.gamma=0.98",),
+        ("method=ppo",),
+        ("track.train.split=test",),
+        ("label=mine",),
+    ]
     assert len({one, *(fingerprint(composed(*other)) for other in others)}) == 1 + len(others)
 
 
 def test_saved_configuration_has_the_same_fingerprint():
     config = composed("run_dir=here")
-    assert fingerprint(OmegaConf.create(OmegaConf.to_container(config, resolve=True))) == fingerprint(config)
+    assert fingerprint(
+        OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    ) == fingerprint(config)
 
 
 def test_fingerprint_in_the_name_of_a_sweep_folder():

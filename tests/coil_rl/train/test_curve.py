@@ -12,12 +12,19 @@ from coil_rl.train.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
 CASES = 5
-WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"smoothness": ["info", "smoothness"]}}
+WATCH = {
+    "episode": {"crashed": ["info", "crashed"]},
+    "step": {"smoothness": ["info", "smoothness"]},
+}
 
 
 def world(tracks, drivers=1, *transforms):
-    env = ConeTrackEnv(tracks, drivers * CASES, starts=CASES, assignment="cyclic", rate=6, time_limit=4)
-    return TransformedEnv(env, Compose(RewardSum(), GuideActions({"spline": SplineGuide()}), *transforms))
+    env = ConeTrackEnv(
+        tracks, drivers * CASES, starts=CASES, assignment="cyclic", rate=6, time_limit=4
+    )
+    return TransformedEnv(
+        env, Compose(RewardSum(), GuideActions({"spline": SplineGuide()}), *transforms)
+    )
 
 
 def curve(folder, tracks, policy, **options):
@@ -45,7 +52,11 @@ def test_numbers_are_those_of_each_policy_driven_alone(tmp_path, rings):
         expected.append(evaluate_policy(world(rings), policy, measures=driving_measures()).episodes)
     assert expected[0] != expected[1]
     for row, episodes in zip(line.drive([0, 100]), expected, strict=True):
-        for name, key in {"return": "reward", "crashed": "crashed", "smoothness": "smoothness"}.items():
+        for name, key in {
+            "return": "reward",
+            "crashed": "crashed",
+            "smoothness": "smoothness",
+        }.items():
             mean = sum(episode[key] for episode in episodes) / CASES
             assert row[f"evaluation/{name}"] == pytest.approx(mean, rel=1e-4, abs=1e-5)
 

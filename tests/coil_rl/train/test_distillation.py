@@ -12,10 +12,23 @@ from coil_rl.programs.train import train
 from coil_rl.train import distillation, load
 from coil_rl.train.check import check
 
-TINY = ["track=generated", "track.train.count=1", "track.test.count=1", "env.laps=1", "env.time_limit=1",
-        "evaluation.repeats=1", "evaluation.gif=false", "logger=none", "budget.num_envs=4", "budget.steps=16",
-        "budget.frames=128", "proxy.budget.frames=256", "proxy.budget.num_envs=4", "proxy.budget.steps=16",
-        "proxy.learner.regressor.epochs=20"]  # fmt: skip
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=1",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "proxy.budget.frames=256",
+    "proxy.budget.num_envs=4",
+    "proxy.budget.steps=16",
+    "proxy.learner.regressor.epochs=20",
+]
 
 
 def composed(*overrides, name="train"):
@@ -28,7 +41,10 @@ def composed(*overrides, name="train"):
 def proxies(tmp_path_factory):
     folder = tmp_path_factory.mktemp("distill")
     config = composed(
-        "guide=[spline,constant]", f"proxy.folder={folder / 'proxies'}", f"run_dir={folder}", name="distill"
+        "guide=[spline,constant]",
+        f"proxy.folder={folder / 'proxies'}",
+        f"run_dir={folder}",
+        name="distill",
     )
     distill(config)
     return folder / "proxies"
@@ -41,7 +57,10 @@ def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
 
     assert folder() == folder("seed=3", "method=ppo", "budget.frames=64", "run_dir=other")
     assert folder().parent == Path("outputs/proxies")
-    others = [folder(other) for other in ("guide.spline.gain=0.9", "env.rate=20", "proxy.seed=1", "track.train.seed=5")]
+    others = [
+        folder(other)
+        for other in ("guide.spline.gain=0.9", "env.rate=20", "proxy.seed=1", "track.train.seed=5")
+    ]
     assert len({folder(), folder(guide="constant"), *others}) == 6
 
 
@@ -51,7 +70,11 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
         *_, last = csv.DictReader(file)
     assert float(last["learner/mse_training"]) < 0.01
     assert float(last["learner/mse_ahead"]) < 0.01
-    distill(composed("guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"))
+    distill(
+        composed(
+            "guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"
+        )
+    )
     output = capsys.readouterr().out
     assert str(folder) in output
     assert "distill: made 1; the lowest mean reward is" in output
@@ -59,15 +82,26 @@ def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, caps
 
 def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
     (tmp_path / "run").mkdir()
-    overrides = ["method=dynamic_coil_sequential", "guide=[spline,zero]", f"proxy.folder={proxies}", "budget.frames=64",
-             f"run_dir={tmp_path / 'run'}"]  # fmt: skip
+    overrides = [
+        "method=dynamic_coil_sequential",
+        "guide=[spline,zero]",
+        f"proxy.folder={proxies}",
+        "budget.frames=64",
+        f"run_dir={tmp_path / 'run'}",
+    ]
     config = composed(*overrides)
     check(config)
     train(config)
-    assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == ["spline", "zero"]
+    assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == [
+        "spline",
+        "zero",
+    ]
     assert len(list(proxies.glob("zero_*"))) == 1
     guides = load.load_guides(tmp_path / "run", config)
-    network, state = guides["spline"], torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True)
+    network, state = (
+        guides["spline"],
+        torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True),
+    )
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
     config = composed(f"run={tmp_path / 'run'}", f"run_dir={tmp_path}", name="evaluate")
     _, policy = evaluate.restore(tmp_path / "run", config)
@@ -76,7 +110,9 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
 
 def test_degraded_advice_is_refused_for_guides_that_learn():
     config = composed("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
-    with pytest.raises(UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"):
+    with pytest.raises(
+        UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"
+    ):
         check(config)
 
 
@@ -85,7 +121,9 @@ def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
     for made in (run, folder):
         made.mkdir()
     (folder / load.PROXIES).write_text("a file in their place")
-    with pytest.raises(UserError, match="proxies is a file, but a folder is to be made there; remove it"):
+    with pytest.raises(
+        UserError, match="proxies is a file, but a folder is to be made there; remove it"
+    ):
         distillation.copy_proxies({"guide": run}, folder)
     (folder / load.PROXIES).unlink()
     with pytest.raises(FileNotFoundError):

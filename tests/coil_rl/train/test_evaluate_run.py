@@ -6,7 +6,13 @@ from omegaconf import OmegaConf
 
 from coil_rl.errors import UserError
 from coil_rl.train.build import build_env, build_guides, build_learner
-from coil_rl.train.evaluate_run import build_evaluation, build_pictures, drive_guides, evaluate_run, recorded
+from coil_rl.train.evaluate_run import (
+    build_evaluation,
+    build_pictures,
+    drive_guides,
+    evaluate_run,
+    recorded,
+)
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -42,11 +48,17 @@ def test_given_guides_are_not_cached(composed):
 
 @pytest.mark.parametrize("change", ["evaluation.repeats=2", "degrade=delayed", "env.time_limit=2"])
 def test_guides_beside_an_agent_drive_as_they_do_alone(composed, change, tmp_path):
-    config = composed("guide=[spline,centre_fast]", "evaluation.gif=false", "evaluation.repeats=1", change)
+    config = composed(
+        "guide=[spline,centre_fast]", "evaluation.gif=false", "evaluation.repeats=1", change
+    )
     policy = build_learner(config, build_env(config)).policy
     evaluate_run(config, policy, tmp_path, seed=0)
     with (tmp_path / "episodes.csv").open(newline="") as file:
-        beside = [float(row["reward"]) for row in csv.DictReader(file) if row["driver"].startswith("guide")]
+        beside = [
+            float(row["reward"])
+            for row in csv.DictReader(file)
+            if row["driver"].startswith("guide")
+        ]
     alone = [episode["reward"] for result in drive(config).values() for episode in result.episodes]
     assert beside == alone
     assert len(set(beside)) == 6
@@ -75,7 +87,9 @@ def test_cases_are_a_number_or_names(composed, cases, names):
 
 @pytest.mark.parametrize("cases", [0, -1, [], "abc", 1.5, None])
 def test_evaluation_without_cases_is_refused(composed, cases):
-    with pytest.raises(UserError, match=r"evaluation\.cases=.* must be at least 1, or the names of the cases"):
+    with pytest.raises(
+        UserError, match=r"evaluation\.cases=.* must be at least 1, or the names of the cases"
+    ):
         build_evaluation(with_cases(composed(), cases))
 
 

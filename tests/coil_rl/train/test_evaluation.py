@@ -22,11 +22,20 @@ DRIVING = driving_measures()
 def test_measures_of_a_guide_that_completes_its_laps(ring):
     tracks = [ring, Track("wider", 1.1 * ring.left, 1.1 * ring.right)]
     env = ConeTrackEnv(tracks, 2, assignment="cyclic", laps=1, rate=8)
-    options = {"cases": [track.name for track in tracks], "measures": DRIVING, "record": {"pose": ("info", "pose")}}
+    options = {
+        "cases": [track.name for track in tracks],
+        "measures": DRIVING,
+        "record": {"pose": ("info", "pose")},
+    }
     result = evaluate_policy(env, SplineGuide(), **options)
     assert result.rate == 8
     for track, row, poses in zip(tracks, result.episodes, result.histories["pose"], strict=True):
-        assert (row["case"], row["completed"], row["crashed"], row["laps"]) == (track.name, True, False, 1)
+        assert (row["case"], row["completed"], row["crashed"], row["laps"]) == (
+            track.name,
+            True,
+            False,
+            1,
+        )
         assert row["clearance"] > 0
         # The middle line at 2 m/s; the guide cuts corners.
         assert row["lap_time"] == pytest.approx(track.length / 2, rel=0.05)
@@ -50,10 +59,18 @@ def test_measures_of_a_crash():
 
 
 def test_return_of_several_agents_is_the_sum_of_their_rewards():
-    env = AnyEnv(4, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True)
-    still = TensorDictModule(lambda seen: 0 * seen[..., :2], [("agents", "observation")], [("agents", "action")])
-    rows = evaluate_policy(env, still, measures={"each": Measure(("agents", "reward"), "min")}).episodes
-    assert [(row["reward"], row["steps"]) for row in rows] == [(pytest.approx(3 * 5 * -0.25), 5)] * 4
+    env = AnyEnv(
+        4, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True
+    )
+    still = TensorDictModule(
+        lambda seen: 0 * seen[..., :2], [("agents", "observation")], [("agents", "action")]
+    )
+    rows = evaluate_policy(
+        env, still, measures={"each": Measure(("agents", "reward"), "min")}
+    ).episodes
+    assert [(row["reward"], row["steps"]) for row in rows] == [
+        (pytest.approx(3 * 5 * -0.25), 5)
+    ] * 4
     assert rows[0]["each"] == pytest.approx(-0.75)
 
 
@@ -65,17 +82,29 @@ def test_sampled_actions_are_less_smooth_than_deterministic_ones():
         for sampled in (False, True)
     )
     assert drawn > 10 * plain
-    mixed = evaluate_policy(env, policy, sampled=torch.tensor([False, True]), measures=DRIVING).episodes
+    mixed = evaluate_policy(
+        env, policy, sampled=torch.tensor([False, True]), measures=DRIVING
+    ).episodes
     assert mixed[0]["smoothness"] == pytest.approx(plain, rel=0.01)
     assert mixed[1]["smoothness"] > 10 * plain
 
 
 def test_reward_of_each_task_is_measured():
-    tasks = {"left": {"alive": 1.0, "crash": 0.0, "cone": 0.0}, "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0}}
-    env = DrivingTasksEnv(TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0})
-    measures = {name: driving_measures("driving_tasks")[name] for name in ("per_step_left", "per_step_right")}
+    tasks = {
+        "left": {"alive": 1.0, "crash": 0.0, "cone": 0.0},
+        "right": {"alive": -1.0, "crash": 0.0, "cone": 0.0},
+    }
+    env = DrivingTasksEnv(
+        TRACKS, 6, assignment="cyclic", tasks=tasks, duration=0.5, reward={"smooth": 0.0}
+    )
+    measures = {
+        name: driving_measures("driving_tasks")[name]
+        for name in ("per_step_left", "per_step_right")
+    }
     record = {"reward": "reward", "left": ("info", "task", "left")}
-    result = evaluate_policy(env, ConstantGuide(1.0), measures=measures, record=record, cases=["a", "b"])
+    result = evaluate_policy(
+        env, ConstantGuide(1.0), measures=measures, record=record, cases=["a", "b"]
+    )
     for row, rewards, left in zip(result.episodes, *result.histories.values(), strict=True):
         assert row["reward"] == pytest.approx(rewards.sum())
         # Every step but that of the crash.
@@ -86,8 +115,12 @@ def test_reward_of_each_task_is_measured():
     *rows, mean = summarise(result.episodes, measures)
     assert all(0.8 < row["per_step_left"] <= 1 for row in rows)
     assert mean["per_step_left"] == pytest.approx(sum(row["per_step_left"] for row in rows) / 2)
-    env = DrivingTasksEnv(TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left")
-    *_, mean = summarise(evaluate_policy(env, ConstantGuide(1.0), measures=measures).episodes, measures)
+    env = DrivingTasksEnv(
+        TRACKS, 2, assignment="cyclic", tasks={"left": {}, "right": {}}, only="left"
+    )
+    *_, mean = summarise(
+        evaluate_policy(env, ConstantGuide(1.0), measures=measures).episodes, measures
+    )
     assert math.isnan(mean["per_step_right"]), "there are no steps of the task"
 
 
@@ -113,9 +146,15 @@ def of_rows(env, name):
 
 
 REDUCE = {
-    "mean": np.mean, "sum": np.sum, "min": np.min, "max": np.max, "last": lambda x: x[-1], "any": np.any,
-    "count": np.count_nonzero, "mean_nonzero": lambda x: x[x != 0].mean() if x.any() else math.nan,
-}  # fmt: skip
+    "mean": np.mean,
+    "sum": np.sum,
+    "min": np.min,
+    "max": np.max,
+    "last": lambda x: x[-1],
+    "any": np.any,
+    "count": np.count_nonzero,
+    "mean_nonzero": lambda x: x[x != 0].mean() if x.any() else math.nan,
+}
 OF_NOTHING = dict.fromkeys(REDUCTIONS, math.nan) | {"sum": 0, "any": False, "count": 0}
 
 
@@ -148,10 +187,15 @@ def test_bounds_make_flags_and_nan_is_within_no_bound():
         for bound, value in bounds.items()
     }
     result = evaluate_policy(env, RandomPolicy(env.action_spec), measures=measures)
-    for row, numbers, flag in zip(result.episodes, of_rows(env, "number"), of_rows(env, "flag"), strict=True):
+    for row, numbers, flag in zip(
+        result.episodes, of_rows(env, "number"), of_rows(env, "flag"), strict=True
+    ):
         for reduction in ("max", "mean"):
             number = REDUCE[reduction](numbers[flag == 1]) if flag.any() else math.nan
-            assert [row[f"{reduction} {bound}"] for bound in bounds] == [number >= 0.5, number <= 0.5]
+            assert [row[f"{reduction} {bound}"] for bound in bounds] == [
+                number >= 0.5,
+                number <= 0.5,
+            ]
 
 
 def test_totals_can_be_read_during_the_episodes():
@@ -170,7 +214,11 @@ def test_env_of_any_batch_is_evaluated_row_by_row(batch):
     record = {"place": "place", "number": "number", "plain": "plain"}
     ticks = []
     result = evaluate_policy(
-        env, RandomPolicy(env.action_spec), record=record, cases=["a", "b"], tick=lambda: ticks.append(1)
+        env,
+        RandomPolicy(env.action_spec),
+        record=record,
+        cases=["a", "b"],
+        tick=lambda: ticks.append(1),
     )
     rows = math.prod(batch)
     assert [episode["case"] for episode in result.episodes] == [*"ababab"][:rows]
@@ -189,7 +237,9 @@ def test_env_of_any_batch_is_evaluated_row_by_row(batch):
 
 def test_parts_of_a_result_keep_their_histories():
     env = script(6)
-    whole = evaluate_policy(env, RandomPolicy(env.action_spec), record={"place": "place"}, cases=["a", "b", "c"])
+    whole = evaluate_policy(
+        env, RandomPolicy(env.action_spec), record={"place": "place"}, cases=["a", "b", "c"]
+    )
     first, second = whole.split(2)
     assert [*first.episodes, *second.episodes] == whole.episodes
     assert [episode["case"] for episode in second.episodes] == ["a", "b", "c"]

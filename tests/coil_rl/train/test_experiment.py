@@ -23,23 +23,37 @@ WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", 
 def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
     torch.manual_seed(seed)
     env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
-    env = TransformedEnv(env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum()))
+    env = TransformedEnv(
+        env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum())
+    )
     learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
     rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
     folder.mkdir(exist_ok=True)
     curve = EvaluationCurve(
-        folder, learner.policy, dict.fromkeys(("evaluation", "selection"), cases), points=4, batches=2
+        folder,
+        learner.policy,
+        dict.fromkeys(("evaluation", "selection"), cases),
+        points=4,
+        batches=2,
     )
-    return Experiment(learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2, curve=curve)
+    return Experiment(
+        learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2, curve=curve
+    )
 
 
 def cases(drivers):
-    env = ConeTrackEnv(shipped_tracks("test"), 3 * drivers, assignment="cyclic", rate=6, time_limit=2)
+    env = ConeTrackEnv(
+        shipped_tracks("test"), 3 * drivers, assignment="cyclic", rate=6, time_limit=2
+    )
     return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
 
 
 def contents(folder):
-    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
 
 
 def as_written(rows):
@@ -48,12 +62,22 @@ def as_written(rows):
 
 def test_run_writes_its_files_and_a_row_per_update(tmp_path):
     rows = experiment(tmp_path / "run").run()
-    names = {"checkpoint.pt", "checkpoint_previous.pt", "metrics.csv", "policy_best.pt", "policy_last.pt"}
+    names = {
+        "checkpoint.pt",
+        "checkpoint_previous.pt",
+        "metrics.csv",
+        "policy_best.pt",
+        "policy_last.pt",
+    }
     kept = {f"policies/{128 * update:012d}.pt" for update in range(5)}
     assert set(contents(tmp_path / "run")) == names | kept
     with (tmp_path / "run" / "metrics.csv").open() as file:
         written = list(csv.DictReader(file))
-    assert [float(row["frames"]) for row in written] == [row["frames"] for row in rows] == [0, 128, 256, 384, 512]
+    assert (
+        [float(row["frames"]) for row in written]
+        == [row["frames"] for row in rows]
+        == [0, 128, 256, 384, 512]
+    )
     assert {"train/return", "train/crashed", "train/cone", "learner/loss_critic"} <= set(written[0])
 
 
@@ -68,7 +92,9 @@ class Killed(BaseException):
     pass
 
 
-@pytest.mark.parametrize(("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4)])
+@pytest.mark.parametrize(
+    ("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4)]
+)
 def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
     frames = 16 * 8 * 5
     rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
@@ -87,10 +113,16 @@ def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last,
         stopped.run()
 
     # Once there is a checkpoint, nothing may depend on the seed of the second process.
-    again = experiment(tmp_path / "stopped", seed=9 if last > 2 else 0, frames=frames, guide=guide())
+    again = experiment(
+        tmp_path / "stopped", seed=9 if last > 2 else 0, frames=frames, guide=guide()
+    )
     again.resume()
     assert as_written(again.run()) == str(rows)
-    place = f"after update {(last - 1) // 2 * 2}" if last > 2 else "from the beginning: there is no checkpoint yet"
+    place = (
+        f"after update {(last - 1) // 2 * 2}"
+        if last > 2
+        else "from the beginning: there is no checkpoint yet"
+    )
     assert f"{tmp_path / 'stopped'} continues {place}\n" in capsys.readouterr().err
     whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
     assert whole.keys() == resumed.keys()
@@ -109,10 +141,16 @@ def test_checkpoint_of_another_run_is_refused(tmp_path):
         run.resume()
 
     checkpoint.save_newest({"policy": 1}, tmp_path)
-    with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks identity\); put the files"):
+    with pytest.raises(
+        UserError, match=r"checkpoint\.pt is damaged \(it lacks identity\); put the files"
+    ):
         resumed()
-    checkpoint.save_newest(experiment(tmp_path).state_dict() | {"identity": {"threads": 1}, "learner": {}}, tmp_path)
-    with pytest.raises(UserError, match=r"checkpoint\.pt belongs to a run with threads=1, not 2; put the files"):
+    checkpoint.save_newest(
+        experiment(tmp_path).state_dict() | {"identity": {"threads": 1}, "learner": {}}, tmp_path
+    )
+    with pytest.raises(
+        UserError, match=r"checkpoint\.pt belongs to a run with threads=1, not 2; put the files"
+    ):
         resumed(threads=2)
     with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks policy\)"):
         resumed(threads=1)
@@ -154,14 +192,18 @@ def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, me
     again.resume()
     assert as_written(again.run()) == as_written(rows)
     whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
-    assert [name for name in whole if whole[name] != resumed[name]] in ([], ["checkpoint_previous.pt"])
+    assert [name for name in whole if whole[name] != resumed[name]] in (
+        [],
+        ["checkpoint_previous.pt"],
+    )
 
 
 def test_best_policy_is_chosen_in_the_cases_of_selection(tmp_path):
     run = experiment(tmp_path / "run")
     drive = run.curve.drive
     run.curve.drive = lambda frames: [
-        row | {"selection/return": -abs(f - 256)} for f, row in zip(frames, drive(frames), strict=True)
+        row | {"selection/return": -abs(f - 256)}
+        for f, row in zip(frames, drive(frames), strict=True)
     ]
     run.run()
     files = contents(tmp_path / "run")
@@ -188,13 +230,17 @@ class WriteNaN(Transform):
 
 
 # At step 20 the env itself raises an error, because of the NaN; step 24 is the last of a batch.
-@pytest.mark.parametrize(("key", "step"), [("observation", 20), ("observation", 24), ("reward", 24)])
+@pytest.mark.parametrize(
+    ("key", "step"), [("observation", 20), ("observation", 24), ("reward", 24)]
+)
 def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, step):
     good = experiment(tmp_path / "good", frames=16 * 8 * 2)
     good.run()
     run = experiment(tmp_path / "run", extra=[WriteNaN(key, step, 5)])
     message = f"next/{key} is nan at step {step} of row 5; the last good checkpoint is kept"
-    with pytest.raises(UserError, match=f"{message}.*{re.escape(f'coil-train resume={tmp_path}/run')}"):
+    with pytest.raises(
+        UserError, match=f"{message}.*{re.escape(f'coil-train resume={tmp_path}/run')}"
+    ):
         run.run()
     ours, theirs = (checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("run", "good"))
     assert ours["updates"] == theirs["updates"] == 2
@@ -206,7 +252,10 @@ def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, 
 
 @pytest.mark.parametrize(
     ("place", "message"),
-    [("loss", "learner/loss_critic is nan in update 4"), ("weight", "learner/critic/.* is nan after update 4")],
+    [
+        ("loss", "learner/loss_critic is nan in update 4"),
+        ("weight", "learner/critic/.* is nan after update 4"),
+    ],
 )
 def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_path, place, message):
     run = experiment(tmp_path / "run")
@@ -228,7 +277,9 @@ def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_pa
     assert not (tmp_path / "run" / "policy_last.pt").exists()
 
 
-ROWS = [{"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)]
+ROWS = [
+    {"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)
+]
 
 
 def write_metrics(path, rows, logger=None):
@@ -238,7 +289,9 @@ def write_metrics(path, rows, logger=None):
     return metrics
 
 
-@pytest.mark.parametrize(("count", "torn"), [(0, b""), (1, b"60,0.1"), (3, b"60,0.1,nan\r\n70"), (5, b"60,0.1")])
+@pytest.mark.parametrize(
+    ("count", "torn"), [(0, b""), (1, b"60,0.1"), (3, b"60,0.1,nan\r\n70"), (5, b"60,0.1")]
+)
 def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
     whole, stopped = tmp_path / "whole.csv", tmp_path / "stopped.csv"
     write_metrics(whole, ROWS)
@@ -246,7 +299,9 @@ def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
     with stopped.open("ab") as file:
         file.write(torn)
     again = Metrics(stopped)
-    assert str(again.truncate(count)) == str([{k: float(v) for k, v in row.items()} for row in ROWS[:count]])
+    assert str(again.truncate(count)) == str(
+        [{k: float(v) for k, v in row.items()} for row in ROWS[:count]]
+    )
     for row in ROWS[count:]:
         again.append(row)
     assert stopped.read_bytes() == whole.read_bytes()

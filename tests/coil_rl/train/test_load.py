@@ -62,10 +62,15 @@ def test_tracks_of_the_training_are_not_needed(replay, tmp_path):
     ("overrides", "words"),
     [
         (["method=guide"], "has no agent: its guide drives alone; give that guide instead"),
-        (["method=ppo", "env=driving_tasks", "observes=[observation,task]"], "the env has no entry task to observe"),
+        (
+            ["method=ppo", "env=driving_tasks", "observes=[observation,task]"],
+            "the env has no entry task to observe",
+        ),
     ],
 )
-def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(replay, tmp_path, overrides, words):
+def test_run_that_cannot_act_in_the_env_is_refused_with_its_folder(
+    replay, tmp_path, overrides, words
+):
     run = make_untrained_run(tmp_path / "run", *overrides, *TRACK[:2])
     with pytest.raises(UserError, match=words) as refusal:
         acts(run, replay)

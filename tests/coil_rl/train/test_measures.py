@@ -7,7 +7,12 @@ from coil_rl.train.measures import Measure, measures_of, summarise
 
 
 def test_measure_of_a_yaml_file_has_tuples_as_keys():
-    node = {"entry": ["info", "lap_time"], "where": ["info", "task", "left"], "reduction": "max", "title": "lap (s)"}
+    node = {
+        "entry": ["info", "lap_time"],
+        "where": ["info", "task", "left"],
+        "reduction": "max",
+        "title": "lap (s)",
+    }
     expected = Measure(("info", "lap_time"), "max", ("info", "task", "left"), title="lap (s)")
     assert measures_of({"lap": node}) == {"lap": expected}
     assert Measure.of("reward") == Measure("reward", "mean")
@@ -27,7 +32,15 @@ def test_unknown_reduction_and_two_bounds_are_refused(options, message):
 
 @pytest.mark.parametrize(
     ("reduction", "pooled"),
-    [("mean", 3.0), ("sum", 3.0), ("last", 3.0), ("count", 3.0), ("mean_nonzero", 3.0), ("min", 1.0), ("max", 6.0)],
+    [
+        ("mean", 3.0),
+        ("sum", 3.0),
+        ("last", 3.0),
+        ("count", 3.0),
+        ("mean_nonzero", 3.0),
+        ("min", 1.0),
+        ("max", 6.0),
+    ],
 )
 def test_episodes_are_pooled_without_nan_by_their_mean_or_extreme(reduction, pooled):
     assert Measure("x", reduction).pool([2.0, math.nan, 1.0, 6.0]) == pooled
@@ -37,9 +50,12 @@ def test_episodes_are_pooled_without_nan_by_their_mean_or_extreme(reduction, poo
 
 @pytest.mark.parametrize(
     "measure",
-    [Measure("x", "any"), *(Measure("x", reduction, at_least=1.0) for reduction in ("last", "min", "max")),
-     Measure("x", "max", at_most=1.0)],
-)  # fmt: skip
+    [
+        Measure("x", "any"),
+        *(Measure("x", reduction, at_least=1.0) for reduction in ("last", "min", "max")),
+        Measure("x", "max", at_most=1.0),
+    ],
+)
 def test_flags_are_pooled_to_the_share_of_episodes(measure):
     assert measure.pool([True, False, False, True, True]) == 0.6
 
@@ -47,12 +63,21 @@ def test_flags_are_pooled_to_the_share_of_episodes(measure):
 def test_summary_is_the_mean_over_cases_of_means_over_episodes():
     def episode(case, reward, lap_time, crashed):
         return {
-            "case": case, "reward": reward, "lap_time": lap_time, "crashed": crashed, "clearance": reward / 100,
-            "steps": 7, "not measured": 1,
-        }  # fmt: skip
+            "case": case,
+            "reward": reward,
+            "lap_time": lap_time,
+            "crashed": crashed,
+            "clearance": reward / 100,
+            "steps": 7,
+            "not measured": 1,
+        }
 
     measures = {name: driving_measures()[name] for name in ("lap_time", "crashed", "clearance")}
-    episodes = [episode("a", 10, 5.0, False), episode("b", 40, math.nan, True), episode("a", 20, math.nan, True)]
+    episodes = [
+        episode("a", 10, 5.0, False),
+        episode("b", 40, math.nan, True),
+        episode("a", 20, math.nan, True),
+    ]
     rows = summarise(episodes, measures)
     assert list(rows[0]) == ["case", "reward", "lap_time", "crashed", "clearance"]
     assert [row["case"] for row in rows] == ["a", "b", "mean"]

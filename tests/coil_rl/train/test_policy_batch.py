@@ -9,7 +9,13 @@ from worlds import cones, perturbed
 
 from coil_rl.imitation import Imitation, SklearnRegressor
 from coil_rl.learners import DQN, PPO, SAC
-from coil_rl.train.policy_batch import PoliciesInTurn, RecordedPolicy, StackedPolicies, is_tensors, policy_batch
+from coil_rl.train.policy_batch import (
+    PoliciesInTurn,
+    RecordedPolicy,
+    StackedPolicies,
+    is_tensors,
+    policy_batch,
+)
 from coil_rl.transforms import DiscreteActions
 
 KEYS = ["observation", "guide_action"]
@@ -67,8 +73,13 @@ def test_recorded_policy_takes_any_number_of_rows_and_mode():
     recorded = RecordedPolicy(policy)
     rows = observations(env)
     with torch.no_grad():
-        for kind, part in [(ExplorationType.RANDOM, rows), (ExplorationType.DETERMINISTIC, rows[:4])]:
+        for kind, part in [
+            (ExplorationType.RANDOM, rows),
+            (ExplorationType.DETERMINISTIC, rows[:4]),
+        ]:
             with set_exploration_type(kind):
                 assert len(recorded(part.clone())["action"]) == len(part)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            torch.testing.assert_close(recorded(rows.clone())["action"], policy(rows.clone())["action"])
+            torch.testing.assert_close(
+                recorded(rows.clone())["action"], policy(rows.clone())["action"]
+            )

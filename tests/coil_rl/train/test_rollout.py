@@ -62,7 +62,9 @@ def learning(env, correlation, squash=True, observed="observation"):
 
 @pytest.mark.parametrize("correlation", [0.0, 0.8])
 @pytest.mark.parametrize("squash", [True, False])
-def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_policys_distribution(correlation, squash):
+def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_policys_distribution(
+    correlation, squash
+):
     torch.manual_seed(0)
     ppo, rollout = learning(worlds.cones(cars=150), correlation, squash)
     batch = torch.cat([rollout.collect(), rollout.collect()], 1)
@@ -72,10 +74,14 @@ def test_noise_is_correlated_over_steps_and_batches_and_each_action_has_the_poli
     assert float(noise.mean()) == pytest.approx(0.0, abs=0.05)
     assert float(noise.std()) == pytest.approx(1.0, abs=0.04)
     for lag in (1, 2, 5):
-        assert float((noise[:, lag:] * noise[:, :-lag]).mean()) == pytest.approx(correlation**lag, abs=0.06)
+        assert float((noise[:, lag:] * noise[:, :-lag]).mean()) == pytest.approx(
+            correlation**lag, abs=0.06
+        )
     assert float((noise[:, 50] * noise[:, 49]).mean()) == pytest.approx(correlation, abs=0.25)
     with torch.no_grad():
-        density = ppo.policy.get_dist(batch).log_prob(batch["action" if squash else "unclipped_action"])
+        density = ppo.policy.get_dist(batch).log_prob(
+            batch["action" if squash else "unclipped_action"]
+        )
     torch.testing.assert_close(batch["action_log_prob"], density)
 
 
@@ -99,7 +105,9 @@ def test_noise_fits_envs_without_a_batch_and_does_not_concern_discrete_actions()
     noise = ((batch["action"] / 2).atanh() - batch["loc"]) / batch["scale"]
     torch.testing.assert_close(noise, noise[:1].expand_as(noise), rtol=0, atol=1e-4)
     env = worlds.carts()
-    assert "exploration_noise" not in Rollout(env, PPO(env).policy, 3, noise_correlation=0.9).collect()
+    assert (
+        "exploration_noise" not in Rollout(env, PPO(env).policy, 3, noise_correlation=0.9).collect()
+    )
 
 
 def zeros():
@@ -112,8 +120,14 @@ def zeros():
     ("places", "message"),
     [
         ([("observation", 3, 2, 1)], "observation is nan at step 103 of row 3"),
-        ([(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)], "observation is nan at step 106 of row 2"),
-        ([(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)], "next/info/pose is nan at step 102 of row 0"),
+        (
+            [(("next", "info", "pose"), 2, 5, 0), ("observation", 2, 5, 0)],
+            "observation is nan at step 106 of row 2",
+        ),
+        (
+            [(("next", "info", "pose"), 0, 1, 0), ("observation", 3, 4, 0)],
+            "next/info/pose is nan at step 102 of row 0",
+        ),
     ],
 )
 def test_first_nan_is_reported_with_its_entry_step_and_row(places, message):

@@ -58,7 +58,9 @@ def changed(saved, key, value):
 
 
 def read(folder, content):
-    (folder / "config.yaml").write_text(content if isinstance(content, str) else OmegaConf.to_yaml(content))
+    (folder / "config.yaml").write_text(
+        content if isinstance(content, str) else OmegaConf.to_yaml(content)
+    )
     return read_config(folder, "run")
 
 
@@ -80,39 +82,57 @@ def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp
     assert set(sys.modules) == modules
 
 
-@pytest.mark.parametrize("path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"])
+@pytest.mark.parametrize(
+    "path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
+)
 @pytest.mark.parametrize(
     "key", ["guide.theirs.of", "env.controllers.theirs", "env.of", "evaluation.env.controllers.x.y"]
 )
-def test_controller_outside_the_list_is_refused_before_any_import(key, path, saved, tmp_path, monkeypatch):
+def test_controller_outside_the_list_is_refused_before_any_import(
+    key, path, saved, tmp_path, monkeypatch
+):
     trust._shipped_targets()
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)
     for value in (path, {"a.b": path} if "controllers" in key else path):
-        with pytest.raises(UserError, match=rf"{key}[a-b.]* names '.*', which is no part of a run and could run code"):
+        with pytest.raises(
+            UserError,
+            match=rf"{key}[a-b.]* names '.*', which is no part of a run and could run code",
+        ):
             read(tmp_path, changed(saved, key, value))
 
 
 def test_gymnasium_env_of_a_module_is_refused_like_the_module(package, saved, tmp_path):
-    for env, message in (("os:x-v0", "no part of a run"), ("their_package:Env-v0", r"trust=\[their_package\]")):
+    for env, message in (
+        ("os:x-v0", "no part of a run"),
+        ("their_package:Env-v0", r"trust=\[their_package\]"),
+    ):
         with pytest.raises(UserError, match=message):
             read(tmp_path, changed(saved, "env.id", env))
     assert "their_package" not in sys.modules
     trust.trust_packages(["their_package"])
-    assert read(tmp_path, changed(saved, "env.id", "their_package:Env-v0")).env.id == "their_package:Env-v0"
+    assert (
+        read(tmp_path, changed(saved, "env.id", "their_package:Env-v0")).env.id
+        == "their_package:Env-v0"
+    )
     assert read(tmp_path, changed(saved, "env.id", "LunarLander-v3")).env.id == "LunarLander-v3"
 
 
 def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package, saved, tmp_path):
     theirs = changed(
-        saved, "guide.theirs", {"_target_": "coil_rl.guides.ControllerGuide", "of": "their_package:TheirGuide"}
+        saved,
+        "guide.theirs",
+        {"_target_": "coil_rl.guides.ControllerGuide", "of": "their_package:TheirGuide"},
     )
     with pytest.raises(
-        UserError, match=r"guide\.theirs\.of names .*; if you know .* allow it with trust=\[their_package\]"
+        UserError,
+        match=r"guide\.theirs\.of names .*; if you know .* allow it with trust=\[their_package\]",
     ):
         read(tmp_path, theirs)
     assert "their_package" not in sys.modules
-    trust.trust_packages([], OmegaConf.create({"guide": {"mine": {"of": "their_package:TheirGuide"}}}))
+    trust.trust_packages(
+        [], OmegaConf.create({"guide": {"mine": {"of": "their_package:TheirGuide"}}})
+    )
     assert read(tmp_path, theirs).guide.theirs
     trust.trust_packages(["their_package"])
     assert read(tmp_path, theirs).guide.theirs
@@ -125,25 +145,63 @@ def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package,
 
 @pytest.mark.parametrize(
     "key",
-    ["guide.spline", "guide.other", "env", "env.reward", "learner.x", "track.train", "track.test.deep.er", "logger",
-     "logger.x", "evaluation.advice.x", "evaluation.env.tracks", "watch.step.x", "proxy.learner", "proxy.method.x",
-     "action", "degrade.x", "preset.perception", "budget.x", "unknown.key", "label"],
-)  # fmt: skip
+    [
+        "guide.spline",
+        "guide.other",
+        "env",
+        "env.reward",
+        "learner.x",
+        "track.train",
+        "track.test.deep.er",
+        "logger",
+        "logger.x",
+        "evaluation.advice.x",
+        "evaluation.env.tracks",
+        "watch.step.x",
+        "proxy.learner",
+        "proxy.method.x",
+        "action",
+        "degrade.x",
+        "preset.perception",
+        "budget.x",
+        "unknown.key",
+        "label",
+    ],
+)
 def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
     for value in ({"_target_": "os.system"}, [[1, {"deep": [{"_target_": "os.system"}]}]]):
-        with pytest.raises(UserError, match=r"config\.yaml: .*_target_ names 'os\.system', which is no part of a run"):
+        with pytest.raises(
+            UserError,
+            match=r"config\.yaml: .*_target_ names 'os\.system', which is no part of a run",
+        ):
             read(tmp_path, changed(saved, key, value))
 
 
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("env.x", {"_target_": ["os.system"]}, r"names \['os.system'\], which is not the full name of a class"),
-        ("env.x", {"_target_": {"_target_": "os.system"}}, "names {.*}, which is not the full name of a class"),
+        (
+            "env.x",
+            {"_target_": ["os.system"]},
+            r"names \['os.system'\], which is not the full name of a class",
+        ),
+        (
+            "env.x",
+            {"_target_": {"_target_": "os.system"}},
+            "names {.*}, which is not the full name of a class",
+        ),
         ("env.x", {"_target_": "${label}"}, "which is not the full name of a class"),
         ("env.x", {"_target_": None}, "names None, which is not the full name of a class"),
-        ("env.x", {"_target_": "my_package.Part"}, r"allow it with trust=\[my_package\] on the command line"),
-        ("env.x", {"_target_": "coil_rl.guides.SplinGuide"}, "did you mean coil_rl.guides.SplineGuide"),
+        (
+            "env.x",
+            {"_target_": "my_package.Part"},
+            r"allow it with trust=\[my_package\] on the command line",
+        ),
+        (
+            "env.x",
+            {"_target_": "coil_rl.guides.SplinGuide"},
+            "did you mean coil_rl.guides.SplineGuide",
+        ),
         ("env.x", {"_args_": ["x"]}, "_args_ is not a key of a run's configuration"),
         ("env.x", {"_recursive_": False}, "_recursive_ is not a key"),
         ("env.x", {"_convert_": "none"}, "_convert_ is not a key"),
@@ -154,13 +212,17 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
         ("logger.x", "a ${${label}}", "is a reference"),
         ("logger.log_dir", "/tmp/elsewhere", "may only be the logger, with log_dir"),
         ("logger.exp_name", "../elsewhere", "a plain exp_name"),
-        ("env.x", {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"}, "may only be the logger"),
+        (
+            "env.x",
+            {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"},
+            "may only be the logger",
+        ),
         ("learner.memory", "cache", "learner.memory names a cache, whose files can run code"),
         ("learner.grid", {"steps__memory": ["cache"]}, "steps__memory names a cache"),
         ("guide", {"../../x": {}}, "must not contain / or"),
         ("label", "../../x", "label must not contain / or"),
     ],
-)  # fmt: skip
+)
 def test_trick_is_refused(key, value, message, saved, tmp_path):
     with pytest.raises(UserError, match=message):
         read(tmp_path, changed(saved, key, value))
@@ -171,12 +233,16 @@ def test_trick_is_refused(key, value, message, saved, tmp_path):
     [
         ("a: &a [1, 1]\nb: *a\n", r"repeats a part of itself by \*a"),
         (
-            "a0: &a0 [x]\n" + "".join(f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]\n" for n in range(30)),
+            "a0: &a0 [x]\n"
+            + "".join(f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]\n" for n in range(30)),
             "repeats",
         ),
         ("a: &a\n  b: *a\n", "repeats a part of itself"),
         ("a: " + "[" * 5000 + "]" * 5000, "has more than 32 levels"),
-        ("a: " + "x" * 200_000, "has 200003 bytes, but the configuration of a run has at most 200000"),
+        (
+            "a: " + "x" * 200_000,
+            "has 200003 bytes, but the configuration of a run has at most 200000",
+        ),
         ("a: !!python/object/apply:os.system [ls]\n", "is not the configuration of a run"),
         ("label: " + "9" * 5000, "is not the configuration of a run"),
     ],
@@ -188,7 +254,16 @@ def test_file_that_no_run_writes_is_refused(text, message, tmp_path):
     assert str(tmp_path / "config.yaml") in str(error.value)
 
 
-GROUPS = ("guide", "degrade", "learner", "logger", "method", "track", "action", "preset")  # of the cone world
+GROUPS = (
+    "guide",
+    "degrade",
+    "learner",
+    "logger",
+    "method",
+    "track",
+    "action",
+    "preset",
+)  # of the cone world
 MISSING = ["+track.dir=levels", "+guide.learned.run=other"]
 MISSING += [
     "+guide.controller.of=coil_rl.guides:SplineGuide",
@@ -199,7 +274,9 @@ OF_ENV = {"gym": ["env.id=CartPole-v1"], "torchrl": ["env.of._target_=coil_rl.en
 
 
 def files(group):
-    return sorted(file.stem for file in (importlib.resources.files("coil_rl.conf") / group).glob("*.yaml"))
+    return sorted(
+        file.stem for file in (importlib.resources.files("coil_rl.conf") / group).glob("*.yaml")
+    )
 
 
 @pytest.mark.slow
@@ -275,7 +352,9 @@ def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_pa
     info = package / "their_package-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their_package\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[coil_rl.trusted]\ntheir_package = their_package\nos = os\n")
+    (info / "entry_points.txt").write_text(
+        "[coil_rl.trusted]\ntheir_package = their_package\nos = os\n"
+    )
     assert read(tmp_path, with_target(saved, "their_package.TheirGuide")).guide.theirs
     with pytest.raises(UserError, match="which is no part of a run"):
         read(tmp_path, with_target(saved, "os.system"))
@@ -283,7 +362,9 @@ def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_pa
 
 def test_what_the_command_itself_names_is_trusted_in_folders(package, saved, tmp_path):
     theirs = with_target(saved, "their_package.TheirGuide")
-    trust.trust_packages([], OmegaConf.create({"guide": {"theirs": {"_target_": "their_package.TheirGuide"}}}))
+    trust.trust_packages(
+        [], OmegaConf.create({"guide": {"theirs": {"_target_": "their_package.TheirGuide"}}})
+    )
     assert read(tmp_path, theirs).guide.theirs
     with pytest.raises(UserError, match=r"trust=\[their_package\]"):
         read(tmp_path, with_target(saved, "their_package.Other"))
@@ -291,12 +372,16 @@ def test_what_the_command_itself_names_is_trusted_in_folders(package, saved, tmp
 
 @pytest.mark.parametrize("name", ["os", "builtins", "torch", "hydra", "coil_rl"])
 def test_package_that_runs_any_code_is_never_trusted(name):
-    with pytest.raises(UserError, match=rf"trust=\[{name}\] cannot be: functions of {name} run any code"):
+    with pytest.raises(
+        UserError, match=rf"trust=\[{name}\] cannot be: functions of {name} run any code"
+    ):
         trust.trust_packages([name])
 
 
 def test_trust_is_a_list_of_packages():
-    with pytest.raises(UserError, match=r"trust=\[a.b\] must be a list of names of installed packages"):
+    with pytest.raises(
+        UserError, match=r"trust=\[a.b\] must be a list of names of installed packages"
+    ):
         trust.trust_packages(["a.b"])
 
 

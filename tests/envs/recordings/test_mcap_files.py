@@ -11,7 +11,11 @@ from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import SCAN, TWIST, decode, definition, encode, header, twist
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
-MARKER = {"ns": "left", "header": header(1_500_000_001, "laser"), "pose": {"orientation": {"w": 1.0}}}
+MARKER = {
+    "ns": "left",
+    "header": header(1_500_000_001, "laser"),
+    "pose": {"orientation": {"w": 1.0}},
+}
 
 
 def write(path, order):
@@ -60,8 +64,17 @@ def test_nothing_is_written_if_the_block_raises(tmp_path):
 
 def test_missing_fields_are_zero_or_empty():
     [marker, empty] = decode(encode(MARKERS, {"markers": [MARKER, {}]}), MARKERS).markers
-    assert (marker.ns, marker.header.stamp.sec, marker.header.stamp.nanosec) == ("left", 1, 500_000_001)
-    assert (empty.ns, empty.pose.position.x, empty.frame_locked, len(empty.points)) == ("", 0.0, False, 0)
+    assert (marker.ns, marker.header.stamp.sec, marker.header.stamp.nanosec) == (
+        "left",
+        1,
+        500_000_001,
+    )
+    assert (empty.ns, empty.pose.position.x, empty.frame_locked, len(empty.points)) == (
+        "",
+        0.0,
+        False,
+        0,
+    )
 
 
 def test_unknown_fields_and_types_are_refused():

@@ -17,11 +17,22 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter, digest
-from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, TWIST_STAMPED, definition, encode, header, twist
+from coil_rl.envs.recordings.messages import (
+    ODOMETRY,
+    SCAN,
+    TWIST,
+    TWIST_STAMPED,
+    definition,
+    encode,
+    header,
+    twist,
+)
 from coil_rl.envs.recordings.reading import RecordingError, read_recording
 
 REAL = Path(__file__).parents[3] / "../shared/recordings"
-EITHER_COMPRESSION = pytest.mark.parametrize("compression", [lambda path: path, uncompressed], ids=["zstd", "none"])
+EITHER_COMPRESSION = pytest.mark.parametrize(
+    "compression", [lambda path: path, uncompressed], ids=["zstd", "none"]
+)
 ANGLE = 0.15 * np.arange(300) * PERIOD / 1e9
 CIRCLE = np.stack([np.sin(ANGLE), 1 - np.cos(ANGLE), ANGLE], axis=1)
 
@@ -29,7 +40,9 @@ CIRCLE = np.stack([np.sin(ANGLE), 1 - np.cos(ANGLE), ANGLE], axis=1)
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     """Several chunks of scans, odometry and commands; not to be written to."""
-    return drive(tmp_path_factory.mktemp("drives") / "whole.mcap", scans=300, odometry=True, commands=True)
+    return drive(
+        tmp_path_factory.mktemp("drives") / "whole.mcap", scans=300, odometry=True, commands=True
+    )
 
 
 def copy(path, folder, share=1.0):
@@ -64,7 +77,9 @@ def refusal(path, **options):
 
 def test_scans_are_read_as_one_array(whole):
     recording = read_recording(whole)
-    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in range(300)])
+    np.testing.assert_array_equal(
+        recording.ranges, [scan(number)["ranges"] for number in range(300)]
+    )
     assert recording.ranges.dtype == np.float32
     np.testing.assert_array_equal(recording.stamp, START + np.arange(300) * PERIOD)
     np.testing.assert_allclose(recording.angles(7), np.linspace(-3.1241, 3.1241, 360), atol=1e-4)
@@ -77,7 +92,9 @@ def test_missing_points_and_ranges_outside_the_scanners_limits_are_no_return(tmp
     scans = [scan(0, ranges=ranges), scan(1, 3), scan(2, 0)]
     recording = read_recording(store(tmp_path / "a.mcap", *scans))
     assert recording.points.tolist() == [9, 3, 0]
-    np.testing.assert_array_equal(recording.ranges[0], [np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4])
+    np.testing.assert_array_equal(
+        recording.ranges[0], [np.inf, np.inf, np.float32(0.15), 1, 12, *[np.inf] * 4]
+    )
     np.testing.assert_array_equal(recording.ranges[1], [*scans[1]["ranges"], *[np.inf] * 6])
     assert np.isinf(recording.ranges[2]).all()
 
@@ -96,11 +113,23 @@ def test_folder_of_split_files_is_one_recording_in_order_of_log_time(tmp_path):
 
 def test_poses_are_interpolated_from_the_odometry(tmp_path, whole):
     np.testing.assert_allclose(read_recording(whole).poses(), CIRCLE, atol=1e-9)
-    poses = [odometry_fields(START + 10**9, 2.0, 0.0, 3.1), odometry_fields(START + 3 * 10**9, 4.0, 1.0, -3.1)]
+    poses = [
+        odometry_fields(START + 10**9, 2.0, 0.0, 3.1),
+        odometry_fields(START + 3 * 10**9, 4.0, 1.0, -3.1),
+    ]
     store(tmp_path / "odometry.mcap", *poses, kind=ODOMETRY, topic="/odom")
-    store(tmp_path / "scans.mcap", *[scan(0, header=header(START + s * 10**9, "laser")) for s in range(5)])
+    store(
+        tmp_path / "scans.mcap",
+        *[scan(0, header=header(START + s * 10**9, "laser")) for s in range(5)],
+    )
     folder = rosbag(tmp_path, "odometry.mcap", "scans.mcap")
-    expected = [[2, 0, 3.1], [2, 0, 3.1], [3, 0.5, np.pi], [4, 1, 2 * np.pi - 3.1], [4, 1, 2 * np.pi - 3.1]]
+    expected = [
+        [2, 0, 3.1],
+        [2, 0, 3.1],
+        [3, 0.5, np.pi],
+        [4, 1, 2 * np.pi - 3.1],
+        [4, 1, 2 * np.pi - 3.1],
+    ]
     np.testing.assert_allclose(read_recording(folder).poses(), expected)
 
 
@@ -111,7 +140,9 @@ def test_poses_without_odometry_are_integrated_from_the_commands(tmp_path, whole
     twists = [twist(1.0, 0.0), twist(2.0, 0.0), twist(0.0, 0.5)]
     store(tmp_path / "commands.mcap", *twists, kind=TWIST, topic="/cmd_vel")
     folder = rosbag(tmp_path, "scans.mcap", "commands.mcap")
-    np.testing.assert_allclose(read_recording(folder).poses(), [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0, 0.5]])
+    np.testing.assert_allclose(
+        read_recording(folder).poses(), [[0, 0, 0], [1, 0, 0], [3, 0, 0], [3, 0, 0.5]]
+    )
 
 
 def test_digest_is_that_of_all_files_in_their_order(tmp_path):
@@ -130,22 +161,30 @@ def written_by_rosbags(writer, release):
     with writer:
         topic = writer.add_connection("/scan", SCAN, typestore=ros)
         for number in range(3):
-            fields = vars(get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(encode(SCAN, scan(number)), SCAN))
+            fields = vars(
+                get_typestore(Stores.ROS2_HUMBLE).deserialize_cdr(encode(SCAN, scan(number)), SCAN)
+            )
             stamp = ros.types["builtin_interfaces/msg/Time"](**vars(fields["header"].stamp))
             sequence = {"seq": number} if release is Stores.ROS1_NOETIC else {}
-            fields["header"] = ros.types["std_msgs/msg/Header"](**sequence, stamp=stamp, frame_id="laser")
+            fields["header"] = ros.types["std_msgs/msg/Header"](
+                **sequence, stamp=stamp, frame_id="laser"
+            )
             serialize = ros.serialize_ros1 if sequence else ros.serialize_cdr
             writer.write(topic, START + number * PERIOD, serialize(ros.types[SCAN](**fields), SCAN))
 
 
 @pytest.mark.parametrize("kind", ["mcap", "sqlite3", "ros1"])
-def test_recordings_of_another_library_are_read_after_conversion_to_mcap(tmp_path, monkeypatch, kind):
+def test_recordings_of_another_library_are_read_after_conversion_to_mcap(
+    tmp_path, monkeypatch, kind
+):
     path = tmp_path / ("drive.bag" if kind == "ros1" else "drive")
     if kind == "ros1":
         written_by_rosbags(rosbag1.Writer(path), Stores.ROS1_NOETIC)
     else:
         storage = rosbag2.StoragePlugin[kind.upper()]
-        written_by_rosbags(rosbag2.Writer(path, version=9, storage_plugin=storage), Stores.ROS2_HUMBLE)
+        written_by_rosbags(
+            rosbag2.Writer(path, version=9, storage_plugin=storage), Stores.ROS2_HUMBLE
+        )
     if kind != "mcap":
         # The command in the error message works.
         remedy = re.search(r"rosbags-convert .*mcap", refusal(path))[0]
@@ -154,7 +193,9 @@ def test_recordings_of_another_library_are_read_after_conversion_to_mcap(tmp_pat
         with pytest.raises(SystemExit, match="0"):
             convert()
         path = tmp_path / "new"
-    np.testing.assert_array_equal(read_recording(path).ranges, [scan(number)["ranges"] for number in range(3)])
+    np.testing.assert_array_equal(
+        read_recording(path).ranges, [scan(number)["ranges"] for number in range(3)]
+    )
 
 
 def test_message_definition_of_the_recording_is_used(tmp_path):
@@ -165,7 +206,9 @@ def test_message_definition_of_the_recording_is_used(tmp_path):
     message, parts = definition(SCAN).decode().split("=" * 80, 1)
     own = f"{message}float32 temperature\n{'=' * 80}{parts}".encode()
     data = encode(SCAN, scan(0))
-    store(tmp_path / "scans.mcap", data + np.float32(36.6).tobytes(), data + bytes(4), definition=own)
+    store(
+        tmp_path / "scans.mcap", data + np.float32(36.6).tobytes(), data + bytes(4), definition=own
+    )
     recording = read_recording(rosbag(tmp_path, "commands.mcap", "scans.mcap"))
     assert recording.commands[0].tolist() == [[0.15, -0.5]] * 2
     np.testing.assert_array_equal(recording.ranges, [scan(0)["ranges"]] * 2)
@@ -196,7 +239,9 @@ def test_missing_files_and_incomplete_folders_are_refused(tmp_path):
     assert "No such file" in refusal(tmp_path / "missing.mcap")
     store(tmp_path / "drive_0.mcap", scan(0))
     assert "folder without a readable metadata.yaml" in refusal(tmp_path)
-    assert "lists drive_1.mcap, which is missing" in refusal(rosbag(tmp_path, "drive_0.mcap", "drive_1.mcap"))
+    assert "lists drive_1.mcap, which is missing" in refusal(
+        rosbag(tmp_path, "drive_0.mcap", "drive_1.mcap")
+    )
     assert "rosbags-convert" in refusal(rosbag(tmp_path, "drive_0.db3", storage="sqlite3"))
     assert "lists no files" in refusal(rosbag(tmp_path))
 
@@ -208,7 +253,9 @@ def test_recording_that_is_cut_off_is_read_as_far_as_it_goes(tmp_path, whole):
     scans = len(recording.ranges)
     assert recording.remarks == [f"is cut off: {scans} scans can be read"]
     assert 120 < scans < 180
-    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in range(scans)])
+    np.testing.assert_array_equal(
+        recording.ranges, [scan(number)["ranges"] for number in range(scans)]
+    )
     assert f"is cut off: {scans} scans can be read; copy it again" in refusal(path, strict=True)
     assert "cut off before its first scan" in refusal(copy(whole, tmp_path, 0.01))
 
@@ -225,7 +272,9 @@ def test_recording_may_be_cut_off_anywhere(tmp_path, whole, compression):
 @EITHER_COMPRESSION
 @pytest.mark.parametrize("place", ["content", "length", "end"])
 @pytest.mark.parametrize("damaged", [[0], [1], [-1], [0, 1, 2]], ids=str)
-def test_readable_chunks_of_a_damaged_recording_are_read(tmp_path, whole, compression, damaged, place):
+def test_readable_chunks_of_a_damaged_recording_are_read(
+    tmp_path, whole, compression, damaged, place
+):
     path = compression(copy(whole, tmp_path))
     with path.open("rb") as stream:
         index = make_reader(stream).get_summary().chunk_indexes
@@ -237,17 +286,25 @@ def test_readable_chunks_of_a_damaged_recording_are_read(tmp_path, whole, compre
         else:
             at = start if place == "length" else end - 30
             data[at : at + 60] = bytes(60)
-        scans -= {n for n in scans if chunk.message_start_time <= START + n * PERIOD <= chunk.message_end_time}
+        scans -= {
+            n
+            for n in scans
+            if chunk.message_start_time <= START + n * PERIOD <= chunk.message_end_time
+        }
     path.write_bytes(data)
     lost = 300 - len(scans)
     assert lost
     with pytest.warns(
-        UserWarning, match=rf"whole\.mcap is damaged at byte \d+: {300 - lost} scans .*, {lost} are lost"
+        UserWarning,
+        match=rf"whole\.mcap is damaged at byte \d+: {300 - lost} scans .*, {lost} are lost",
     ):
         recording = read_recording(path)
-    np.testing.assert_array_equal(recording.ranges, [scan(number)["ranges"] for number in sorted(scans)])
-    assert f"{lost} are lost; copy it again from where it was recorded, or set strict=false" in refusal(
-        path, strict=True
+    np.testing.assert_array_equal(
+        recording.ranges, [scan(number)["ranges"] for number in sorted(scans)]
+    )
+    assert (
+        f"{lost} are lost; copy it again from where it was recorded, or set strict=false"
+        in refusal(path, strict=True)
     )
 
 
@@ -257,14 +314,19 @@ def test_number_of_lost_scans_is_unknown_without_an_index(tmp_path):
         options = {"use_statistics": False, "repeat_channels": False, "repeat_schemas": False}
         writer = Writer(stream, 4000, CompressionType.NONE, index_types=IndexType.NONE, **options)
         writer.start("ros2")
-        channel = writer.register_channel("/scan", "cdr", writer.register_schema(SCAN, "ros2msg", definition(SCAN)))
+        channel = writer.register_channel(
+            "/scan", "cdr", writer.register_schema(SCAN, "ros2msg", definition(SCAN))
+        )
         for number in range(9):
             writer.add_message(channel, START + number * PERIOD, encode(SCAN, scan(number)), 0)
         writer.finish()
     data = bytearray(path.read_bytes())
     data[data.find(encode(SCAN, scan(4))) + 100] ^= 1
     path.write_bytes(data)
-    with pytest.warns(UserWarning, match=r"is damaged at byte \d+: \d scans can be read, an unknown number are lost"):
+    with pytest.warns(
+        UserWarning,
+        match=r"is damaged at byte \d+: \d scans can be read, an unknown number are lost",
+    ):
         recording = read_recording(path)
     kept = ((recording.stamp - START) // PERIOD).tolist()
     assert {0, 8} < set(kept) < set(range(9)) - {4}
@@ -279,7 +341,9 @@ def test_damage_that_no_chunk_explains_is_refused(tmp_path, whole):
     data[chunk.chunk_start_offset + chunk.chunk_length + 30] ^= 1  # the index after the chunk
     path.write_bytes(data)
     assert re.search("is damaged before byte .*crc validation failed.*mcap recover", refusal(path))
-    path.write_bytes(data[:8] + b"\1" + (2**40).to_bytes(8, "little") + data[17:-36] + bytes(28) + data[-8:])
+    path.write_bytes(
+        data[:8] + b"\1" + (2**40).to_bytes(8, "little") + data[17:-36] + bytes(28) + data[-8:]
+    )
     assert "is damaged before byte 17 (" in refusal(path)
     assert "is damaged before its first scan" in refusal(scanless(tmp_path / "a.mcap"))
 
@@ -298,7 +362,11 @@ def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
     path = compression(drive(tmp_path / "a.mcap", scans=9, commands=True))
     expected, data = read_recording(path), path.read_bytes()
     draw = np.random.default_rng(0)
-    for place in [*range(8, 120), *draw.integers(120, len(data), 200), *range(len(data) - 60, len(data))]:
+    for place in [
+        *range(8, 120),
+        *draw.integers(120, len(data), 200),
+        *range(len(data) - 60, len(data)),
+    ]:
         damaged = bytearray(data)
         damaged[place] ^= 1 << draw.integers(8)
         path.write_bytes(damaged)
@@ -341,8 +409,14 @@ def test_recording_without_scans_is_refused(tmp_path):
 )
 def test_other_encodings_and_types_are_refused(tmp_path, channel):
     message = refusal(store(tmp_path / "a.mcap", json.dumps({"ranges": [1.0]}).encode(), **channel))
-    kind, encoding = channel.get("kind", SCAN) or "no type", channel.get("encoding", "cdr") or "no encoding"
-    assert f"has messages of {kind} in {encoding} on topic /scan, not of {SCAN} in cdr; record the scans" in message
+    kind, encoding = (
+        channel.get("kind", SCAN) or "no type",
+        channel.get("encoding", "cdr") or "no encoding",
+    )
+    assert (
+        f"has messages of {kind} in {encoding} on topic /scan, not of {SCAN} in cdr; record the scans"
+        in message
+    )
 
 
 OTHERS = {
@@ -351,7 +425,10 @@ OTHERS = {
         "/odom",
         TWIST_STAMPED,
     ): f"not of {ODOMETRY} in cdr, and they are ignored; give the topic of such messages, here /o",
-    ("/cmd_vel", "geometry_msgs/msg/Vector3"): f"not of {TWIST} or {TWIST_STAMPED} in cdr, and they are ignored",
+    (
+        "/cmd_vel",
+        "geometry_msgs/msg/Vector3",
+    ): f"not of {TWIST} or {TWIST_STAMPED} in cdr, and they are ignored",
 }
 
 
@@ -374,7 +451,9 @@ def test_commands_may_be_stamped(tmp_path, kind):
     if kind == TWIST_STAMPED:
         fields = [{"header": header(1, "base_link"), "twist": each} for each in fields]
     commands = [("/cmd_vel", kind, START + number, each) for number, each in enumerate(fields)]
-    recording = read_recording(rosbag_of(tmp_path / "drive", ("/scan", SCAN, START, scan(0)), *commands))
+    recording = read_recording(
+        rosbag_of(tmp_path / "drive", ("/scan", SCAN, START, scan(0)), *commands)
+    )
     np.testing.assert_array_equal(recording.commands[0], [[0.3, 0.0], [0.3, 0.1], [0.3, 0.2]])
     assert recording.stamped_commands == (kind == TWIST_STAMPED)
     assert recording.remarks == []
@@ -387,7 +466,9 @@ def scanners(path, *, frames=("front", "rear"), ranges=(12.0, 12.0), senders=(""
             of = number % 2
             time = START + number * PERIOD
             fields = scan(number, header=header(time, frames[of]), range_max=ranges[of])
-            channel = Channel("/scan", SCAN, definition=definition(SCAN), metadata=(("callerid", senders[of]),))
+            channel = Channel(
+                "/scan", SCAN, definition=definition(SCAN), metadata=(("callerid", senders[of]),)
+            )
             writer.copy(RawMessage(channel, time, time, encode(SCAN, fields)))
     return path
 
@@ -401,25 +482,36 @@ def test_of_several_scanners_on_a_topic_the_chosen_one_is_read(tmp_path):
     for frame, odd in (("front", 0), ("rear", 1)):
         recording = read_recording(path, frame=frame)
         assert (recording.frame, recording.remarks) == (frame, [])
-        np.testing.assert_array_equal(recording.ranges, [scan(n)["ranges"] for n in range(odd, 7, 2)])
+        np.testing.assert_array_equal(
+            recording.ranges, [scan(n)["ranges"] for n in range(odd, 7, 2)]
+        )
         np.testing.assert_array_equal(recording.log_time, START + np.arange(odd, 7, 2) * PERIOD)
-    assert "has no scan with the frame left; give frame=front or rear." in refusal(path, frame="left")
+    assert "has no scan with the frame left; give frame=front or rear." in refusal(
+        path, frame="left"
+    )
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"ranges": (12.0, 4.0)}, r"laser \(4 scans to 12 m\), laser \(3 scans to 4 m\)"),
-        ({"senders": ("/left", "/right")}, r"laser of /left \(4 scans.*, laser of /right \(3 scans"),
+        (
+            {"senders": ("/left", "/right")},
+            r"laser of /left \(4 scans.*, laser of /right \(3 scans",
+        ),
     ],
 )
-def test_scanners_with_the_same_frame_are_distinguished_by_range_and_sender(tmp_path, options, words):
+def test_scanners_with_the_same_frame_are_distinguished_by_range_and_sender(
+    tmp_path, options, words
+):
     path = scanners(tmp_path / "a.mcap", frames=("laser", "laser"), **options)
     with pytest.warns(UserWarning, match=words + ".*; record each on a topic of its own$"):
         assert len(read_recording(path, frame="laser").ranges) == 4
 
 
-DRIVEN = [  # linear speed of the commands, whether there is odometry, the speed of the robot by it, and the result
+# linear speed of the commands, whether there is odometry, the speed of the robot by it, and the
+# result
+DRIVEN = [
     (0.35, True, 0.2, 0.35),
     (0.35, False, 0.2, 0.35),
     (0.0, True, 0.2, 0.2),
@@ -428,13 +520,17 @@ DRIVEN = [  # linear speed of the commands, whether there is odometry, the speed
 
 
 @pytest.mark.parametrize(("commanded", "odometry", "measured", "expected"), DRIVEN)
-def test_speed_of_a_command_is_its_own_or_measured_or_nominal(tmp_path, commanded, odometry, measured, expected):
+def test_speed_of_a_command_is_its_own_or_measured_or_nominal(
+    tmp_path, commanded, odometry, measured, expected
+):
     messages = []
     for number in range(4):
         time = START + number * 10**9
         messages += [("/scan", SCAN, time, scan(0, header=header(time, "laser")))]
         messages += [("/cmd_vel", TWIST, time + 1, twist(commanded, 0.1))]
-        messages += [("/odom", ODOMETRY, time, odometry_fields(time, measured * number, 0, 0))] * odometry
+        messages += [
+            ("/odom", ODOMETRY, time, odometry_fields(time, measured * number, 0, 0))
+        ] * odometry
     recording = read_recording(rosbag_of(tmp_path / "drive", *messages))
     commands = recording.commands_of_scans(0.15)
     np.testing.assert_allclose(commands[:3], [[expected, 0.1]] * 3, rtol=1e-6)
@@ -477,7 +573,10 @@ def test_recordings_of_real_sensors_are_read_like_another_library_does(name, top
     assert (np.diff(recording.seconds) > 0).all()
     with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
         channels = [channel for channel in reader.connections if channel.topic == topic]
-        messages = [reader.deserialize(data, channel.msgtype) for channel, _, data in reader.messages(channels)]
+        messages = [
+            reader.deserialize(data, channel.msgtype)
+            for channel, _, data in reader.messages(channels)
+        ]
     messages = [message for message in messages if message.header.frame_id == recording.frame]
     for row, message in zip(recording.ranges, messages, strict=True):
         in_range = (message.ranges >= message.range_min) & (message.ranges <= message.range_max)

@@ -48,7 +48,9 @@ def scripted(ranges, angles):
 
 
 def test_env_contract_holds(tmp_path):
-    env = McapReplayEnv([drive(tmp_path / "a.mcap", 7), drive(tmp_path / "b.mcap", 3, commands=True)], scripted)
+    env = McapReplayEnv(
+        [drive(tmp_path / "a.mcap", 7), drive(tmp_path / "b.mcap", 3, commands=True)], scripted
+    )
     assert env.batch_size == (2,)
     check_env(env)
     check_transform(env, GuideActions({"spline": SplineGuide()}))
@@ -57,16 +59,18 @@ def test_env_contract_holds(tmp_path):
 @torch.no_grad()
 def test_cones_and_guide_are_those_of_the_drive():
     """Replay recordings of the drive by a robot of a seventh of the car's size."""
-    rollout = ConeTrackEnv(shipped_tracks("test"), 3, rate=RATE, laps=99, assignment="cyclic").rollout(
-        80, SplineGuide(), break_when_any_done=False
-    )
+    rollout = ConeTrackEnv(
+        shipped_tracks("test"), 3, rate=RATE, laps=99, assignment="cyclic"
+    ).rollout(80, SplineGuide(), break_when_any_done=False)
     times = (np.arange(80) * 1e9 / RATE).astype(np.int64)
     layout = np.ones(80, int), np.zeros(80), np.ones(80)
     recordings = []
     for car, poses in enumerate(rollout["info", "pose"].double().numpy() / [SCALE, SCALE, 1]):
         # The only range of each scan encodes its index.
         ranges = (1 + np.arange(80, dtype=np.float32) + 1000 * car).reshape(-1, 1)
-        recordings.append(Recording(Path("drive"), times, times, ranges, *layout, (poses, times, times)))
+        recordings.append(
+            Recording(Path("drive"), times, times, ranges, *layout, (poses, times, times))
+        )
 
     def perception(ranges, angles):
         car, scan = np.divmod(ranges[:, 0].astype(int) - 1, 1000)
@@ -84,19 +88,28 @@ def test_cones_and_guide_are_those_of_the_drive():
     # The cone world has no check of plausibility.
     alike = both & again["info", "valid"].all(-1)
     assert alike.sum() > 0.8 * both.sum()
-    torch.testing.assert_close(again["observation"][alike], rollout["observation"][alike], rtol=0, atol=2e-4)
+    torch.testing.assert_close(
+        again["observation"][alike], rollout["observation"][alike], rtol=0, atol=2e-4
+    )
 
 
 @torch.no_grad()
 def test_ten_unreadable_scans_keep_the_last_observation_and_action(tmp_path):
     save_drive(simulated_drive("both", seed=0), tmp_path / "a.mcap")
-    recording, perception = read_recording(tmp_path / "a.mcap"), Perception(simulated_cone_classifier())
-    valid = McapReplayEnv(recording, perception).rollout(80, SplineGuide())["info", "valid"][0].all(-1)
+    recording, perception = (
+        read_recording(tmp_path / "a.mcap"),
+        Perception(simulated_cone_classifier()),
+    )
+    valid = (
+        McapReplayEnv(recording, perception).rollout(80, SplineGuide())["info", "valid"][0].all(-1)
+    )
     last = 20 + int(valid[20:].nonzero()[0])
     gap = slice(last + 1, last + 11)
     unreadable = recording.ranges.copy()
     unreadable[gap] = np.nan
-    steps = McapReplayEnv(replace(recording, ranges=unreadable), perception).rollout(80, SplineGuide())[0]
+    steps = McapReplayEnv(replace(recording, ranges=unreadable), perception).rollout(
+        80, SplineGuide()
+    )[0]
     assert not steps["info", "valid"][gap].any()
     for key in ("observation", "action"):
         assert torch.equal(steps[key][gap], steps[key][last].expand(10, -1))
@@ -107,7 +120,10 @@ def test_each_recording_ends_after_one_action_per_scan_and_restarts(tmp_path):
     paths = [drive(tmp_path / f"{scans}.mcap", scans, seed=scans) for scans in (7, 3)]
     env = McapReplayEnv(paths, scripted)
     rollout = env.rollout(7, break_when_any_done=False)
-    assert rollout["info", "scan"].squeeze(-1).tolist() == [[0, 1, 2, 3, 4, 5, 6], [0, 1, 2, 0, 1, 2, 0]]
+    assert rollout["info", "scan"].squeeze(-1).tolist() == [
+        [0, 1, 2, 3, 4, 5, 6],
+        [0, 1, 2, 0, 1, 2, 0],
+    ]
     ends = rollout["next", "truncated"].squeeze(-1).int().tolist()
     assert ends == [[0, 0, 0, 0, 0, 0, 1], [0, 0, 1, 0, 0, 1, 0]]
     assert torch.equal(rollout["next", "done"], rollout["next", "truncated"])
@@ -121,7 +137,9 @@ def test_each_recording_ends_after_one_action_per_scan_and_restarts(tmp_path):
 
 
 def test_omega_follows_from_the_steering_and_the_robot(tmp_path):
-    env = McapReplayEnv(drive(tmp_path / "a.mcap", 9), blind, speed=0.2, car_length=0.25, smooth=-2.0)
+    env = McapReplayEnv(
+        drive(tmp_path / "a.mcap", 9), blind, speed=0.2, car_length=0.25, smooth=-2.0
+    )
     state = env.reset()
     assert state["omega"].item() == 0
     state = env.step(state.set("action", torch.tensor([[0.5]])))["next"]
@@ -136,7 +154,9 @@ def test_pose_is_relative_to_the_first_scan(tmp_path):
     path = drive(tmp_path / "a.mcap", 40, odometry=True)
     pose = McapReplayEnv(path, blind).rollout(40)["info", "pose"][0]
     angle = 0.15 * 0.182 * torch.arange(40)
-    torch.testing.assert_close(pose, torch.stack([angle.sin(), 1 - angle.cos(), angle], 1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        pose, torch.stack([angle.sin(), 1 - angle.cos(), angle], 1), rtol=0, atol=1e-6
+    )
     recording = read_recording(path)
     poses, log_time, stamp = recording.odometry
     turned = np.stack([100 - poses[:, 1], poses[:, 0] - 50, poses[:, 2] + np.pi / 2], axis=1)
@@ -152,7 +172,9 @@ def test_state_dict_is_the_whole_state(tmp_path):
 
     state = first.rollout(8, steer)[:, -1]["next"]
     second.load_state_dict(first.state_dict())
-    expected, resumed = (env.rollout(5, steer, auto_reset=False, tensordict=state.clone()) for env in (first, second))
+    expected, resumed = (
+        env.rollout(5, steer, auto_reset=False, tensordict=state.clone()) for env in (first, second)
+    )
     assert (expected == resumed).all()
     assert resumed["info", "scan"].squeeze().tolist() == [8, 9, 10, 11, 12]
 
@@ -191,7 +213,10 @@ def test_cones_are_padded_or_cut_to_the_nearest(tmp_path):
         ({"smooth": math.nan}, "smooth=nan must be at least -1000000.0"),
         ({"recordings": []}, "recordings is empty; give at least one"),
         ({"recordings": ["missing.mcap"]}, "missing.mcap cannot be read"),
-        ({"perception": lambda ranges, angles: blind(ranges[:1], angles)}, r"must return \[3, 2, K, 2\]"),
+        (
+            {"perception": lambda ranges, angles: blind(ranges[:1], angles)},
+            r"must return \[3, 2, K, 2\]",
+        ),
     ],
 )
 def test_invalid_arguments_are_refused(tmp_path, options, reason):
@@ -210,4 +235,9 @@ def test_configuration_builds_the_env(tmp_path):
     with pytest.raises(UserError, match="env: recordings is empty; give at least one"):
         build(node | {"recordings": []}, "env", McapReplayEnv, perception=blind)
     with pytest.raises(UserError, match=r"env: .*missing\.mcap cannot be read \(No such file"):
-        build(node | {"recordings": str(tmp_path / "missing.mcap")}, "env", McapReplayEnv, perception=blind)
+        build(
+            node | {"recordings": str(tmp_path / "missing.mcap")},
+            "env",
+            McapReplayEnv,
+            perception=blind,
+        )

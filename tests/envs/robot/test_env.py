@@ -10,7 +10,15 @@ from worlds import driving_measures
 
 import coil_rl.train.config  # noqa: F401  registers the typed roots
 from coil_rl import testing
-from coil_rl.envs import ConeTrackEnv, Perception, SimulatedLidar, SimulatedRobotEnv, Track, robot_track, shipped_tracks
+from coil_rl.envs import (
+    ConeTrackEnv,
+    Perception,
+    SimulatedLidar,
+    SimulatedRobotEnv,
+    Track,
+    robot_track,
+    shipped_tracks,
+)
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.train.build import build_env
@@ -28,7 +36,9 @@ def steered(env, actions):
     """The states before and after each of the actions."""
     states = [env.reset()]
     for action in actions:
-        states.append(env.step(states[-1].set("action", torch.full((*env.batch_size, 1), action)))["next"])
+        states.append(
+            env.step(states[-1].set("action", torch.full((*env.batch_size, 1), action)))["next"]
+        )
     return states
 
 
@@ -58,8 +68,13 @@ def test_cones_in_view_are_those_of_the_track():
     state = robots(1, lidar=EXACT).reset()
     (left, right), (lefts, rights) = state["cones"][0] / 7, state["cone_count"][0]
     x, y, heading = robot_track().start
-    turn = torch.tensor([[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]])
-    for found, ring, radius in ((left[:lefts], robot_track().left, 0.02), (right[:rights], robot_track().right, 0.045)):
+    turn = torch.tensor(
+        [[math.cos(heading), math.sin(heading)], [-math.sin(heading), math.cos(heading)]]
+    )
+    for found, ring, radius in (
+        (left[:lefts], robot_track().left, 0.02),
+        (right[:rights], robot_track().right, 0.045),
+    ):
         centres = (torch.tensor(ring).float() - torch.tensor([x, y])) @ turn.T
         assert len(found) >= 3
         assert (torch.cdist(found, centres).amin(1) <= radius).all()
@@ -68,7 +83,9 @@ def test_cones_in_view_are_those_of_the_track():
 
 
 def test_drive_is_determined_by_the_seed():
-    first, second, third = (steered(robots(2, seed=seed), [0.1, -0.2])[-1]["observation"] for seed in (1, 1, 2))
+    first, second, third = (
+        steered(robots(2, seed=seed), [0.1, -0.2])[-1]["observation"] for seed in (1, 1, 2)
+    )
     assert torch.equal(first, second)
     assert not torch.equal(first, third)
 
@@ -76,17 +93,23 @@ def test_drive_is_determined_by_the_seed():
 def test_robots_are_independent_but_for_the_noise():
     options = {"lidar": EXACT, "assignment": "cyclic"}
     alone = steered(robots(1, **options), [0.3, -0.1, 0.2])[-1]
-    together = steered(robots(3, tracks=[robot_track(), ring_track("ring", 0.6, 0.4)], **options), [0.3, -0.1, 0.2])[-1]
+    together = steered(
+        robots(3, tracks=[robot_track(), ring_track("ring", 0.6, 0.4)], **options), [0.3, -0.1, 0.2]
+    )[-1]
     for car in (0, 2):
         torch.testing.assert_close(alone["observation"][0], together["observation"][car])
-        torch.testing.assert_close(alone["info", "clearance"][0], together["info", "clearance"][car])
+        torch.testing.assert_close(
+            alone["info", "clearance"][0], together["info", "clearance"][car]
+        )
 
 
 def test_state_dict_is_the_whole_state():
     first, second = robots(2, seed=1), robots(2, seed=9)
     state = steered(first, [0.2] * 3)[-1]
     second.load_state_dict(first.state_dict())
-    one, other = (env.step(state.clone().set("action", torch.zeros(2, 1)))["next"] for env in (first, second))
+    one, other = (
+        env.step(state.clone().set("action", torch.zeros(2, 1)))["next"] for env in (first, second)
+    )
     for key, value in one.items(True, True):
         assert torch.equal(value, other[key]), key
     assert torch.equal(first.scan, second.scan)
@@ -94,7 +117,9 @@ def test_state_dict_is_the_whole_state():
 
 @pytest.mark.parametrize("action", [1.0, 0.0])
 def test_constant_steering_crashes(action):
-    episodes = evaluate_policy(robots(2), ConstantGuide(action), measures=driving_measures("simulated_robot")).episodes
+    episodes = evaluate_policy(
+        robots(2), ConstantGuide(action), measures=driving_measures("simulated_robot")
+    ).episodes
     assert all(episode["crashed"] and not episode["completed"] for episode in episodes)
     assert all(-0.03 < episode["clearance"] <= 0 for episode in episodes)
     assert all(episode["reward"] < -90 for episode in episodes)
@@ -150,11 +175,16 @@ def test_invalid_options_are_refused(options, words):
 
 def test_configuration_agrees_with_the_defaults():
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        config = compose("evaluate", ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"])
+        config = compose(
+            "evaluate",
+            ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"],
+        )
     env = build_env(config, {**config.evaluation.env, "num_envs": 3}).base_env
     assert isinstance(env, SimulatedRobotEnv)
     plain = SimulatedRobotEnv(num_envs=3, assignment="cyclic")
     for one, other in ((env, plain), (env.perception, plain.perception), (env.lidar, plain.lidar)):
-        numbers = {name: value for name, value in vars(other).items() if isinstance(value, (int, float))}
+        numbers = {
+            name: value for name, value in vars(other).items() if isinstance(value, (int, float))
+        }
         assert {name: vars(one)[name] for name in numbers} == pytest.approx(numbers, rel=1e-5)
     assert {key: float(value) for key, value in env.weights.items()} == plain.weights

@@ -34,10 +34,17 @@ def test_turning_during_a_scan_shifts_the_bearings():
     turn = 0.05
     poses = torch.zeros(3, 1, 360)
     poses[2] = turn * lidar.phase
-    standing, turning = (cast((1.0, 0.0, 0.2), (-1.0, 0.3, 0.2), poses=p)[0][0].isfinite() for p in (STANDING, poses))
+    standing, turning = (
+        cast((1.0, 0.0, 0.2), (-1.0, 0.3, 0.2), poses=p)[0][0].isfinite() for p in (STANDING, poses)
+    )
     assert lidar.phase[-1] == 0
-    middle = [[float(lidar.angles[seen & part].mean()) for part in (lidar.angles.abs() < 1, lidar.angles > 2)]
-              for seen in (standing, turning)]  # fmt: skip
+    middle = [
+        [
+            float(lidar.angles[seen & part].mean())
+            for part in (lidar.angles.abs() < 1, lidar.angles > 2)
+        ]
+        for seen in (standing, turning)
+    ]
     # What is behind on the left is measured first, before the robot has turned.
     expected = [turn / 2, turn * 0.05]
     np.testing.assert_allclose(np.subtract(*middle), expected, atol=0.01)
@@ -80,14 +87,20 @@ def test_arc_equals_many_small_steps():
     steps = pose
     for _ in range(2000):
         half = torch.stack([steps[0], steps[1], steps[2] + 0.4 / 4000])
-        steps = torch.stack([
-            half[0] + 0.5 / 2000 * half[2].cos(), half[1] + 0.5 / 2000 * half[2].sin(), steps[2] + 0.4 / 2000
-        ])  # fmt: skip
+        steps = torch.stack(
+            [
+                half[0] + 0.5 / 2000 * half[2].cos(),
+                half[1] + 0.5 / 2000 * half[2].sin(),
+                steps[2] + 0.4 / 2000,
+            ]
+        )
     found = move_along_arc(pose, *torch.tensor([0.5, 0.4]).double())
     torch.testing.assert_close(found, steps, atol=1e-7, rtol=0)
 
 
-@pytest.mark.parametrize("wrong", [{"beams": 0}, {"rate": -1}, {"noise": -0.1}, {"no_return": 0.7, "outliers": 0.4}])
+@pytest.mark.parametrize(
+    "wrong", [{"beams": 0}, {"rate": -1}, {"noise": -0.1}, {"no_return": 0.7, "outliers": 0.4}]
+)
 def test_invalid_options_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
         SimulatedLidar(**wrong)

@@ -64,14 +64,20 @@ class BatchedPI(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` [B, 1]."""
         cold = -tensordict["observation"][..., :1]
-        integral = tensordict["integral"] + self.tracking * (tensordict["last_action"] - tensordict["wish"])
+        integral = tensordict["integral"] + self.tracking * (
+            tensordict["last_action"] - tensordict["wish"]
+        )
         wish = self.kp * cold + integral
         tensordict.set("action", wish.clamp(0, 1))
-        return tensordict.set(("next", "integral"), integral + self.ki * cold).set(("next", "wish"), wish)
+        return tensordict.set(("next", "integral"), integral + self.ki * cold).set(
+            ("next", "wish"), wish
+        )
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the memory, 0 at the start of each episode."""
-        return TensorDictPrimer({"integral": Unbounded((1,)), "wish": Unbounded((1,))}, expand_specs=True)
+        return TensorDictPrimer(
+            {"integral": Unbounded((1,)), "wish": Unbounded((1,))}, expand_specs=True
+        )
 
 
 def proportional(observation: Tensor, kp: float = 0.2) -> Tensor:

@@ -24,7 +24,12 @@ class Rooms(EnvBase):
     """
 
     def __init__(
-        self, num_envs: int = 1, seed: int = 0, first_seed: int | None = None, cases: int = 1, goal: float = 21.0
+        self,
+        num_envs: int = 1,
+        seed: int = 0,
+        first_seed: int | None = None,
+        cases: int = 1,
+        goal: float = 21.0,
     ) -> None:
         super().__init__(batch_size=[num_envs])
         self.goal, self.generator, self.days = goal, torch.Generator(), None
@@ -35,9 +40,13 @@ class Rooms(EnvBase):
         self.rooms = torch.zeros(num_envs, 4)  # air, wall, mean outside, number of steps
         number, flag = Unbounded((num_envs, 1)), Binary(1, (num_envs, 1), dtype=torch.bool)
         info = Composite(power=number.clone(), in_band=number.clone(), shape=(num_envs,))
-        self.observation_spec = Composite(observation=Unbounded((num_envs, 2)), info=info, shape=(num_envs,))
+        self.observation_spec = Composite(
+            observation=Unbounded((num_envs, 2)), info=info, shape=(num_envs,)
+        )
         self.action_spec, self.reward_spec = Bounded(0, 1, (num_envs, 1)), number
-        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(num_envs,))
+        self.done_spec = Composite(
+            done=flag, terminated=flag.clone(), truncated=flag.clone(), shape=(num_envs,)
+        )
 
     def _reset(self, tensordict: TensorDictBase | None = None, **_: Any) -> TensorDictBase:
         count, everything = len(self.rooms), torch.ones(len(self.rooms), 1, dtype=torch.bool)
@@ -46,10 +55,16 @@ class Rooms(EnvBase):
         begin = torch.tensor([15.0, 14.0, -5.0, 0.0]).repeat(count, 1)
         begin[:, 2] += 15 * days
         self.rooms = torch.where(mask, begin, self.rooms)
-        return TensorDict(self._observed(torch.zeros(count)) | dict(self.done_spec.zero()), self.batch_size)
+        return TensorDict(
+            self._observed(torch.zeros(count)) | dict(self.done_spec.zero()), self.batch_size
+        )
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        (air, wall, mean, steps), outside, power = self.rooms.unbind(-1), self._outside(), tensordict["action"][:, 0]
+        (air, wall, mean, steps), outside, power = (
+            self.rooms.unbind(-1),
+            self._outside(),
+            tensordict["action"][:, 0],
+        )
         flows = 1.5 * (wall - air) + 0.3 * (outside - air) + 15 * power
         walls = 0.4 * (air - wall) + 0.05 * (outside - wall)
         air, wall, steps = air + HOURS * flows, wall + HOURS * walls, steps + 1
