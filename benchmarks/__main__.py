@@ -36,8 +36,8 @@ from benchmarks.training import (
 )
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs.app import program
-from coil_rl.train.check import check_parts
-from coil_rl.train.run_folder import versions
+from coil_rl.config.check import check_parts
+from coil_rl.run.folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "processes": ("Start-up and memory of fresh processes", measure_processes),

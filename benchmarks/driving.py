@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from torch.profiler import profile
 from torchrl.envs import EnvBase, TransformedEnv
 
-import coil_rl.train.config  # noqa: F401  registers the schema
+import coil_rl.config.schema  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
 from coil_rl.envs import (
     Perception,
@@ -26,7 +26,7 @@ from coil_rl.envs import (
     simulated_cone_classifier,
     simulated_drive,
 )
-from coil_rl.train.build import build_bare_env, build_guides, compile_steps
+from coil_rl.config.build import build_bare_env, build_guides, compile_steps
 from coil_rl.transforms import GuideActions
 
 

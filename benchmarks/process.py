@@ -46,7 +46,7 @@ def main(cars: int, steps: int, device: str, threads: int) -> Row:
     from coil_rl.envs import ConeTrackEnv, shipped_tracks
     from coil_rl.guides import SplineGuide
     from coil_rl.learners import PPO
-    from coil_rl.train.rollout import Rollout
+    from coil_rl.run.rollout import Rollout
     from coil_rl.transforms import GuideActions
 
     torch.set_num_threads(threads)

@@ -22,7 +22,7 @@ from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, media
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
-from coil_rl.train.build import (
+from coil_rl.config.build import (
     build,
     build_bare_env,
     build_env,
@@ -30,8 +30,8 @@ from coil_rl.train.build import (
     build_learner,
     compile_steps,
 )
-from coil_rl.train.experiment import Experiment, watched_keys
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.experiment import Experiment, watched_keys
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 METHODS = ("ppo", "coil")

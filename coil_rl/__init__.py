@@ -10,6 +10,11 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
+    from coil_rl.config.load import open_run as open_run
+    from coil_rl.config.python import prepare as prepare
+    from coil_rl.config.python import train as train
+    from coil_rl.config.trust import trust_packages as trust_packages
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
     from coil_rl.envs import EnvBatch as EnvBatch
@@ -30,7 +35,6 @@ if TYPE_CHECKING:
     from coil_rl.guides import RecordedGuide as RecordedGuide
     from coil_rl.guides import SplineGuide as SplineGuide
     from coil_rl.guides import ZeroGuide as ZeroGuide
-    from coil_rl.guides.learned import LearnedGuide as LearnedGuide
     from coil_rl.imitation import Imitation as Imitation
     from coil_rl.learners import A2C as A2C
     from coil_rl.learners import DQN as DQN
@@ -39,16 +43,18 @@ if TYPE_CHECKING:
     from coil_rl.learners import TRPO as TRPO
     from coil_rl.learners import DynamicCoil as DynamicCoil
     from coil_rl.learners import Reinforce as Reinforce
+    from coil_rl.report.measures import Measure as Measure
+    from coil_rl.run.controller import Controller as Controller
+    from coil_rl.run.evaluation import evaluate_policy as evaluate_policy
+    from coil_rl.run.judge import Evaluation as Evaluation
+    from coil_rl.run.judge import Trial as Trial
+    from coil_rl.run.parts import EnvMaker as EnvMaker
+    from coil_rl.run.rollout import Rollout as Rollout
+    from coil_rl.run.run import Budget as Budget
+    from coil_rl.run.run import Run as Run
     from coil_rl.testing import check_env as check_env
     from coil_rl.testing import check_guide as check_guide
     from coil_rl.testing import check_transform as check_transform
-    from coil_rl.train.evaluation import evaluate_policy as evaluate_policy
-    from coil_rl.train.load import load_policy as load_policy
-    from coil_rl.train.load import load_policy_in_env as load_policy_in_env
-    from coil_rl.train.measures import Measure as Measure
-    from coil_rl.train.rollout import Rollout as Rollout
-    from coil_rl.train.run_folder import read_config as read_config
-    from coil_rl.train.trust import trust_packages as trust_packages
     from coil_rl.transforms import DiscreteActions as DiscreteActions
     from coil_rl.transforms import GuideActions as GuideActions
     from coil_rl.transforms import JumpStart as JumpStart
@@ -63,16 +69,20 @@ _NAMES = {
     "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
     "coil_rl.errors": "UserError",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide SplineGuide ZeroGuide",
-    "coil_rl.guides.learned": "LearnedGuide",
+    "coil_rl.config.learned_guide": "LearnedGuide",
     "coil_rl.imitation": "Imitation",
     "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
     "coil_rl.testing": "check_env check_guide check_transform",
-    "coil_rl.train.evaluation": "evaluate_policy",
-    "coil_rl.train.load": "load_policy load_policy_in_env",
-    "coil_rl.train.measures": "Measure",
-    "coil_rl.train.rollout": "Rollout",
-    "coil_rl.train.run_folder": "read_config",
-    "coil_rl.train.trust": "trust_packages",
+    "coil_rl.run.evaluation": "evaluate_policy",
+    "coil_rl.run.judge": "Evaluation Trial",
+    "coil_rl.config.load": "open_run",
+    "coil_rl.config.python": "prepare train",
+    "coil_rl.report.measures": "Measure",
+    "coil_rl.run.rollout": "Rollout",
+    "coil_rl.run.controller": "Controller",
+    "coil_rl.run.parts": "EnvMaker",
+    "coil_rl.run.run": "Budget Run",
+    "coil_rl.config.trust": "trust_packages",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling "
     "set_progress",
 }

@@ -19,7 +19,7 @@ from typing import Any
 from unittest.mock import patch
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.fx import GraphModule
 from tqdm import tqdm
 
@@ -87,6 +87,17 @@ def library(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tenso
 def folder() -> Path:
     """Return the folder of the compiled libraries, `coil-rl` in the user's cache folder."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coil-rl"
+
+
+def compile_steps(env: nn.Module) -> None:
+    """Compile the steps of an env, and those of its guides, where they can be.
+
+    A part that can has a method `compile_steps`, which gets this module's `Compiled`.
+    """
+    for module in env.modules():
+        compile_part = getattr(module, "compile_steps", None)
+        if compile_part is not None:
+            compile_part(Compiled)
 
 
 def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor]) -> GraphModule:

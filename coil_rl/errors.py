@@ -1,4 +1,4 @@
-"""User errors, and messages of one sentence for them."""
+"""Mistakes of the user, and damaged files of a run, as errors of one sentence."""
 
 import difflib
 import errno
@@ -7,34 +7,13 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from hydra.errors import MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
-from omegaconf.errors import (
-    ConfigAttributeError,
-    ConfigKeyError,
-    InterpolationKeyError,
-    OmegaConfBaseException,
-)
-
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 # Another kind of file than expected, or one that may not be used.
 IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP)
-LAUNCHERS = {
-    "joblib": "joblib",
-    "submitit_slurm": "slurm",
-    "submitit_local": "slurm",
-    "ray": "ray",
-}  # and their extras
 
 
 class UserError(Exception):
     """A mistake in the input of the user. The message states what is wrong, what is expected and what to do."""
-
-
-def is_no_bug(error: BaseException) -> bool:
-    """Return whether an error has a cause outside of the program: the input, the configuration or the disk."""
-    outside = isinstance(error, (UserError, OmegaConfBaseException))
-    return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 
 @contextmanager
@@ -43,7 +22,7 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if isinstance(error, OmegaConfBaseException) or getattr(error, "errno", None) in NO_SPACE:
+        if getattr(error, "errno", None) in NO_SPACE:
             raise
         missing = f"it lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
         problem = textwrap.shorten(missing, 200, placeholder=" ...")
@@ -54,84 +33,3 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
     """Return `; did you mean X?` with the most similar known name, or an empty string."""
     similar = difflib.get_close_matches(given, list(known), n=1)
     return f"; did you mean {similar[0]}?" if similar else ""
-
-
-def sentence(error: BaseException) -> str:
-    """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
-    return " ".join(_message(error).split())
-
-
-def _message(error: BaseException) -> str:
-    cause = error.__cause__
-    if isinstance(error, UserError):
-        return str(error)
-    if isinstance(error, MissingConfigException):
-        return _unknown_file(error)
-    if isinstance(error, OSError):
-        name, remedy = (
-            error.filename or "the output",
-            "choose another folder with hydra.run.dir=FOLDER",
-        )
-        if error.errno == errno.ENAMETOOLONG:
-            name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
-        elif error.errno in IN_THE_WAY:
-            remedy = "put the right file or folder there, with the right to use it"
-        return f"{name} cannot be used ({error.strerror}); {remedy}"
-    if isinstance(
-        error, (AssertionError, TypeError)
-    ):  # of Hydra, for a choice of a group that is no text
-        return (
-            "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
-        )
-    if isinstance(error, OverrideParseException):
-        return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
-    for key_error in (error, cause):
-        if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
-            return _unknown_key(key_error)
-    if isinstance(error, MissingMandatoryValue) and error.full_key:
-        return f"{error.full_key} must be given: write {error.full_key}=VALUE"
-    if isinstance(error, OmegaConfBaseException) and (key := error.full_key):
-        if isinstance(error, InterpolationKeyError):
-            missing, group = str(error).split("'")[1], key.partition(".")[0]
-            return f"{key} refers to {missing}, which does not exist; choose another {group}, or give {key}=VALUE"
-        return f"{key}: {_first_paragraph(error)}"
-    if isinstance(cause, OmegaConfBaseException):
-        return f"{_first_paragraph(error)}: {_first_paragraph(cause)}"
-    return _first_paragraph(error)
-
-
-def _unknown_file(error: MissingConfigException) -> str:
-    group, _, name = (error.missing_cfg_file or "").rpartition("/")
-    if not group:
-        return _first_paragraph(error)
-    if group == "hydra/launcher" and name in LAUNCHERS:
-        return f"hydra/launcher={name} is not installed: python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
-    options = sorted(error.options or [])
-    choices = (
-        f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
-    )
-    return f"there is no {group}={name}{choices}"
-
-
-def _unknown_key(error: OmegaConfBaseException) -> str:
-    key, parent = str(error.full_key or error.key), error.parent_node
-    names = parent if isinstance(parent, DictConfig) else []
-    known = [str(name) for name in names if name not in ("hydra", "defaults")]
-    node = key.rpartition(".")[0] or "the configuration"
-    add = (
-        f"; +{key}=VALUE adds it"
-        if parent is not None and OmegaConf.get_type(parent) is dict
-        else ""
-    )
-    return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{did_you_mean(str(error.key), known)}"
-
-
-def _first_paragraph(error: BaseException) -> str:
-    # Indented lines hold OmegaConf's internals.
-    lines = str(error).partition("\n\n")[0].splitlines()
-    kept = [
-        line.strip()
-        for line in lines
-        if line.strip() and not line.startswith((" ", "\t", "See http"))
-    ]
-    return " ".join(kept) or type(error).__name__

@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT))
 import torch  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
-from coil_rl.train import checkpoint  # noqa: E402
+from coil_rl.run import checkpoint  # noqa: E402
 
 SMALL = [
     "budget.frames=10240",

@@ -19,7 +19,7 @@ import yaml
 
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter, read_messages
 from coil_rl.envs.recordings.messages import SCAN, decode, definition, encode
-from coil_rl.train import checkpoint
+from coil_rl.run import checkpoint
 
 LARGE = [1000, 2**31, 2**63 - 1, 2**63, 10**30, 1e23, 1e300]
 NUMBERS = [-1, 0, 1, 2, 5, 1.5, -0.5, math.nan, math.inf, -math.inf, 1e-300, True]
@@ -65,7 +65,7 @@ CALLS: list[dict[str, Any]] = [
     {"_target_": "subprocess.Popen", "args": MARK.split()},
     {"_target_": "distutils.spawn.spawn", "cmd": MARK.split()},
     {"_target_": "torch.utils.collect_env.run", "command": MARK},
-    {"_target_": "coil_rl.train.run_folder._output", "command": MARK.split()},
+    {"_target_": "coil_rl.run.folder._output", "command": MARK.split()},
     {"_target_": "joblib.load", "filename": "bomb.pkl"},
     {"_target_": "torch.load", "f": "bomb.pkl", "weights_only": False},
     {"_target_": "numpy.load", "file": "bomb.pkl", "allow_pickle": True},

@@ -12,10 +12,10 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import ROOT
 
-import coil_rl.train.config  # noqa: F401 registers the configuration schema
+import coil_rl.config.schema  # noqa: F401 registers the configuration schema
 from coil_rl.report import write_csv
-from coil_rl.train import checkpoint
-from coil_rl.train.build import build_env, build_learner
+from coil_rl.run import checkpoint
+from coil_rl.config.build import build_env, build_learner
 
 Row = dict[str, Any]
 MEASURES = yaml.safe_load((ROOT / "conf" / "measures" / "driving.yaml").read_text())

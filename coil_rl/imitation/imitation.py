@@ -22,7 +22,7 @@ from coil_rl.imitation.regressors import Regressor
 from coil_rl.imitation.validation import cross_validate, scores
 from coil_rl.learners.encoders import ConcatObservations
 from coil_rl.learners.networks import FastTensorDictModule
-from coil_rl.train import checkpoint
+from coil_rl.run import checkpoint
 from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 
@@ -56,7 +56,7 @@ class Imitation:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
         >>> from coil_rl.imitation import SklearnRegressor
-        >>> from coil_rl.train.rollout import Rollout
+        >>> from coil_rl.run.rollout import Rollout
         >>> from coil_rl.transforms import GuideActions
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))

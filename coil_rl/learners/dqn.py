@@ -46,7 +46,7 @@ class DQN(OffPolicy):
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.train.rollout import Rollout
+        >>> from coil_rl.run.rollout import Rollout
         >>> from coil_rl.transforms import DiscreteActions
         >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_envs=64), DiscreteActions(5))
         >>> dqn = DQN(env, starts=256)

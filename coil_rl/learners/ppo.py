@@ -83,7 +83,7 @@ class PPO(Stateful):
 
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> from coil_rl.train.rollout import Rollout
+        >>> from coil_rl.run.rollout import Rollout
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=64)
         >>> ppo = PPO(env)
         >>> metrics = ppo.update(Rollout(env, ppo.policy, steps=32).collect())

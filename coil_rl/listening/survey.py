@@ -16,9 +16,9 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.listening.measures import ADVICE, InterceptedPolicy, agreement, gradient, intervention
-from coil_rl.train.evaluate_run import Evaluation
-from coil_rl.train.evaluation import EvaluationResult
-from coil_rl.train.measures import summarise
+from coil_rl.report.measures import summarise
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace
 
@@ -90,7 +90,7 @@ def survey(
     guides = next((list(source.names) for source in sources if source is not None), None)
     if guides is None:
         raise ValueError("nothing writes guide_action: put GuideActions into the env")
-    result = evaluation.drive(env, recorder, tick=tick)
+    result = evaluation.run(env, recorder, tick=tick)
     steps = torch.tensor([episode["steps"] for episode in result.episodes], device=env.device)
     running = torch.arange(len(history), device=env.device).unsqueeze(-1) < steps
     states: TensorDictBase = torch.stack(history)[running]
@@ -166,7 +166,7 @@ def drive_ablated(
         mask = replaced[torch.arange(rows, device=env.device), section].unsqueeze(-1)
         return state.set(ADVICE, torch.where(mask, replacement, state[ADVICE]))
 
-    episodes = evaluation.drive(env, InterceptedPolicy(policy, remove), tick=tick).episodes
+    episodes = evaluation.run(env, InterceptedPolicy(policy, remove), tick=tick).episodes
     return [episodes[start : start + share] for start in range(0, rows, share)]
 
 

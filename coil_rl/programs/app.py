@@ -4,7 +4,7 @@ A program imports torch, and whatever imports it, inside its functions. Help tex
 overrides then take a second:
 
     def train(config: DictConfig) -> float:
-        from coil_rl.train.run import run
+        from coil_rl.run.run import run
 
         return run(config)
 """
@@ -32,10 +32,11 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-import coil_rl.train  # noqa: F401  registers the root configurations
+import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
-from coil_rl.errors import UserError, is_no_bug, sentence
-from coil_rl.train.trust import trust_packages
+from coil_rl.config.sentences import is_no_bug, sentence
+from coil_rl.config.trust import trust_packages
+from coil_rl.errors import UserError
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
 HYDRA_FILES = (
@@ -80,6 +81,11 @@ def overrides() -> list[tuple[str, str]]:
     return [(text.lstrip("+~").partition("=")[0].rpartition("@")[2], text) for text in texts]
 
 
+def command_line() -> list[str]:
+    """Return the command that makes this run alone, also where it is a job of a sweep."""
+    return ["coil-train", *HydraConfig.get().overrides.task]
+
+
 def check_used(used: Iterable[str], reason: str) -> None:
     """Raise a `UserError` for an override that has no effect.
 
@@ -95,13 +101,14 @@ def check_used(used: Iterable[str], reason: str) -> None:
 
 
 def check_run(config: DictConfig) -> None:
-    """Check everything that a run needs, unless it is finished; see `coil_rl.train.check.check`."""
-    from coil_rl.train.run_folder import holds, is_evaluated
+    """Check everything that a run needs, unless it is finished; see `coil_rl.config.check.check`."""
+    from coil_rl.config.saved import holds
+    from coil_rl.run.folder import is_evaluated
 
     folder = Path(config.run_dir)
     if config.get("existing") == "resume" and is_evaluated(folder) and holds(folder, config):
         return
-    from coil_rl.train.check import check
+    from coil_rl.config.check import check
 
     check(config)
 

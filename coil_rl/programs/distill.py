@@ -10,16 +10,16 @@ from coil_rl.programs import app
 
 def distill(config: DictConfig) -> float:
     """Train the missing proxies of all guides, and return the lowest mean test reward of a proxy."""
+    from coil_rl.config import distillation
+    from coil_rl.config.build import build_guides
+    from coil_rl.config.start import run_configured
     from coil_rl.report.runs import read_runs
     from coil_rl.report.table import TABLES, markdown_table
-    from coil_rl.train import distillation
-    from coil_rl.train.build import build_guides
-    from coil_rl.train.run import run
 
     table = []
     for name in build_guides(config):
         proxy_config = distillation.proxy_config(config, name)
-        reward = run(proxy_config, wait=True)
+        reward = run_configured(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])
         learned = {
             name.removeprefix("learner/"): value for name, value in finished.curve[-1].items()
@@ -42,7 +42,8 @@ def distill(config: DictConfig) -> float:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration of the proxies, and make their folder."""
-    from coil_rl.train.check import check_proxies, check_values, make_folder
+    from coil_rl.config.check import check_proxies, make_folder
+    from coil_rl.config.values import check_values
 
     used = ("preset", "track", "env", "guide", "evaluation", "proxy")
     app.check_used(used, "a proxy is trained as the key proxy says")

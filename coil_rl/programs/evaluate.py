@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -23,64 +24,76 @@ OWN = (
 )  # keys of `evaluation` of the command, not of the run
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
-if TYPE_CHECKING:
-    from torch import nn
-
 
 def evaluate(config: DictConfig) -> float:
     """Evaluate the configured run or guides, and return the mean reward of the deterministic policy."""
     import torch
 
-    from coil_rl.train.evaluate_run import evaluate_run, report_outcome
-    from coil_rl.train.fallback import build_fallback
+    from coil_rl.config.build import assemble, env_maker, trial
+    from coil_rl.run.judge import judge, report_outcome
 
     torch.set_num_threads(config.threads)
-    folder, seed, agent, run = Path(config.run_dir), config.seed, None, config.run
-    if run is not None:
-        config, agent = restore(Path(run), config)
-    evaluate_run(config, agent, folder, seed, build_fallback(config, Path(run or ""), agent))
-    return report_outcome(folder)
+    results = Path(config.run_dir)
+    if config.run is None:
+        judge(trial(config, env_maker(config)), None, results, config.seed)
+        return report_outcome(results)
+    folder = Path(config.run).expanduser()
+    run = assemble(configured(folder, config), folder)
+    policy = run.policy()
+    fallback = run.make_fallback(policy) if run.fallback else None
+    judge(run.trial, policy, results, config.seed, fallback)
+    return report_outcome(results)
 
 
-def restore(run: Path, requested: DictConfig) -> tuple[DictConfig, nn.Module | None]:
-    """Return the configuration of a run with the requested evaluation, and its policy.
+def configured(folder: Path, requested: DictConfig) -> DictConfig:
+    """Return the configuration of a run with the requested evaluation.
 
-    Everything is as in the run but for what the command line gives. A folder without a complete
-    run, or one without tracks although tracks are given, is a `UserError`.
+    Everything is as in the run but for what the command line gives.
+
+    Args:
+        folder: of the run.
+        requested: configuration of the program.
+
+    Raises:
+        UserError: for a folder without a run, one without tracks although tracks are given, or an
+            env that does not write what is measured.
     """
-    from coil_rl.errors import UserError
-    from coil_rl.train.build import build_env
-    from coil_rl.train.check import check_measures, check_values
-    from coil_rl.train.load import load_policy
-    from coil_rl.train.run_folder import read_config
+    from coil_rl.config.build import env_maker
+    from coil_rl.config.check import check_measures
+    from coil_rl.config.saved import read_config
+    from coil_rl.config.values import check_values
 
-    config = read_config(run, "run", {"device": requested.device})
+    config = read_config(folder, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
     own: Any = OmegaConf.to_container(config.evaluation.advice, resolve=True)
     # The advice of the training is evaluated too.
     resolved["evaluation"]["advice"] = own | resolved["evaluation"]["advice"] | resolved["degrade"]
+    values = OmegaConf.create(resolved["evaluation"])
+    for key in _changed(config, resolved, folder):
+        value = OmegaConf.select(values, key)
+        OmegaConf.update(config.evaluation, key, value, merge=False, force_add=True)
+    if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
+        config.evaluation.env["cases"] = config.evaluation.cases
+    check_values(config)
+    if config.method.observes is not None:
+        check_measures(config, env_maker(config)())
+    return config
+
+
+def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> list[str]:
+    """Return the keys of `evaluation` that the command line changes; set the tracks that it gives."""
+    from coil_rl.errors import UserError
+
     changed = list(OWN)
     for key, text in app.overrides() if HydraConfig.initialized() else ():
         if key == "track":
             if not config.track:
-                raise UserError(f"{text} has no effect: run={run} has no tracks; leave it out")
+                raise UserError(f"{text} has no effect: run={folder} has no tracks; leave it out")
             config.track = resolved["track"]
             changed += OF_A_TRACK
         elif key.startswith("evaluation."):
             changed.append(key.removeprefix("evaluation."))
-    values = OmegaConf.create(resolved["evaluation"])
-    for key in changed:
-        OmegaConf.update(
-            config.evaluation, key, OmegaConf.select(values, key), merge=False, force_add=True
-        )
-    if "cases" in config.evaluation.env:  # an env whose cases are numbered seeds
-        config.evaluation.env["cases"] = config.evaluation.cases
-    check_values(config)
-    if config.method.observes is None:
-        return config, None
-    env = build_env(config)
-    check_measures(config, env)
-    return config, load_policy(run, config, env, config.evaluation.policy)
+    return changed
 
 
 def check(config: DictConfig) -> None:

@@ -1,6 +1,6 @@
 """`coil-info`: print the versions that a bug report needs."""
 
-from coil_rl.train.run_folder import versions
+from coil_rl.run.folder import versions
 
 
 def main() -> None:

@@ -16,20 +16,23 @@ def listen(config: DictConfig) -> None:
     import torch
     from tqdm import tqdm
 
+    from coil_rl.config.build import assemble, build_evaluation
+    from coil_rl.config.nodes import build
     from coil_rl.files import write_text
     from coil_rl.learners.anchor import AnchoredHead
     from coil_rl.listening import WholeEpisode
     from coil_rl.listening import survey as surveys
     from coil_rl.listening.measures import split_policy
-    from coil_rl.programs.evaluate import restore
+    from coil_rl.programs.evaluate import configured
     from coil_rl.report import markdown_table, write_csv
     from coil_rl.report.table import TABLES
-    from coil_rl.train.build import build, build_env
-    from coil_rl.train.evaluate_run import build_evaluation
+    from coil_rl.run.parts import TEST
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
-    run, agent = restore(Path(config.run), config)
+    run = configured(Path(config.run), config)
+    opened = assemble(run, Path(config.run))
+    agent = opened.policy()
     if agent is None:
         raise UserError(
             f"run={config.run} has no agent, only a guide; give a run of an agent that observes advice"
@@ -45,7 +48,7 @@ def listen(config: DictConfig) -> None:
     torch.manual_seed(config.seed)  # for guides with random actions
     with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
-        env = build_env(run, {**run.evaluation.env, "num_envs": rows})
+        env = opened.make_env(rows, TEST)
         data = surveys.survey(
             env,
             agent,
@@ -57,7 +60,7 @@ def listen(config: DictConfig) -> None:
         )
         removed = surveys.ablations(len(data.guides), len(sections.names))
         bar.set_postfix_str("one guide removed")
-        env = build_env(run, {**run.evaluation.env, "num_envs": rows * len(removed)})
+        env = opened.make_env(rows * len(removed), TEST)
         mean_advice = data.advice.mean(0)
         episodes = surveys.drive_ablated(
             env, agent, sections, evaluation, removed, mean_advice, tick=bar.update

@@ -29,12 +29,12 @@ def replay(config: DictConfig) -> None:
     import torch
     from tqdm import tqdm
 
+    from coil_rl.config.nodes import build
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
     from coil_rl.replay.open_loop import open_loop
     from coil_rl.replay.report import caution, describe, outcome
     from coil_rl.report.table import TABLES
-    from coil_rl.train.build import build
 
     torch.set_num_threads(config.threads)
     with warnings.catch_warnings():
@@ -74,11 +74,10 @@ def replay(config: DictConfig) -> None:
 
 def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Policies]:
     """Return the runs and all policies by name, guides first."""
+    from coil_rl.config.build import assemble, build_guides
+    from coil_rl.config.check import check_guide_in_env
+    from coil_rl.config.saved import read_config
     from coil_rl.replay.open_loop import RECORDED
-    from coil_rl.train.build import build_guides
-    from coil_rl.train.check import check_guide_in_env
-    from coil_rl.train.load import load_policy_in_env
-    from coil_rl.train.run_folder import read_config
 
     guides = build_guides(config) if config.guide else {}
     for name, guide in guides.items():
@@ -94,7 +93,7 @@ def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Polici
         )
     runs = dict(zip(run_names, zip(folders, configs, strict=True), strict=True))
     agents = {
-        name: load_policy_in_env(run, own, env, config.policy) for name, (run, own) in runs.items()
+        name: assemble(own, run).in_env(env, config.policy) for name, (run, own) in runs.items()
     }
     return runs, {
         name: (env, guide) for name, guide in zip(guide_names, guides.values(), strict=True)
@@ -107,7 +106,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     from coil_rl.replay.annotation import annotate, foxglove_layout
     from coil_rl.replay.report import draw_steering, over_time
     from coil_rl.report import write_csv
-    from coil_rl.train.load import weights_file
+    from coil_rl.run.folder import weights_file
 
     robot = config.env
     # The folder of the results is left out, so that it does not change the bytes.
@@ -175,7 +174,7 @@ def _check_unique(key: str, paths: Sequence[Path]) -> None:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    from coil_rl.train.check import check_values, make_folder
+    from coil_rl.config.check import check_values, make_folder
 
     check_values(config)
     if config.recording is None:

@@ -120,7 +120,7 @@ def check(config: DictConfig) -> None:
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
 
-    from coil_rl.train.check import check_values
+    from coil_rl.config.values import check_values
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -27,11 +27,11 @@ def reproduce(config: DictConfig) -> None:
     """Train the missing runs, make the requested results, print their pages and write them with RESULTS.md."""
     import torch
 
+    from coil_rl.config.nodes import build
     from coil_rl.files import write_text
     from coil_rl.reproduce import pages
     from coil_rl.reproduce.result import Result
-    from coil_rl.train.build import build
-    from coil_rl.train.run_folder import versions
+    from coil_rl.run.folder import versions
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
@@ -125,7 +125,7 @@ def command(config: DictConfig, key: str, name: str = "") -> str:
 
 def check(config: DictConfig) -> None:
     """Raise a `UserError` for the first mistake in the configuration."""
-    from coil_rl.train.check import check_values
+    from coil_rl.config.values import check_values
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:

@@ -19,8 +19,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 
-from coil_rl.errors import UserError, sentence
-from coil_rl.train.run_folder import is_evaluated
+from coil_rl.config.sentences import sentence
+from coil_rl.errors import UserError
+from coil_rl.run.folder import is_evaluated
 
 
 @dataclass(frozen=True)

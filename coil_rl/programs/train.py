@@ -1,52 +1,92 @@
 """`coil-train`: train a method, evaluate the policy beside its guides and draw the results."""
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
+from coil_rl.config.schema import TrainConfig
+from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
 from coil_rl.programs import app
-from coil_rl.train.config import TrainConfig
-from coil_rl.train.trust import trust_packages
+
+# What may be given beside resume=FOLDER.
+BESIDE_RESUME = ("trust=", "budget.frames=")
 
 
 def train(config: DictConfig) -> float:
     """Do one run and return the mean test reward of its deterministic policy."""
-    from coil_rl.train.run import run
+    from coil_rl.config.start import run_configured
 
     if config.resume is not None:
         raise UserError(
             f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
         )
-    return run(config)
+    return run_configured(config, command=app.command_line())
 
 
-def resume(folder: Path) -> float:
-    """Finish a run that was stopped, and return the same as `train`.
+def resume(folder: Path, frames: int | None = None) -> float:
+    """Finish a run that was stopped, or train it for longer, and return the same as `train`.
 
-    A folder without a run, or one that cannot be resumed or would write outside of its folder, is a
-    `UserError`.
+    Args:
+        folder: of the run.
+        frames: new length of the run.
+
+    Raises:
+        UserError: for a folder without a run, or one that cannot be resumed or would write outside
+            of its folder.
     """
-    from coil_rl.train.check import check
-    from coil_rl.train.run import resume_run
-    from coil_rl.train.run_folder import is_evaluated, locked, read_config
+    from coil_rl.config.build import assemble
+    from coil_rl.config.check import check
+    from coil_rl.config.saved import read_config
+    from coil_rl.run.folder import is_evaluated, locked
 
     config = read_config(folder, "resume")
     folder = folder.absolute()
-    if link := next((path for path in folder.rglob("*") if path.is_symlink()), None):
-        problem = "is a link, so that the run could write outside of its folder"
-        raise UserError(f"{link} {problem}; put the file in its place")
+    link = next((path for path in folder.rglob("*") if path.is_symlink()), None)
+    if link is not None:
+        raise UserError(
+            f"{link} is a link, so that the run could write outside of its folder; put the file in "
+            "its place"
+        )
     config.run_dir = str(folder)
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
     with locked(folder):
+        run = assemble(config, folder)
+        if is_evaluated(folder):
+            run.check_unchanged()
+        if frames is not None:
+            run.lengthen(frames)
         try:
             if not is_evaluated(folder):
                 check(config)
         except UserError as error:
             raise UserError(f"{folder / 'config.yaml'}: {error}") from error
-        return resume_run(config, folder)
+        return run.finish_begun()
+
+
+def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
+    """Resume a run as the arguments of the program say, without Hydra.
+
+    Hydra would compose another configuration and make another folder.
+
+    Args:
+        resumed: the argument `resume=FOLDER`.
+        others: the other arguments.
+    """
+    unknown = [argument for argument in others if not argument.startswith(BESIDE_RESUME)]
+    if unknown:
+        raise UserError(
+            f"{resumed} takes no argument but trust=[PACKAGE] and budget.frames=NUMBER: the run "
+            f"has its own config.yaml; leave out {' '.join(unknown)}"
+        )
+    given = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(list(others)))
+    trust_packages(given.trust)
+    lengthens = any(argument.startswith("budget.frames=") for argument in others)
+    folder = Path(resumed.removeprefix("resume=")).expanduser()
+    resume(folder, given.budget.frames if lengthens else None)
 
 
 def main() -> None:
@@ -56,20 +96,8 @@ def main() -> None:
     if resumed is None:
         app.run(train, "train")
         return
-    # Without Hydra, which would compose another configuration and make another folder.
     with app.program("train"):
-        trust = [argument for argument in arguments if argument.startswith("trust=")]
-        if others := " ".join(
-            argument for argument in arguments if argument not in (resumed, *trust)
-        ):
-            problem = (
-                f"{resumed} takes no argument but trust=[PACKAGE]: the run has its own config.yaml"
-            )
-            raise UserError(f"{problem}; leave out {others}")
-        trust_packages(
-            OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(trust)).trust
-        )
-        resume(Path(resumed.removeprefix("resume=")).expanduser())
+        resume_from_command_line(resumed, [each for each in arguments if each != resumed])
 
 
 if __name__ == "__main__":

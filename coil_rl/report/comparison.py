@@ -11,9 +11,9 @@ import numpy as np
 import pandas as pd
 
 from coil_rl.errors import UserError
+from coil_rl.report.measures import Measure
 from coil_rl.report.runs import DRIVER, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
-from coil_rl.train.measures import Measure
 
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 

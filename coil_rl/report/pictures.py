@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchrl.envs import EnvBase
 
     from coil_rl.envs.track import Track
-    from coil_rl.train.evaluation import EvaluationResult
+    from coil_rl.run.evaluation import EvaluationResult
 
 
 class Picture:

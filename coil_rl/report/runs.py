@@ -9,12 +9,10 @@ from typing import BinaryIO
 import numpy as np
 import pandas as pd
 import yaml
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.train.measures import Measure, measures_of
-from coil_rl.train.trust import read_yaml
+from coil_rl.plain_yaml import read_yaml
+from coil_rl.report.measures import Measure, measures_of
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "case")
@@ -96,15 +94,14 @@ def _read_run(folder: Path) -> Run:
     path = folder / "config.yaml"
     try:
         config = read_yaml(path)
-        if not isinstance(config, DictConfig):
+        if not isinstance(config, dict):
             raise ValueError("a list")
         run = Run(
             folder, str(config["label"]), int(config["seed"]), config["method"]["needs_guide"]
         )
-        nodes = OmegaConf.select(config, "evaluation.measures") or {}
-        measures = measures_of({name: node for name, node in nodes.items()})
-    except (OmegaConfBaseException, yaml.YAMLError, ValueError, TypeError, KeyError) as error:
-        problem = " ".join(str(error).split("\n    full_key")[0].split())
+        measures = measures_of((config.get("evaluation") or {}).get("measures") or {})
+    except (yaml.YAMLError, AttributeError, ValueError, TypeError, KeyError) as error:
+        problem = " ".join(str(error).split())
         remedy = "restore the file that coil-train wrote, or remove the run from the folder"
         raise UserError(
             f"{path} has no valid label, seed and method.needs_guide ({problem}); {remedy}"

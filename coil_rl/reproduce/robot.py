@@ -12,6 +12,8 @@ import numpy as np
 from omegaconf import OmegaConf
 from tqdm import tqdm
 
+from coil_rl.config.build import assemble, build_guides
+from coil_rl.config.saved import read_config
 from coil_rl.envs import SimulatedRobotEnv
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import Recording, read_recording
@@ -24,10 +26,8 @@ from coil_rl.report.statistics import count_of_seeds, estimate
 from coil_rl.reproduce import pages
 from coil_rl.reproduce.recorded_drives import Row, draw_drives, means, measure, record, smoothness
 from coil_rl.reproduce.result import NO_RUNS, PAGES, Result, Runs, runs_by_label
-from coil_rl.train.build import build_guides
-from coil_rl.train.evaluate_run import driver_names
-from coil_rl.train.load import load_policy_in_env, weights_file
-from coil_rl.train.run_folder import read_config
+from coil_rl.run.folder import weights_file
+from coil_rl.run.judge import guide_titles
 
 PAGE = PAGES["table_6"]
 PAPER_ROBOT = PAGE["paper"]
@@ -147,7 +147,7 @@ class Table6(Result):
         )
         configs = [read_config(run.folder, "run", {"device": "cpu"}) for run in runs]
         guides = build_guides(configs[0])
-        for display_name, (name, guide) in zip(driver_names(guides), guides.items(), strict=True):
+        for display_name, (name, guide) in zip(guide_titles(guides), guides.items(), strict=True):
             config = json.dumps(OmegaConf.to_container(configs[0].guide[name], resolve=True))
             about = {"policy": display_name, "guide": config}
             yield (
@@ -162,7 +162,7 @@ class Table6(Result):
             ).is_file():  # a missing file is reported when the policy is loaded
                 about["policy_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
             make = partial(
-                lambda folder, own: load_policy_in_env(folder, own, make_env()), run.folder, own
+                lambda folder, own: assemble(own, folder).in_env(make_env()), run.folder, own
             )
             yield run.folder.name, about, make
 

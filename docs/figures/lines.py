@@ -25,11 +25,11 @@ from coil_rl.envs.track import SIDES, Track
 from coil_rl.listening.sections import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import markdown_table, style
 from coil_rl.report.style import lighten, picture
-from coil_rl.train import load
-from coil_rl.train.build import build, build_env
-from coil_rl.train.evaluate_run import build_evaluation, drive_guides
-from coil_rl.train.evaluation import EvaluationResult
-from coil_rl.train.run_folder import read_config
+from coil_rl.config import load
+from coil_rl.config.build import build, build_env
+from coil_rl.run.judge import build_evaluation, drive_guides
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.folder import read_config
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track

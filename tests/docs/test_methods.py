@@ -9,7 +9,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from programs import ROOT
 
-import coil_rl.train.config  # noqa: F401  the types that the configurations begin with
+import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
 
 FOLDER = ROOT / "docs" / "methods"
 PAGES = sorted(FOLDER.glob("*.md"))

@@ -13,7 +13,7 @@ from torchrl.envs import TransformedEnv
 from coil_rl import GymnasiumEnv
 from coil_rl.guides import EntryGuide, classic
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
 

@@ -13,7 +13,7 @@ from worlds import continued
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import ControllerGuide, EntryGuide, PerRow, RecordedGuide
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 SOURCE = """

@@ -14,8 +14,8 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.errors import UserError
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.imitation import Imitation, NetworkRegressor, SklearnRegressor
-from coil_rl.train import checkpoint
-from coil_rl.train.rollout import Rollout
+from coil_rl.run import checkpoint
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 REGRESSORS = {

@@ -19,7 +19,7 @@ from sklearn.svm import SVR
 from coil_rl.errors import UserError
 from coil_rl.imitation import NetworkRegressor, SklearnRegressor
 from coil_rl.schedules import Linear
-from coil_rl.train import checkpoint
+from coil_rl.run import checkpoint
 
 
 def scaled_data():

@@ -6,7 +6,7 @@ import worlds
 
 from coil_rl.learners import PPO, Advisor, KickstartLoss
 from coil_rl.learners.ppo import standardise
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 
 def make(env=None, in_keys=("observation",), **options):

@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
 from coil_rl.learners.anchor import Look
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
 KEYS = ("observation", "guide_action")

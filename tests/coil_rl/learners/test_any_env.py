@@ -18,7 +18,7 @@ from torchrl.data import (
 from torchrl.envs.utils import ExplorationType, check_env_specs, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Reinforce
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 ACTIONS = {
     "bounded": Bounded(-1, 1, (2,)),

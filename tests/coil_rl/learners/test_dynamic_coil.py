@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.learners import AfterFrames, AtConvergence, DynamicCoil, PhaseSchedule, networks
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 AGENT = (True, ())
 

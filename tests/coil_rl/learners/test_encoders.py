@@ -8,7 +8,7 @@ from torchrl.data import Bounded, Categorical, Unbounded
 
 from coil_rl.learners import DQN, PPO, SAC
 from coil_rl.learners.encoders import Cnn, Mlp, ObservationNetwork
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 SMALL = {"channels": [4, 8], "kernels": [3, 3], "strides": [2, 1], "hidden": [16]}
 

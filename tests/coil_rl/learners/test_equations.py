@@ -7,7 +7,7 @@ import torch
 import worlds
 
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 GAMMA, LAMBDA = 0.9, 0.8
 

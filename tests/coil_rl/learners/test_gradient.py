@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModule
 
 from coil_rl.errors import UserError
 from coil_rl.learners import A2C, DQN, PPO, SAC, DynamicCoil, gradient
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions
 
 

@@ -16,7 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.errors import UserError
-from coil_rl.guides.learned import LearnedGuide
+from coil_rl.config.learned_guide import LearnedGuide
 from coil_rl.learners import (
     A2C,
     DQN,
@@ -35,11 +35,11 @@ from coil_rl.programs.evaluate import restore
 from coil_rl.programs.train import resume, train
 from coil_rl.schedules import Linear
 from coil_rl.testing import check_env
-from coil_rl.train.build import build_env, build_guided_env, build_guides
-from coil_rl.train.check import check
-from coil_rl.train.evaluation import evaluate_policy
-from coil_rl.train.policy_batch import PoliciesInTurn, policy_batch
-from coil_rl.train.rollout import Rollout
+from coil_rl.config.build import build_env, build_guided_env, build_guides
+from coil_rl.config.check import check
+from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.run.policy_batch import PoliciesInTurn, policy_batch
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import DiscreteActions, Takeover
 
 DELAY = 5

@@ -8,8 +8,8 @@ from torchrl.envs import PendulumEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import IBRL
-from coil_rl.train.policy_batch import policy_batch
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.policy_batch import policy_batch
+from coil_rl.run.rollout import Rollout
 
 RANDOM, DETERMINISTIC = ExplorationType.RANDOM, ExplorationType.DETERMINISTIC
 

@@ -9,7 +9,7 @@ from torchrl.data import MultiCategorical
 from coil_rl.learners import PPO, SAC, FilteredKickstartLoss, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
 from coil_rl.schedules import Linear
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 
 def make(env, in_keys=("observation",), steps=16):

@@ -13,8 +13,8 @@ from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, DynamicCoil, Reinforce
 from coil_rl.learners.encoders import Mlp, ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.learners.normaliser import LIMIT, Moments, Normaliser
-from coil_rl.train.policy_batch import policy_batch
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.policy_batch import policy_batch
+from coil_rl.run.rollout import Rollout
 
 KINDS = [PPO, A2C, Reinforce, TRPO, SAC, DQN]
 

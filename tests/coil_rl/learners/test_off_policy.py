@@ -12,7 +12,7 @@ from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import DQN, SAC
 from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import (
     DelayedAdvice,
     DiscreteActions,

@@ -17,7 +17,7 @@ from torchrl.envs import RewardSum, TransformedEnv
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.envs.gym import ConeTrackGym
 from coil_rl.learners import A2C, PPO, TRPO, Reinforce
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 CONFIG = OmegaConf.to_container(
     OmegaConf.load(Path(__file__).parents[3] / "conf/learner/ppo_sb3.yaml")

@@ -7,8 +7,8 @@ from torchrl.envs import GymEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import SAC
-from coil_rl.train.policy_batch import policy_batch
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.policy_batch import policy_batch
+from coil_rl.run.rollout import Rollout
 
 
 def make(**options):

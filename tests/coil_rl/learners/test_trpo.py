@@ -6,7 +6,7 @@ import worlds
 
 from coil_rl.learners import TRPO
 from coil_rl.learners.trpo import conjugate_gradients
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 
 def weights(learner):

@@ -11,7 +11,7 @@ from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide, SplineGuide
 from coil_rl.listening.sections import SECTIONS, TrackSections
 from coil_rl.listening.survey import Ablation, ablations, drive_ablated, survey, table_by_section
-from coil_rl.train.evaluate_run import Evaluation
+from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
 
 TRACKS = [oval_track("to the left"), oval_track("to the right", clockwise=True)]

@@ -6,9 +6,9 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from coil_rl.errors import UserError
-from coil_rl.train.build import build_env, build_learner
-from coil_rl.train.check import check
-from coil_rl.train.rollout import Rollout
+from coil_rl.config.build import build_env, build_learner
+from coil_rl.config.check import check
+from coil_rl.run.rollout import Rollout
 
 METHODS = sorted(
     file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")

@@ -16,12 +16,12 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 
-import coil_rl.train.run  # noqa: F401  before `started` replaces functions that it imports
+import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs import app, train
-from coil_rl.train import checkpoint, evaluate_run
-from coil_rl.train.build import build_env, build_learner
-from coil_rl.train.check import check
+from coil_rl.run import checkpoint, judge
+from coil_rl.config.build import build_env, build_learner
+from coil_rl.config.check import check
 
 TINY = [
     "budget.num_envs=8",

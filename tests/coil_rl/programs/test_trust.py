@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 from programs import TINY, called
 from run_folders import make_untrained_run
 
-from coil_rl.train import trust
+from coil_rl.config import trust
 
 COMMANDS = {
     "evaluate": ["run=run", "track=generated", "track.test.count=1"],

@@ -8,7 +8,7 @@ from ovals import ring_track
 from PIL import Image
 
 from coil_rl.report import DrivenLines, Film, Returns
-from coil_rl.train.evaluation import EvaluationResult
+from coil_rl.run.evaluation import EvaluationResult
 
 TRACKS = [ring_track("small", 5.0), ring_track("large", 8.0)]
 

@@ -22,8 +22,8 @@ from coil_rl.errors import UserError
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.report.runs import Run
 from coil_rl.reproduce.robot import Table6, robot_page
-from coil_rl.train import checkpoint
-from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.run import checkpoint
+from coil_rl.run.evaluation import evaluate_policy
 
 
 @pytest.fixture(scope="module")

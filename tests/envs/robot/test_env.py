@@ -8,7 +8,7 @@ from hydra import compose, initialize_config_module
 from ovals import ring_track
 from worlds import driving_measures
 
-import coil_rl.train.config  # noqa: F401  registers the typed roots
+import coil_rl.config.schema  # noqa: F401  registers the typed roots
 from coil_rl import testing
 from coil_rl.envs import (
     ConeTrackEnv,
@@ -21,8 +21,8 @@ from coil_rl.envs import (
 )
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.guides import ConstantGuide, SplineGuide
-from coil_rl.train.build import build_env
-from coil_rl.train.evaluation import evaluate_policy
+from coil_rl.config.build import build_env
+from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.transforms import GuideActions
 
 EXACT = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)

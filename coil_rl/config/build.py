@@ -1,0 +1,303 @@
+"""From a configuration to a run: its envs, guides, learner, evaluation and budget."""
+
+from collections.abc import Mapping
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import get_object
+from omegaconf import DictConfig, ListConfig, OmegaConf, open_dict
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, Transform
+
+from coil_rl.config.nodes import build, build_all, find_target
+from coil_rl.config.saved import identity, settings
+from coil_rl.errors import UserError
+from coil_rl.learners.learner import Learner
+from coil_rl.report import Returns
+from coil_rl.report.measures import measures_of
+from coil_rl.report.pictures import Picture
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
+from coil_rl.run.parts import TEST, TRAIN, EnvMaker
+from coil_rl.run.run import Budget, GuideReturns, Run
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import nested_key
+
+
+def assemble(config: DictConfig, folder: Path | None = None) -> Run:
+    """Return the run that a configuration describes; nothing is built or written yet.
+
+    Args:
+        config: of `coil-train`, composed or read from a folder.
+        folder: of the run, instead of `run_dir`.
+    """
+    # Here, because proxies are runs themselves.
+    from coil_rl.config.distillation import distil
+    from coil_rl.config.load import load_guides
+
+    folder = Path(config.run_dir) if folder is None else folder
+    make_env = env_maker(config)
+    trains = trains_guides(config)
+
+    def make_learner(env: EnvBase) -> Learner:
+        return build_learner(config, env, load_guides(folder, config) if trains else None)
+
+    def guide_returns(learner: Learner) -> list[GuideReturns]:
+        each_phase = config.evaluation.guides == "phases"
+        return [GuideReturns(make_env, learner.guides, each_phase=each_phase)] if trains else []
+
+    return Run(
+        folder,
+        make_env,
+        None if config.method.observes is None else make_learner,
+        partial(trial, config, make_env),
+        budget(config),
+        label=config.label,
+        seed=config.seed,
+        watch=OmegaConf.to_container(config.watch),  # type: ignore[arg-type]
+        failure=measures_of(config.evaluation.measures).get("crashed"),
+        noise_correlation=config.training.noise_correlation,
+        logger=partial(build, config.logger, "logger") if config.logger else None,
+        callbacks=guide_returns,
+        prepare=partial(distil, config, folder) if trains else lambda: None,
+        init=Path(config.init).expanduser() if config.init else None,
+        which=config.evaluation.policy,
+        fallback=config.evaluation.fallback,
+        compiled=config.compile,
+        device=config.device,
+        threads=config.threads,
+        settings=settings(config),
+        identity=identity(config),
+    )
+
+
+def budget(config: DictConfig) -> Budget:
+    """Return how much a run learns, and how often it looks at itself."""
+    curve = config.evaluation.curve
+    return Budget(
+        frames=config.budget.frames,
+        steps=config.budget.steps,
+        stages=list(config.budget.stages),
+        points=curve.points,
+        batches=curve.batches,
+        checkpoint_every=config.checkpoint_every,
+    )
+
+
+def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
+    """Return how the policy of a run is evaluated; no cases are a `UserError`."""
+    pictures = build_pictures(config)
+    has_agent = config.method.observes is not None
+    notes = [
+        f"guide.{name} sees: {what}; it may know more than the agent."
+        for name, what in what_guides_see(config).items()
+    ]
+    return Trial(
+        config.label,
+        build_evaluation(config, recorded(pictures)),
+        make_env,
+        pictures=pictures,
+        guides=guide_titles(config.guide),
+        guide_results=partial(guide_results, config),
+        together=has_agent and advises_only(config),
+        advice=list(config.evaluation.advice) if config.method.transforms else [],
+        repeats=config.evaluation.repeats,
+        compiled=config.compile,
+        device=config.device,
+        notes=notes,
+    )
+
+
+def build_evaluation(
+    config: DictConfig, record: Mapping[str, NestedKey] | None = None
+) -> Evaluation:
+    """Return the cases and measures of a configuration; no cases are a `UserError`.
+
+    `record` names entries of every step that are kept.
+    """
+    cases = config.evaluation.cases
+    names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases
+    if isinstance(names, int):
+        names = list(range(names))
+    if not isinstance(names, (list, tuple, ListConfig)) or not names:
+        raise UserError(f"evaluation.cases={cases} must be at least 1, or the names of the cases")
+    measures = measures_of(config.evaluation.measures)
+    return Evaluation(list(map(str, names)), measures, record or {})
+
+
+def build_pictures(config: DictConfig) -> list[Picture]:
+    """Return the pictures of a configuration; without any, the returns."""
+    nodes = config.evaluation.pictures.items()
+    pictures = [build(node, f"evaluation.pictures.{name}") for name, node in nodes if node]
+    return pictures or [Returns()]
+
+
+def recorded(pictures: list[Picture]) -> dict[str, NestedKey]:
+    """Return the entries that pictures need, by name."""
+    entries: dict[str, NestedKey] = {}
+    for picture in pictures:
+        entries |= picture.record
+    return entries
+
+
+def advises_only(config: DictConfig) -> bool:
+    """Return whether the env of the agent is that of its guides: a method adds only their advice."""
+    added = {get_object(node["_target_"]) for node in config.method.transforms.values()}
+    return added == {GuideActions} and not config.degrade and not config.action
+
+
+def guide_results(config: DictConfig, evaluation: Evaluation) -> Mapping[str, EvaluationResult]:
+    """Evaluate each guide of a configuration alone; the runs of a sweep share the results."""
+    nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+    if not nodes["guide"]:
+        return {}
+    node = env_node(config, config.evaluation.env)
+    return dict(_guide_results(OmegaConf.to_yaml({"env": node, **nodes}), evaluation))
+
+
+@lru_cache(maxsize=64)
+def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationResult]:
+    config: Any = OmegaConf.create(nodes)
+
+    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        return build_bare_env(config, {"num_envs": rows})
+
+    make_env = EnvMaker(bare, degrade=partial(build_all, config.degrade, "degrade"))
+    return evaluate_guides(make_env, evaluation, build_guides(config))
+
+
+def env_maker(config: DictConfig) -> EnvMaker:
+    """Return the maker of the envs of a configuration."""
+
+    def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        return build_bare_env(config, cases_node(config, rows, cases, count))
+
+    curve = config.evaluation.curve
+    return EnvMaker(
+        bare,
+        transforms=partial(build_transforms, config),
+        guides=lambda: build_guides(config) if config.guide else {},
+        degrade=partial(build_all, config.degrade, "degrade"),
+        sizes={str(cases): curve.num_envs for cases in curve.cases},
+    )
+
+
+def cases_node(
+    config: DictConfig, rows: int | None, cases: str, count: int | None
+) -> dict[str, Any]:
+    """Return the overrides of `env` for a set of cases.
+
+    Args:
+        config: with `env`, `training` and `evaluation`.
+        rows: number of rows; None for that of the training.
+        cases: name of the set: TRAIN, TEST, or one of `evaluation.curve.cases`.
+        count: number of different cases, instead of that of the set.
+    """
+    own = {} if rows is None else {"num_envs": rows}
+    if cases == TRAIN:
+        return {**config.training.env, **own}
+    if cases == TEST:
+        number = {} if count is None else {"cases": count}
+        return {**config.evaluation.env, **number, **own}
+    curve = config.evaluation.curve
+    number = {curve.count_key: count or curve.num_envs}
+    return {**curve.env, **number, **curve.cases[cases], **own}
+
+
+def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
+    """Return the env of a configuration without transforms."""
+    env: EnvBase = build(env_node(config, overrides), "env", EnvBase)
+    return env
+
+
+def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return the node `env` with overrides and all references resolved."""
+    overrides = overrides or {}
+    with open_dict(config):  # `build` checks the keys
+        node = OmegaConf.merge(config.env, dict(overrides))
+        for key, value in overrides.items():
+            # The arguments of another target replace those of the first one.
+            if isinstance(value, (Mapping, DictConfig)) and "_target_" in value:
+                OmegaConf.update(node, key, value, merge=False)
+    resolved: Any = OmegaConf.to_container(node, resolve=True)
+    return dict(resolved)
+
+
+def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:
+    """Return the transforms of method, `degrade` if the method has any, `advice`, `action` and network."""
+    transforms = build_all(config.method.transforms, "method.transforms")
+    if transforms:
+        transforms += build_all(config.degrade, "degrade")
+    if advice:
+        node = config.evaluation.advice[advice]
+        transforms.append(build(node, f"evaluation.advice.{advice}", Transform))
+    if config.action:
+        transforms.append(build(config.action, "action", Transform))
+    network = OmegaConf.select(config, "learner.network")
+    if network:  # one with a memory needs an env that carries it
+        transforms += getattr(build(network, "learner.network"), "env_transforms", list)()
+    return transforms
+
+
+def build_learner(
+    config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None
+) -> Learner:
+    """Return the learner of a configuration, which observes `observes` and `method.observes` of an env.
+
+    `guides` are for a learner that trains guides.
+    """
+    arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
+    keys = observed_keys(config)
+    learner: Learner = build(config.learner, "learner", Learner, env=env, in_keys=keys, **arguments)
+    return learner
+
+
+def observed_keys(config: DictConfig) -> list[NestedKey]:
+    """Return the keys of the entries that the agent of a configuration observes."""
+    return [nested_key(key) for key in (*config.observes, *(config.method.observes or ()))]
+
+
+def learner_kind(config: DictConfig) -> str:
+    """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`."""
+    target = find_target(config.learner.get("_target_"), "learner")
+    if isinstance(target, type) and issubclass(target, Learner):
+        return target.kind
+    return "agent"
+
+
+def trains_guides(config: DictConfig) -> bool:
+    """Return whether the learner of a configuration trains guides besides the agent."""
+    return config.method.observes is not None and learner_kind(config) == "guides"
+
+
+def what_guides_see(config: DictConfig) -> dict[str, str]:
+    """Return by name the attribute `sees` of the guides that may know more than an agent."""
+    seen = {}
+    for name, node in config.guide.items():
+        sees = getattr(find_target(node.get("_target_"), name), "sees", "")
+        if sees:
+            seen[str(name)] = sees
+    return seen
+
+
+def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """Return the guides of a configuration by name.
+
+    Errors are those of `build`, also for no guide, or one without a name.
+    """
+    if "_target_" in config.guide:
+        raise UserError(
+            "guide: a guide needs a name, because there may be several: begin its file with "
+            "# @package guide.NAME, or give +guide.NAME._target_"
+        )
+    if not config.guide:
+        raise UserError(
+            f"guide: there is none, but method={config.method.name} needs one; give guide=NAME, or "
+            "method=ppo"
+        )
+    guides = {}
+    for name, node in config.guide.items():
+        guides[str(name)] = build(node, f"guide.{name}", TensorDictModuleBase)
+    return guides

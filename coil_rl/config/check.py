@@ -1,0 +1,276 @@
+"""Check of a configuration before a run starts: ranges, and one small build of every part.
+
+A mistake is found in seconds. Nothing is written except the folder of the run, as the last step.
+"""
+
+import os
+from collections.abc import Callable, Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from tensordict import NestedKey
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase, TransformedEnv
+
+from coil_rl.config import build
+from coil_rl.config.distillation import (
+    guides_with_untrained_proxies,
+    guides_without_parameters,
+    proxy_config,
+)
+from coil_rl.config.nodes import build as build_node
+from coil_rl.config.nodes import build_all, check_node
+from coil_rl.config.schema import TrainConfig
+from coil_rl.config.values import check_values
+from coil_rl.errors import UserError, did_you_mean
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.learners.learner import Learner
+from coil_rl.report.measures import measures_of
+from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_actions import UnfitActionError
+
+# Kind of a learner: description and example.
+KINDS = {
+    "agent": ("learns from reward", "ppo"),
+    "imitation": ("imitates a guide", "forest"),
+    "guides": ("improves its guides", "dynamic_coil"),
+}
+EPISODE_REWARD = "episode_reward"  # written by a transform of every env
+WATCHED = ("episode", "step")  # groups of `watch`
+
+
+def check(config: DictConfig) -> None:
+    """Raise a `UserError` for the first mistake in the configuration of a program that acts or trains."""
+    check_parts(config)
+    make_folder(Path(config.run_dir))
+
+
+def check_parts(config: DictConfig) -> None:
+    """Do the checks of `check` without making the folder of the run."""
+    check_values(config)
+    trains = OmegaConf.get_type(config) is TrainConfig
+    has_agent = trains and config.method.observes is not None
+    if has_agent:
+        _check_kind(config)
+    make_env = build.env_maker(config)
+    cases = len(build.build_evaluation(config).cases)
+    recorded = build.recorded(build.build_pictures(config))
+    if trains or OmegaConf.select(config, "run") is None:
+        _check_env(config, make_env, cases, recorded.values())
+    build_all(config.evaluation.advice, "evaluation.advice")
+    if has_agent:
+        _check_label(config.label)
+        _check_training(config, make_env)
+        if config.method.transforms:
+            for advice in config.evaluation.advice:
+                _check_cases(cases, partial(make_env, cases, TEST, advice))
+
+
+def _check_kind(config: DictConfig) -> None:
+    """Raise a `UserError` if the learner is of another kind than the method needs."""
+    kind, needed = build.learner_kind(config), config.method.learner
+    if kind != needed:
+        purpose, example = KINDS[needed]
+        learner = config.learner["_target_"].rpartition(".")[2]
+        raise UserError(
+            f"method={config.method.name} needs a learner that {purpose}, such as "
+            f"learner={example}, but {learner} is one that {KINDS[kind][0]}"
+        )
+
+
+def _check_label(label: str) -> None:
+    if not label or label.split()[:1] == ["guide"] or "/" in label:
+        raise UserError(
+            f"label={label} cannot be used: it must not be empty, begin with guide or contain /"
+        )
+
+
+def _check_env(
+    config: DictConfig, make_env: EnvMaker, cases: int, recorded: Iterable[NestedKey]
+) -> None:
+    """Check the env, what is measured in it, and that its guides can act."""
+    if "num_envs" not in config.env:
+        raise UserError(
+            f"env: {config.env.get('_target_', 'it')} has no key num_envs, so no policy can act in "
+            "it; choose another env (for the actions of policies on a recording: "
+            "coil-replay recording=FILE)"
+        )
+    check_node(config.env, "env")
+    env = make_env.bare(1, TEST, None)
+    check_measures(config, env)
+    for key in recorded:
+        _check_entry(env, key, "evaluation.pictures")
+    advises = config.method.needs_guide or "advice" in config.method.transforms
+    if not config.guide and not advises:
+        return
+    guides = build.build_guides(config)
+    for name, guide in guides.items():
+        check_guide_in_env(guide, env, f"guide.{name}")
+    build_all(config.degrade, "degrade")
+    if config.degrade:
+        _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
+
+
+def check_measures(config: DictConfig, env: EnvBase) -> None:
+    """Raise a `UserError` if an env does not write an entry that is measured."""
+    for name, measure in measures_of(config.evaluation.measures).items():
+        for key in (measure.entry, measure.where):
+            if key is not None:
+                _check_entry(env, key, f"evaluation.measures.{name}")
+
+
+def _check_entry(env: EnvBase, key: NestedKey, name: str) -> None:
+    """Raise a `UserError` if an env does not write an entry; `name` is the key that names it."""
+    known = {EPISODE_REWARD}
+    for spec in (env.observation_spec, env.full_reward_spec, env.full_done_spec):
+        known |= {_dotted(each) for each in spec.keys(True)}
+    given = _dotted(key)
+    if given not in known:
+        raise UserError(
+            f"{name}={given} is no entry of the env; it has {', '.join(sorted(known))}"
+            f"{did_you_mean(given, known)}"
+        )
+
+
+def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> None:
+    """Check that a guide can act in an env.
+
+    Args:
+        guide: the guide.
+        env: of any number of rows; it is stepped once.
+        name: key of the guide, for the message.
+
+    Raises:
+        UserError: if the env lacks an entry that the guide reads, or its action does not fit.
+    """
+    try:
+        transform = GuideActions({"guide": guide})
+        memory = (key for each in transform.guides.memories.values() for key in each.specs)
+        known = [*env.observation_spec.keys(True), *transform.supplied, *memory]
+        for key in guide.in_keys:
+            if key not in known:
+                has = ", ".join(map(_dotted, env.observation_spec.keys()))
+                raise UserError(f"{name}: it reads {_dotted(key)}, but the env has only {has}")
+        advised = TransformedEnv(env, transform)
+        advised.step(FollowAdvice(advised)(advised.reset()))
+        advised.state_dict()  # a state that no checkpoint can hold is refused before the training
+    except UnfitActionError as error:
+        raise UserError(f"{name}: its action {error.problem}") from error
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
+    except RuntimeError as error:
+        first = str(error).partition("\n")[0]
+        raise UserError(
+            f"{name}: it cannot act on the observations of this env ({first})"
+        ) from error
+
+
+def _check_cases(cases: int, make: Callable[[], Any]) -> None:
+    """Make the env of an evaluation: some ways to degrade advice need several rows."""
+    try:
+        make()
+    except UserError as error:
+        raise UserError(
+            f"each case of the evaluation has one row, {cases} in all: {error}"
+        ) from error
+
+
+def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
+    if not build.observed_keys(config):
+        raise UserError(
+            "observes=[]: the agent has no observations; give the entries of the env that it "
+            "observes"
+        )
+    env = make_env()
+    trains = build.trains_guides(config)
+    if trains and config.degrade:
+        raise UserError(
+            f"degrade={list(config.degrade)} has no effect on guides that are trained; leave it out"
+        )
+    guides = build.build_guides(config) if trains else {}
+    check_proxies(config, guides_without_parameters(guides))
+    untrained = guides_with_untrained_proxies(config) if guides else None
+    learner = build.build_learner(config, env, untrained)
+    _check_batch(config, learner)
+    _check_validation(config, learner)
+    _check_curve(config, make_env)
+    if config.logger:
+        check_node(config.logger, "logger")
+    _check_watch(config, env)
+
+
+def _check_batch(config: DictConfig, learner: Learner) -> None:
+    frames = config.budget.num_envs * config.budget.steps
+    try:
+        learner.check_batch(frames)
+    except ValueError as error:
+        raise UserError(
+            f"learner.{error}; a batch has budget.num_envs x budget.steps = {frames} frames"
+        ) from error
+
+
+def _check_validation(config: DictConfig, learner: Learner) -> None:
+    """Raise a `UserError` if tracks are to be left out to validate, and there is only one."""
+    if not config.track or not learner.validates_groups:
+        return
+    if len(build_node(config.track.train, "track.train")) == 1:
+        raise UserError(
+            "track.train gives one track, which cannot be left out to validate; set "
+            "learner.group_key=null, or learner.validate=false"
+        )
+
+
+def _check_curve(config: DictConfig, make_env: EnvMaker) -> None:
+    cases = list(config.evaluation.curve.cases)
+    if not cases:
+        return
+    if set(cases) != {EVALUATION, SELECTION}:
+        raise UserError(
+            f"evaluation.curve.cases has {', '.join(cases)}; give {EVALUATION} and {SELECTION}, or "
+            "none"
+        )
+    for name in cases:
+        make_env(make_env.sizes[name], name)
+
+
+def _check_watch(config: DictConfig, env: EnvBase) -> None:
+    for group, keys in config.watch.items():
+        if group not in WATCHED:
+            raise UserError(
+                f"there is no key watch.{group}; watch has episode, step"
+                f"{did_you_mean(group, WATCHED)}"
+            )
+        for name, key in keys.items():
+            if not isinstance(key, ListConfig):
+                raise UserError(f"watch.{group}.{name}={key} must be a list, such as [info, lap]")
+            _check_entry(env, key, f"watch.{group}.{name}")
+
+
+def check_proxies(config: DictConfig, guides: Iterable[str]) -> None:
+    """Raise a `UserError` for the first mistake in the training of the proxies of guides."""
+    for name in guides:
+        try:
+            check_parts(proxy_config(config, name))
+        except UserError as error:
+            raise UserError(f"proxy of guide.{name}: {error}") from error
+
+
+def _dotted(key: str | Iterable[Any]) -> str:
+    return key if isinstance(key, str) else ".".join(map(str, key))
+
+
+def make_folder(folder: Path) -> None:
+    """Make the folder of a run, or raise a `UserError` if nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            raise PermissionError(None, "Permission denied")
+    except OSError as error:
+        raise UserError(
+            f"the run's folder {folder} cannot be used ({error.strerror}); choose another with "
+            "hydra.run.dir=FOLDER"
+        ) from error

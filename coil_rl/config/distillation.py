@@ -1,0 +1,94 @@
+"""Proxies: networks that imitate guides without parameters, for methods that train their guides.
+
+A proxy is the policy of an imitation run. The configuration of that run follows from the guide, the
+env and the key `proxy`; its hash is part of the folder name, so that a proxy is trained once. A run
+copies its proxies into its own folder.
+"""
+
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from coil_rl.config import load
+from coil_rl.config.build import build_guides, build_learner, env_maker
+from coil_rl.config.schema import TrainConfig, fingerprint
+from coil_rl.config.start import run_configured
+from coil_rl.errors import UserError
+from coil_rl.files import temporary, whole_file
+
+FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
+
+
+def guides_without_parameters(guides: Mapping[str, nn.Module]) -> list[str]:
+    """Return the names of the guides without parameters."""
+    return [name for name, guide in guides.items() if not any(True for _ in guide.parameters())]
+
+
+def proxy_config(config: DictConfig, name: str) -> DictConfig:
+    """Return the configuration of the run that trains the proxy of one guide of a training run.
+
+    The key `proxy` of the training run must describe a network.
+    """
+    if config.proxy is None or config.proxy.method.observes is None:
+        raise UserError("proxy.method.observes: a proxy needs observations; give proxy=network")
+    resolved: Any = OmegaConf.to_container(config, resolve=True)
+    guide, proxy = {name: resolved["guide"][name]}, resolved["proxy"]
+    values = {
+        **{key: resolved[key] for key in ("preset", "track", "observes", "device", "threads")},
+        **{key: proxy[key] for key in ("method", "learner", "budget", "seed")},
+        "env": resolved["env"] | resolved["training"]["imitation_env"] | proxy["env"],
+        "guide": guide,
+        "label": f"proxy of {name}",
+        "evaluation": {key: resolved["evaluation"][key] for key in ("cases", "measures", "env")}
+        | {"gif": False},
+        "existing": "resume",
+    }
+    merged: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), values)
+    OmegaConf.update(merged, "method.transforms.advice.guides", guide, merge=False, force_add=True)
+    merged.run_dir = f"{proxy['folder']}/{name}_{fingerprint(merged)}"
+    return merged
+
+
+def distil(config: DictConfig, folder: Path) -> None:
+    """Put a proxy of each guide without parameters into the folder of a run, unless it is there."""
+    if (folder / load.PROXIES).is_dir():
+        return
+    proxies = {}
+    for name in guides_without_parameters(build_guides(config)):
+        proxy = proxy_config(config, name)
+        run_configured(proxy, wait=True)
+        proxies[name] = Path(proxy.run_dir)
+    copy_proxies(proxies, folder)
+
+
+def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
+    """Copy proxies into the folder of the run that uses them, all at once.
+
+    `runs` are their run folders by the name of the guide. A file in their place is a `UserError`.
+    """
+    proxies = folder / load.PROXIES
+    if proxies.is_file():
+        raise UserError(f"{proxies} is a file, but a folder is to be made there; remove it")
+    unfinished = temporary(proxies)
+    try:
+        for name, run in runs.items():
+            for file in FILES:
+                with whole_file(unfinished / name / file) as copy:
+                    shutil.copyfile(run / file, copy)
+        unfinished.rename(proxies)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictModuleBase]:
+    """Return the guides of a configuration, with an untrained proxy for each guide without parameters."""
+    guides = build_guides(config)
+    for name in guides_without_parameters(guides):
+        proxy = proxy_config(config, name)
+        guides[name] = build_learner(proxy, env_maker(proxy)()).policy
+    return guides

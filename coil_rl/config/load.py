@@ -1,0 +1,73 @@
+"""Finished runs, opened from their folders."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from tensordict.nn import TensorDictModuleBase
+
+from coil_rl.config.build import assemble, build_guides, trains_guides
+from coil_rl.config.given import give
+from coil_rl.config.saved import read_config
+from coil_rl.config.trust import trust_packages
+from coil_rl.errors import UserError
+from coil_rl.run.run import Run
+
+PROXIES = "proxies"  # subfolder with the networks that replace guides without parameters
+
+
+def open_run(
+    folder: str | Path,
+    *,
+    guide: Any = None,
+    env: Any = None,
+    trust: Sequence[str] = (),
+    device: str = "cpu",
+) -> Run:
+    """Return the run in a folder, finished or not.
+
+    Args:
+        folder: that `coil-train` or `coil_rl.train` has written; it may come from anybody.
+        guide: the object that was the guide, for a run that was made in Python with one that no
+            import path names.
+        env: the same for its env.
+        trust: packages whose parts the folder may use, see docs/trust.md.
+        device: of everything, "cpu" or "cuda".
+
+    Raises:
+        UserError: for a folder without a run, or one whose configuration cannot be read or could
+            run code.
+
+    Example:
+        >>> import coil_rl
+        >>> controller = coil_rl.open_run("outputs/tank").controller()  # doctest: +SKIP
+    """
+    folder = Path(folder).expanduser()
+    if trust:
+        trust_packages(trust)
+    config = read_config(folder, "folder", {"device": device})
+    give(config, {"guide": guide, "env": env})
+    return assemble(config, folder)
+
+
+def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModuleBase]:
+    """Return the first guides of a run that trains its guides: the proxy of a guide if there is one.
+
+    Args:
+        folder: of the run.
+        config: of the run.
+    """
+    guides = build_guides(config)
+    for name in guides:
+        proxy = folder / PROXIES / name
+        if not proxy.exists():
+            continue
+        key = f"the proxy of guide.{name}"
+        proxy_config = read_config(proxy, key, {"device": config.device})
+        if trains_guides(proxy_config):
+            raise UserError(
+                f"{proxy} trains guides itself, but a proxy imitates one; train the run again"
+            )
+        guides[name] = assemble(proxy_config, proxy).policy(which="last")
+    return guides

@@ -1,0 +1,95 @@
+"""Instantiation of nodes with a `_target_`, after a check of their arguments; the only caller of `instantiate`."""
+
+import textwrap
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+import hydra.utils
+from omegaconf import DictConfig, ListConfig, OmegaConf
+from torchrl.envs import Transform
+
+from coil_rl.config.arguments import check_arguments, yaml_text
+from coil_rl.errors import UserError
+
+
+def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
+    """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
+
+    A target that does not exist, refuses an argument, or returns another type is a `UserError`.
+
+    Args:
+        node: with a `_target_`.
+        name: key of the node, for the message.
+        expected: type of the result.
+        arguments: added by the program.
+    """
+    node = check_node(node, name, arguments)
+    try:
+        built = hydra.utils.instantiate(node, **arguments, _convert_="all")
+    except hydra.errors.InstantiationException as error:
+        cause = error.__cause__
+        if isinstance(cause, (UserError, ValueError, KeyError, TypeError, AttributeError, OSError)):
+            message = cause.args[0] if isinstance(cause, KeyError) and cause.args else cause
+            raise UserError(
+                f"{name}: {textwrap.shorten(str(message), 500, placeholder=' ...')}"
+            ) from error
+        if isinstance(cause, ImportError):
+            raise UserError(
+                f"{name}: {node['_target_']} needs a package ({cause}); install it"
+            ) from error
+        if cause is None:  # Hydra itself refuses to call the target
+            raise UserError(f"{name}: {error}") from error
+        if isinstance(cause, MemoryError) or "allocate" in str(cause):
+            raise UserError(f"{name}: there is not enough memory; make it smaller") from error
+        raise
+    if expected is not None and not isinstance(built, expected):
+        raise UserError(
+            f"{name}: {node['_target_']} makes {type(built).__name__}, not {expected.__name__}"
+        )
+    return built
+
+
+def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
+    """Return a node with its references resolved after the checks of `build`, without building anything.
+
+    `program` has the names of the arguments that the program adds.
+    """
+    if isinstance(node, (DictConfig, ListConfig)):
+        node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
+    if not isinstance(node, Mapping) or "_target_" not in node:
+        raise UserError(
+            f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or function"
+        )
+    _check(node, name, program)
+    return dict(node)
+
+
+def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
+    if isinstance(node, Mapping):
+        for key, value in node.items():
+            _check(value, f"{name}.{key}")
+        if "_target_" in node:
+            check_arguments(find_target(node["_target_"], name), node, name, program)
+    elif isinstance(node, list):
+        for index, value in enumerate(node):
+            _check(value, f"{name}[{index}]")
+
+
+def find_target(path: Any, name: str) -> Callable[..., Any]:
+    """Return the class or function of a full name; `name` is the key that names it, for the message."""
+    try:
+        target: Callable[..., Any] = hydra.utils.get_object(path)
+    except Exception as error:
+        raise UserError(
+            f"{name}: there is no {path!r}; check the spelling, and that its package is installed"
+        ) from error
+    if not callable(target):
+        raise UserError(
+            f"{name}: {path} is {target!r}, which cannot be called; give a class or a function"
+        )
+    return target
+
+
+def build_all(nodes: Mapping[str, Any], name: str) -> list[Transform]:
+    """Return transforms in the order of the configuration."""
+    return [build(node, f"{name}.{key}", Transform) for key, node in nodes.items()]

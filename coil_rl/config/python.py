@@ -1,0 +1,172 @@
+"""Runs from Python: the words of the command line as arguments, with objects where a name is not enough."""
+
+import os
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+from hydra import compose, initialize_config_module
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+from torchrl.envs import EnvBase
+
+from coil_rl.config.build import assemble
+from coil_rl.config.check import check
+from coil_rl.config.given import import_path, keep
+from coil_rl.config.sentences import sentence
+from coil_rl.config.trust import trust_own
+from coil_rl.errors import UserError
+from coil_rl.run.controller import Controller
+from coil_rl.run.run import Run
+
+
+def train(
+    env: Any,
+    *,
+    guide: Any = None,
+    method: str | None = None,
+    frames: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    overrides: Sequence[str] = (),
+) -> Run:
+    """Train a policy, evaluate it beside its guide, and return the run.
+
+    Args:
+        env: the id of a Gymnasium env, such as "CartPole-v1" or "PACKAGE:ID"; the name of a file in
+            conf/env, such as "cone_track"; a class or function that makes a Gymnasium env, or a
+            TorchRL env without batch; or a `Run`, which is trained as it is.
+        guide: a class, an object with `act(observation)`, a function, a network; the import path
+            "PACKAGE.MODULE:NAME" of one; the name of a file in conf/guide, such as "spline"; a
+            `Controller` of another run; or None.
+        method: name of a file in conf/method; by default "coil" with a guide, "ppo" without one.
+        frames: length of the run; by default that of the env's file.
+        seed: of everything.
+        folder: for everything that the run writes; by default a new one in outputs/train.
+        overrides: further words of the command line, such as "learner.gamma=0.98".
+
+    Raises:
+        UserError: for a mistake in an argument, with one sentence that says what to do.
+
+    Example:
+        >>> import coil_rl
+        >>> run = coil_rl.train("CartPole-v1", frames=50_000)  # doctest: +SKIP
+        >>> table = run.evaluate(cases=50)  # doctest: +SKIP
+    """
+    if isinstance(env, Run):
+        return env.train(frames)
+    folder = Path(folder).expanduser() if folder is not None else _new_folder()
+    run = prepare(
+        env,
+        guide=guide,
+        method=method,
+        frames=frames,
+        seed=seed,
+        folder=folder,
+        overrides=overrides,
+    )
+    return run.train()
+
+
+def prepare(
+    env: Any,
+    *,
+    guide: Any = None,
+    method: str | None = None,
+    frames: int | None = None,
+    seed: int = 0,
+    folder: str | Path,
+    overrides: Sequence[str] = (),
+) -> Run:
+    """Return a run that is checked and ready to train; arguments and errors as for `train`."""
+    env_words, env_nodes = _env(env, f"{folder}#env")
+    guide_words, guide_nodes = _guide(guide, f"{folder}#guide")
+    words = [*env_words, *guide_words]
+    words.append(f"method={method or ('ppo' if guide is None else 'coil')}")
+    if frames is not None:
+        words.append(f"budget.frames={frames}")
+    words += [f"seed={seed}", *overrides]
+    config = _composed([*words, f"run_dir={_quoted(str(folder))}"])
+    with open_dict(config):
+        for place, node in (env_nodes | guide_nodes).items():
+            OmegaConf.update(config, place, node, merge=False, force_add=True)
+    trust_own(config)
+    check(config)
+    run = assemble(config)
+    run.command = ["coil-train", *words]
+    return run
+
+
+def _new_folder() -> Path:
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
+    return Path("outputs", "train", f"{now}_{os.getpid()}")
+
+
+def _composed(words: Sequence[str]) -> DictConfig:
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            return compose("train", list(words))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
+
+
+def _shipped(group: str) -> set[str]:
+    """Return the names of the files in a group of the shipped configuration."""
+    folder = resources.files("coil_rl.conf") / group
+    return {file.name.removesuffix(".yaml") for file in folder.iterdir()}
+
+
+def _quoted(text: str) -> str:
+    """Return a text as a value on the command line."""
+    return "'" + text.replace("'", "\\'") + "'"
+
+
+Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key
+
+
+def _env(env: Any, name: str) -> Words:
+    """Return what chooses an env; an object is kept under a name."""
+    if isinstance(env, str):
+        return ([f"env={env}"] if env in _shipped("env") else _gym_words(env)), {}
+    if not callable(env):
+        raise UserError(
+            f"env is {type(env).__name__}; give the id of a Gymnasium env, the name of a file in "
+            "conf/env, or a class or function that makes an env"
+        )
+    path = import_path(env)
+    made = env()
+    made.close()
+    if isinstance(made, gymnasium.Env):
+        if path is not None:
+            return _gym_words(path), {}
+        return _gym_words("given"), {"env.id": keep(name, env)}
+    if isinstance(made, EnvBase) and not made.batch_size:
+        words = ["env=torchrl", f"env.of._target_={(path or 'given').replace(':', '.')}"]
+        return words, {} if path is not None else {"env.of": keep(name, env)}
+    raise UserError(
+        f"env makes {type(made).__name__}; give a maker of a Gymnasium env, or of a TorchRL env "
+        "without batch (a batched one of your own needs a file, see docs/your_env.md)"
+    )
+
+
+def _gym_words(env: str) -> list[str]:
+    return ["env=gym", f"env.id={_quoted(env)}"]
+
+
+def _guide(guide: Any, name: str) -> Words:
+    """Return what chooses a guide; an object is kept under a name."""
+    if guide is None:
+        return [], {}
+    if isinstance(guide, str) and ":" not in guide:
+        return [f"guide={guide}"], {}
+    if isinstance(guide, Controller):
+        if guide.folder is None:
+            raise UserError("guide: this controller has no run; give one of coil_rl.open_run")
+        return ["guide=learned", f"guide.learned.run={_quoted(str(guide.folder))}"], {}
+    path = guide if isinstance(guide, str) else import_path(guide)
+    words = ["guide=controller", f"guide.controller.of={_quoted(path or 'given')}"]
+    return words, {} if path is not None else {"guide.controller.of": keep(name, guide)}

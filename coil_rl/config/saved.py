@@ -1,0 +1,106 @@
+"""The configuration in the folder of a run: written, read without running code, and compared."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
+from coil_rl.config.sentences import sentence
+from coil_rl.config.trust import check_config
+from coil_rl.errors import UserError
+from coil_rl.plain_yaml import read_yaml
+from coil_rl.run.folder import CONFIG, check_same, is_begun
+
+# Parts that moved, by the names that older folders have for them.
+OLD_NAMES = {"coil_rl.guides.learned.LearnedGuide": "coil_rl.LearnedGuide"}
+
+
+def settings(config: DictConfig) -> dict[str, Any]:
+    """Return what is saved of a configuration: plain values, without references."""
+    saved: Any = OmegaConf.to_container(config, resolve=True)
+    saved.pop("trust", None)  # it holds for one command
+    # Loggers write into `run_dir`, which may be another folder when the run is resumed.
+    saved["logger"] = OmegaConf.to_container(config.logger) if config.logger else None
+    return dict(saved)
+
+
+def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
+    """Return the configuration of the run in a folder.
+
+    The folder may come from anybody; `trust_packages` names packages that it may use.
+
+    Args:
+        folder: of the run.
+        key: of the calling program that names the folder, for the message.
+        changes: new values of top-level keys.
+
+    Raises:
+        UserError: for a configuration that cannot be read, could run code, or is of a run that was
+            made from parts.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
+    try:
+        values = read_yaml(path)
+        if not isinstance(values, dict):
+            raise UserError(f"{path} is not the configuration of a run, but a list")
+        if values.get("made_from_parts"):
+            raise UserError(
+                f"{key}={folder} was made in Python from parts, which no file names; "
+                "make the same coil_rl.Run there, and call its methods"
+            )
+        saved = OmegaConf.create(_renamed(values))
+        check_config(saved, path)
+        for name, value in (changes or {}).items():
+            saved[name] = value
+        config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
+        OmegaConf.to_container(config, throw_on_missing=True)
+    except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
+        raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error
+    return config
+
+
+def _renamed(node: Any) -> Any:
+    """Return nested values with today's names of parts that moved."""
+    if isinstance(node, Mapping):
+        return {key: _renamed(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_renamed(value) for value in node]
+    return OLD_NAMES.get(node, node) if isinstance(node, str) else node
+
+
+def holds(folder: Path, config: DictConfig) -> bool:
+    """Return whether a folder holds a run; a `UserError` if that has another configuration."""
+    if not is_begun(folder):
+        return False
+    saved = read_config(folder, "run_dir")
+    remedy = "choose another folder, or remove that one"
+    check_same(identity(saved), identity(config), f"{folder} holds a run", remedy)
+    return True
+
+
+def identity(config: DictConfig) -> dict[str, Any]:
+    """Return the values on which the numbers of a run depend, by their full keys."""
+    values: Any = OmegaConf.to_container(config, resolve=True)
+    flat = _flat(values)
+    ignored = set(IGNORED_KEYS)
+    return {
+        key: value
+        for key, value in flat.items()
+        if key not in ignored and key.split(".")[0] not in ignored
+    }
+
+
+def _flat(node: Any, name: str = "") -> dict[str, Any]:
+    """Return the values of nested mappings by their full keys."""
+    if not isinstance(node, Mapping) or not node:
+        return {name: node}
+    result: dict[str, Any] = {}
+    for key, value in node.items():
+        result |= _flat(value, f"{name}.{key}" if name else str(key))
+    return result

@@ -1,0 +1,316 @@
+"""Typed root configurations of the programs, and the fingerprint of a run.
+
+The types of the fields are checked by OmegaConf, their ranges by pydantic
+(`coil_rl.config.check.check_values`).
+"""
+
+import hashlib
+import json
+import os
+import re
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+from hydra.core.config_store import ConfigStore
+from omegaconf import MISSING, DictConfig, OmegaConf
+from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema
+from pydantic_core import PydanticCustomError, core_schema
+
+from coil_rl.report.measures import REDUCTIONS
+
+LARGEST = 2**63 - 1
+# Keys in which two runs with the same numbers may differ.
+IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust", "proxy.folder")
+
+
+def one_of(*choices: str) -> GetPydanticSchema:
+    """Return the schema of a string with a few possible values; OmegaConf supports no `Literal`."""
+    return GetPydanticSchema(lambda *_: core_schema.literal_schema(list(choices)))
+
+
+def format_of_numbers(spec: str) -> str:
+    """Return a format for numbers, as Python's `format` takes it, with a width of at most two digits."""
+    if not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
+        raise PydanticCustomError("format", "a format of numbers, such as .1f")
+    return spec
+
+
+# Most upper limits only prevent that a typing error fills the memory.
+Seed = Annotated[int, Field(ge=0, le=LARGEST)]
+Positive = Annotated[int, Field(ge=1, le=LARGEST)]
+Threads = Annotated[int, Field(ge=1, le=1024)]
+Envs = Annotated[int, Field(ge=1, le=2**20)]
+Steps = Annotated[int, Field(ge=1, le=2**16)]
+Repeats = Annotated[int, Field(ge=1, le=10_000)]
+WhichPolicy = Annotated[str, one_of("last", "best")]
+
+
+class NodeConfig:
+    """Base of all typed nodes."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
+
+@dataclass
+class BudgetConfig(NodeConfig):
+    """Amount of experience: frames in total, envs in parallel, steps of each per batch, and minibatches per pass.
+
+    `stages` are earlier lengths, in frames, of a run that was made longer.
+    """
+
+    frames: Positive = 1
+    num_envs: Envs = MISSING
+    steps: Steps = 1
+    minibatches: Positive = 16
+    stages: list[int] = field(default_factory=list)
+
+
+@dataclass
+class CurveConfig(NodeConfig):
+    """Evaluation of the policies that a run keeps, see `coil_rl.run.curve`; `env` and `cases` are overrides."""
+
+    points: Annotated[int, Field(ge=1, le=1000)] = 16
+    batches: Annotated[int, Field(ge=1, le=1000)] = 1
+    num_envs: Envs = 1  # number of cases in a set
+    count_key: str = "num_envs"  # argument of the env that takes this number, if it is another one
+    env: dict[str, Any] = field(default_factory=dict)
+    cases: dict[str, dict[str, Any]] = field(default_factory=dict)  # by the name of a set
+
+
+@dataclass
+class TrainingConfig(NodeConfig):
+    """Training values for an env, and overrides of `env` in training; `imitation_env` is for methods that imitate."""
+
+    learning_rate: float = 1e-3  # of PPO, at the start of a run
+    noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
+        0.0  # of the noise of continuous actions, see `Rollout`
+    )
+    anchored: dict[str, Any] = field(
+        default_factory=dict
+    )  # of anchored COIL, see its file in conf/method
+    env: dict[str, Any] = field(default_factory=dict)
+    imitation_env: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass
+class MeasureConfig(NodeConfig):
+    """A measure of an episode, see `coil_rl.report.measures.Measure`."""
+
+    entry: Any = MISSING
+    reduction: Annotated[str, one_of(*REDUCTIONS)] = "mean"
+    where: Any = None
+    at_least: float | None = None
+    at_most: float | None = None
+    title: str = ""
+    format: Annotated[str, AfterValidator(format_of_numbers)] = ".1f"
+
+
+@dataclass
+class EvaluationConfig(NodeConfig):
+    """Evaluation of a policy; `cases` is their number, or a node that gives their names."""
+
+    cases: Any = 1
+    measures: dict[str, MeasureConfig] = field(default_factory=dict)
+    pictures: dict[str, Any] = field(default_factory=dict)
+    sections: dict[str, Any] | None = None  # of coil-listen
+    env: dict[str, Any] = field(default_factory=dict)
+    curve: CurveConfig = field(default_factory=CurveConfig)
+    advice: dict[str, Any] = field(default_factory=dict)
+    repeats: Repeats = 5
+    policy: WhichPolicy = "last"
+    guides: Annotated[str, one_of("phases", "ends")] = "phases"
+    gif: bool = True
+    fallback: bool = False
+
+
+@dataclass
+class MethodConfig(NodeConfig):
+    """Transforms of the agent, the kind of its learner, and what it observes besides the env's entries."""
+
+    name: str = MISSING
+    observes: list[Any] | None = MISSING  # None: no agent
+    transforms: dict[str, Any] = field(default_factory=dict)
+    needs_guide: bool = MISSING
+    learner: Annotated[str, one_of("agent", "imitation", "guides")] = "agent"
+
+
+@dataclass
+class ProxyConfig(NodeConfig):
+    """Training of the networks that imitate guides without parameters."""
+
+    folder: str = MISSING
+    seed: Seed = 0
+    method: MethodConfig = field(default_factory=MethodConfig)
+    env: dict[str, Any] = field(default_factory=dict)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    learner: dict[str, Any] = MISSING
+
+
+@dataclass
+class ProgramConfig(NodeConfig):
+    """Base of the root configurations: Hydra's help text and callback of this project."""
+
+    defaults: list[Any] = field(
+        default_factory=lambda: [
+            {"override /hydra/help": "program"},
+            {"override /hydra/callbacks": "program"},
+            "_self_",
+        ]
+    )
+
+
+@dataclass
+class DrivingConfig(ProgramConfig):
+    """Configuration that all programs share that drive."""
+
+    preset: dict[str, Any] = field(default_factory=dict)
+    track: dict[str, Any] = field(default_factory=dict)
+    env: dict[str, Any] = MISSING
+    guide: dict[str, Any] = MISSING
+    degrade: dict[str, Any] = field(default_factory=dict)
+    method: MethodConfig = field(default_factory=MethodConfig)
+    observes: list[Any] = field(default_factory=lambda: ["observation"])
+    action: dict[str, Any] = field(default_factory=dict)
+    budget: BudgetConfig = field(default_factory=BudgetConfig)
+    training: TrainingConfig = field(default_factory=TrainingConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    watch: dict[str, dict[str, Any]] = field(default_factory=dict)
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 2
+    compile: bool = False
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+@dataclass
+class TrainConfig(DrivingConfig):
+    """Configuration of `coil-train`."""
+
+    label: str = MISSING
+    learner: dict[str, Any] = MISSING
+    logger: dict[str, Any] | None = None
+    proxy: ProxyConfig | None = None
+    checkpoint_every: Positive = 10
+    existing: Annotated[str, one_of("refuse", "resume")] = "refuse"
+    resume: str | None = None
+    init: str | None = None
+
+
+@dataclass
+class EvaluateConfig(DrivingConfig):
+    """Configuration of `coil-evaluate`."""
+
+    run: str | None = None
+
+
+@dataclass
+class ListenConfig(DrivingConfig):
+    """Configuration of `coil-listen`."""
+
+    run: str = MISSING
+    donors: Repeats = 16
+
+
+@dataclass
+class ReplayConfig(ProgramConfig):
+    """Configuration of `coil-replay`."""
+
+    recording: Any = MISSING
+    runs: list[str] = field(default_factory=list)
+    policy: WhichPolicy = "last"
+    frame: str | None = None
+    strict: bool = False
+    preset: dict[str, Any] = MISSING
+    env: dict[str, Any] = MISSING
+    guide: dict[str, Any] = field(default_factory=dict)
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 1
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+@dataclass
+class ReportConfig(ProgramConfig):
+    """Configuration of `coil-report`."""
+
+    folder: Any = MISSING
+    actions: Annotated[str, one_of("deterministic", "sampled", "both")] = "deterministic"
+    against: str | None = None
+
+
+@dataclass
+class RunsBudgetConfig(NodeConfig):
+    """Training runs of `coil-reproduce`: number of seeds, and overrides of all runs and of single experiments."""
+
+    seeds: Annotated[int, Field(ge=1)] = MISSING
+    seeds_of: dict[str, Annotated[int, Field(ge=1)]] = field(
+        default_factory=dict
+    )  # by experiment, where it is another
+    note: str | None = None
+    every: list[str] = field(default_factory=list)
+    only: dict[str, list[str]] = field(default_factory=dict)
+
+
+@dataclass
+class ReproduceConfig(ProgramConfig):
+    """Configuration of `coil-reproduce`."""
+
+    table: Any = None
+    figure: Any = None
+    claim: Any = None
+    all: bool = False
+    budget: str = MISSING
+    budgets: dict[str, RunsBudgetConfig] = MISSING
+    aliases: dict[str, str] = field(default_factory=dict)
+    other_figures: dict[str, list[int]] = field(default_factory=dict)
+    threads: Threads = 1
+    train: list[str] = field(default_factory=list)
+    known_problems: list[str] = field(default_factory=list)
+    not_reproduced: list[str] = field(default_factory=list)
+    results: dict[str, Any] = MISSING
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+def fingerprint(config: DictConfig) -> str:
+    """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
+    identity: dict[str, Any] = {
+        str(key): OmegaConf.to_container(config[key], resolve=True)
+        if OmegaConf.is_config(config[key])
+        else config[key]
+        for key in sorted(map(str, config))
+        if key not in (*IGNORED_KEYS, "hydra")
+    }
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
+
+
+def agent_label(config: DictConfig) -> str:
+    """Return the default label of a run: the method, and the learner unless it is PPO or the method's own."""
+    name = str(config.method.name)
+    if OmegaConf.is_missing(config, "learner") or config.method.learner != "agent":
+        return name
+    learner = str(config.learner.get("_target_", "")).rpartition(".")[2].lower()
+    if learner in ("", "ppo"):
+        return name
+    return learner if name == "ppo" else f"{name}_{learner}"
+
+
+# Process id in run folders: two runs may start within a microsecond.
+OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
+# Keys of a table in a label: ${names:${degrade},intact}
+OmegaConf.register_new_resolver(
+    "names", lambda table, none: "_".join(map(str, table)) or none, replace=True
+)
+# ${label}_seed${seed}_${fingerprint:}
+OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
+OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
+
+_store = ConfigStore.instance().store
+_store(name="schema", node=TrainConfig)
+_store(name="evaluate_schema", node=EvaluateConfig)
+_store(name="report_schema", node=ReportConfig)
+_store(name="listen_schema", node=ListenConfig)
+_store(name="replay_schema", node=ReplayConfig)
+_store(name="reproduce_schema", node=ReproduceConfig)

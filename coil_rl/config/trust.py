@@ -1,0 +1,218 @@
+"""The gate for received run folders: what a `config.yaml` that somebody else may have written can name.
+
+Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a
+controller, the `controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So
+each of them must be on a list of full names before anything is imported:
+
+- what the shipped configuration names in the groups of a run, also as an alternative in a comment:
+  a part that has its YAML file is on the list;
+- the estimators of scikit-learn and the transforms and loggers of TorchRL in `conf/trusted.yaml`;
+- what the configuration of the command itself names, because the command uses it anyway;
+- anything that is defined in a package that the user trusts.
+
+A constructor on the list may read a file that its arguments name, but must not write one.
+`docs/trust.md` has the trust model.
+"""
+
+import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
+from functools import cache
+from importlib import metadata, resources
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+from omegaconf import DictConfig, OmegaConf
+
+from coil_rl.config.schema import TrainConfig
+from coil_rl.errors import UserError, did_you_mean
+from coil_rl.imitation.estimators import ESTIMATORS, TRUSTED
+
+ENTRY_POINTS = (
+    "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
+)
+# Their functions run any code or write any file.
+NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
+    "coil_rl",
+    "hydra",
+    "joblib",
+    "numpy",
+    "omegaconf",
+    "pandas",
+    "scipy",
+    "sympy",
+    "tensordict",
+    "torch",
+}
+
+LOGGERS = "torchrl.record.loggers."
+NAMED = ESTIMATORS.union(
+    ["coil_rl.config.given.kept"],  # it looks an object up that the user handed over in Python
+    (f"torchrl.envs.{name}" for name in TRUSTED["transforms"]),
+    (LOGGERS + name for name in TRUSTED["loggers"]),
+)
+
+_packages: frozenset[str] = frozenset()  # of the option `trust`
+_own: frozenset[str] = frozenset()  # targets in the configuration of the command
+
+
+def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
+    """Let the run folders that this process reads from here on use parts of these packages, and of no others.
+
+    The names are top-level; a folder may call everything that is defined in these packages. The
+    targets that `command` names, the configuration that the user composed, are trusted too. A
+    package that is never trusted is a `UserError`.
+    """
+    global _packages, _own
+    names = list(packages)
+    for name in names:
+        if not name.isidentifier():
+            raise UserError(
+                f"trust=[{name}] must be a list of names of installed packages, such as trust=[my_package]"
+            )
+        if name in NEVER_TRUSTED:
+            raise UserError(
+                f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part"
+            )
+    _packages = frozenset(names)
+    _own = frozenset() if command is None else _targets(command)
+
+
+def trust_own(config: DictConfig) -> None:
+    """Let this process read folders that name what a configuration of the user names."""
+    global _own
+    _own |= _targets(config)
+
+
+def _targets(config: DictConfig) -> frozenset[str]:
+    paths = (
+        _import_path(name, key, value)
+        for name, _, key, value in _entries(OmegaConf.to_container(config))
+    )
+    return frozenset(path for path in paths if isinstance(path, str))
+
+
+def check_config(config: DictConfig, path: Path) -> None:
+    """Raise a `UserError` for anything in the configuration of a folder that could run code or write elsewhere.
+
+    Nothing is resolved, and nothing is imported but packages that the user trusts.
+    """
+    for name, parent, key, value in _entries(OmegaConf.to_container(config)):
+        named = (
+            key if not name.startswith("defaults[") else ""
+        )  # Hydra's list names groups by paths
+        if re.search(r"[/\\]", str(value if name == "label" else named)):
+            raise UserError(
+                f"{path}: {name:.100} must not contain / or \\, because files are named by it"
+            )
+        target = _import_path(name, key, value)
+        if key == "_target_" or target is not None:
+            _check_target(target, name, parent, path)
+        elif str(key).startswith("_") and key != "_partial_":
+            raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
+        if (key == "memory" or str(key).endswith("__memory")) and value is not None:
+            raise UserError(
+                f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
+            )
+        # Only the logger is saved with references, and none to itself, so that they cannot grow.
+        known = (
+            r"\$\{(?!logger\b)\w[\w.]*\}"
+            if name.startswith("logger.") and key != "_target_"
+            else r"(?!)"
+        )
+        if isinstance(value, str) and "${" in re.sub(known, "", value):
+            raise UserError(
+                f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place"
+            )
+
+
+def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any], Any, Any]]:
+    """Yield full key, parent, key and value of each entry of nested mappings and lists."""
+    parent = (
+        node
+        if isinstance(node, Mapping)
+        else dict(enumerate(node))
+        if isinstance(node, list)
+        else {}
+    )
+    for key, value in parent.items():
+        full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
+        yield full, parent, key, value
+        yield from _entries(value, full)
+
+
+def _import_path(name: str, key: Any, value: Any) -> Any:
+    """Return what an entry names to be imported, written with points only, else None."""
+    if key == "_target_":
+        return value
+    # The text under `controllers` may be at any depth, because keys may contain points.
+    names_code = (
+        key == "of" or re.search(r"\bcontrollers[.\[]", name) or (key == "id" and ":" in str(value))
+    )
+    return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
+
+
+def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
+    refusal = f"{path}: {name:.100} names {target!r:.100}"
+    package = target.partition(".")[0] if isinstance(target, str) else ""
+    if not package.isidentifier():
+        raise UserError(f"{refusal}, which is not the full name of a class; give one")
+    allowed = NAMED | _shipped_targets() | _own
+    if target in allowed and not target.startswith(LOGGERS):
+        return
+    if (
+        package not in NEVER_TRUSTED
+        and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names
+    ):
+        if (
+            name.endswith(".id") and "controllers" not in name
+        ):  # a Gymnasium env, which its module registers
+            return
+        try:
+            origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(
+                "."
+            )[0]
+        except Exception as error:
+            raise UserError(
+                f"{refusal}, which {package} does not have; check that the package is installed"
+            ) from error
+        if origin != package:
+            raise UserError(
+                f"{refusal}, which is defined elsewhere; name the package that defines it"
+            )
+    elif target in allowed:
+        plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
+        if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
+            allowed_as = (
+                "which may only be the logger, with log_dir: ${run_dir} and a plain exp_name"
+            )
+            reason = "because a run writes only into its own folder"
+            raise UserError(
+                f"{refusal}, {allowed_as}, {reason}; trust=[torchrl] on the command line allows it"
+            )
+    elif package in NEVER_TRUSTED:
+        similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
+        raise UserError(
+            f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}"
+        )
+    else:
+        remedy = f"allow it with trust=[{package:.100}] on the command line"
+        raise UserError(
+            f"{refusal}, which could run code; if you know the folder and the package, {remedy}"
+        )
+
+
+@cache
+def _shipped_targets() -> frozenset[str]:
+    conf = resources.files("coil_rl.conf")
+    names = [*(field.name for field in fields(TrainConfig)), "cases", "network"]
+    groups = [group for name in names if (group := conf / name).is_dir()]
+    texts = [
+        file.read_text(encoding="utf-8")
+        for group in groups
+        for file in group.iterdir()
+        if ".yaml" in file.name
+    ]
+    return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))

@@ -1,0 +1,56 @@
+"""Check of the values of a configuration: unknown keys, types and ranges."""
+
+import re
+from dataclasses import fields
+from typing import Any
+
+import torch
+from omegaconf import DictConfig, OmegaConf
+from pydantic import TypeAdapter, ValidationError
+
+from coil_rl.config.arguments import validation_message
+from coil_rl.errors import UserError, did_you_mean
+
+LARGEST_BATCH = 2**28  # frames
+
+
+def check_values(config: DictConfig) -> None:
+    """Raise a `UserError` for an unknown key, or a value out of range, in the configuration of any program."""
+    values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    schema: Any = OmegaConf.get_type(config)
+    try:
+        TypeAdapter(schema).validate_python(values)
+    except ValidationError as error:
+        for detail in error.errors():
+            if detail["type"] == "unexpected_keyword_argument":
+                raise UserError(_unknown_key(config, *map(str, detail["loc"]))) from None
+        raise UserError(validation_message(error, values)) from None
+    for name in ("budget", "proxy.budget"):
+        budget = OmegaConf.select(config, name)
+        if (
+            isinstance(budget, DictConfig)
+            and (frames := budget.num_envs * budget.steps) > LARGEST_BATCH
+        ):
+            raise UserError(
+                f"{name}.num_envs x {name}.steps={frames} must be at most {LARGEST_BATCH}"
+            )
+    for name in ("device", "env.device"):
+        if not isinstance(device := OmegaConf.select(config, name), str):
+            continue
+        if not re.fullmatch(r"cpu|cuda(:\d+)?", device):
+            raise UserError(f"{name}={device} must be cpu, cuda, or one GPU such as cuda:0")
+        try:
+            torch.empty(0, device=device)
+        except (AssertionError, RuntimeError) as error:
+            problem = str(error).splitlines()[0]
+            raise UserError(
+                f"{name}={device} cannot be used ({problem}); take {name}=cpu"
+            ) from error
+
+
+def _unknown_key(config: DictConfig, *path: str) -> str:
+    *parents, key = path
+    name = ".".join(parents)
+    node = OmegaConf.select(config, name) if name else config
+    known = [field.name for field in fields(OmegaConf.get_type(node)) if field.name != "defaults"]  # type: ignore[arg-type]
+    return f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}{did_you_mean(key, known)}"

@@ -1,0 +1,88 @@
+"""YAML files of plain values, such as the configuration in the folder of a run.
+
+A file may come from anybody: it is read without running code, and stays as small in memory as on
+the disk. Numbers are read and written as OmegaConf does, to which 1e-3 is a number.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import yaml
+
+from coil_rl.errors import UserError
+
+LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
+DEEPEST = 32  # levels
+FLOAT = re.compile(r"([-+]?(\d[\d_]*\.?[\d_]*|\.\d[\d_]*)([eE][-+]?\d+)?|[-+]?\.(inf|Inf|INF))$")
+TEXT = "tag:yaml.org,2002:str"
+
+
+class _Loader(yaml.SafeLoader):
+    """Reads 1e-3 as a number, a date as a text, and refuses a key that is given twice."""
+
+    yaml_implicit_resolvers: ClassVar[dict[str, Any]] = {
+        first: [pair for pair in pairs if pair[0] != "tag:yaml.org,2002:timestamp"]
+        for first, pairs in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return a mapping; a key that is given twice is a `ConstructorError`."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"found duplicate key {key.value}", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("-+0123456789."))
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes texts that could be read as numbers, such as 1e3, in quotes."""
+
+
+def _represent_text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = "'" if FLOAT.fullmatch(text) else None
+    return dumper.represent_scalar(TEXT, text, style=style)
+
+
+_Dumper.add_representer(str, _represent_text)
+
+
+def read_yaml(path: Path) -> Any:
+    """Return the values of a file.
+
+    Raises:
+        UserError: for a file that is larger or deeper than any configuration of a run, or refers to
+            parts of itself.
+        yaml.YAMLError: for a file that is no YAML.
+        OSError: for a file that cannot be read.
+    """
+    size = path.stat().st_size
+    if size > LARGEST_FILE:
+        raise UserError(
+            f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}"
+        )
+    text, depth = path.read_text(encoding="utf-8"), 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.AliasEvent):
+            raise UserError(
+                f"{path} repeats a part of itself by *{event.anchor:.40}; write the part out"
+            )
+        if depth > DEEPEST:
+            raise UserError(f"{path} has more than {DEEPEST} levels; no configuration of a run has")
+    return yaml.load(text, Loader=_Loader)
+
+
+def yaml_of(values: Mapping[str, Any]) -> str:
+    """Return plain values as YAML, which `read_yaml` and OmegaConf read as the same values."""
+    return yaml.dump(dict(values), Dumper=_Dumper, sort_keys=False, allow_unicode=True)

@@ -1,0 +1,143 @@
+"""What a machine is sent: the policy of a run as a controller, outside of any env.
+
+A policy alone is not enough: its action may be a residual that is added to a guide's, it observes
+advice, and it may have a memory. Here the whole chain of the run is applied to observations that
+come from anywhere: guides, transforms, normaliser, policy, and what the transforms make of its
+action. It is the chain of an evaluation, step for step, without the env itself.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase, is_tensor_collection
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
+
+
+class Controller:
+    """A trained policy with the face of a controller: `act(observation)` returns the executed action.
+
+    Actions are deterministic. Call `reset()` at the start of each episode.
+
+    Args:
+        env: env of one row with the transforms of the run. It gives the specs and converts
+            observations and actions; it is never stepped.
+        policy: of the run, for this env.
+        folder: of the run, if it has one.
+
+    Example:
+        >>> import coil_rl
+        >>> controller = coil_rl.open_run("outputs/tank").controller()  # doctest: +SKIP
+        >>> controller.reset()  # doctest: +SKIP
+        >>> action = controller.act(observation)  # doctest: +SKIP
+    """
+
+    def __init__(
+        self, env: EnvBase, policy: TensorDictModuleBase, folder: Path | None = None
+    ) -> None:
+        if not isinstance(env, TransformedEnv) or env.batch_size.numel() != 1:
+            raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
+        self.env, self.policy = env.eval(), policy
+        self.plant, self.folder = env.base_env, folder
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: forget everything."""
+        self._acted: TensorDictBase | None = None  # the last state with the policy's action
+        self._executed: TensorDictBase | None = None  # the same after the transforms of the action
+
+    @torch.no_grad()
+    def act(self, observation: Any) -> Any:
+        """Return the action for an observation.
+
+        Args:
+            observation: as the env gives it: for a Gymnasium env what its `reset` and `step`
+                return; for a TorchRL env its entries as a mapping or TensorDict, or the value of
+                the only entry, each without the batch dimension.
+
+        Returns:
+            The action in the env's own units and numbering: for a Gymnasium env what its `step`
+            takes; for a TorchRL env an array of the action.
+
+        Raises:
+            ValueError: if the observation does not fit the env.
+        """
+        state = self._state(self._entries(observation))
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            self._acted = self.policy(state)
+        self._executed = self.env.transform.inv(self._acted)
+        return self._decoded(self._executed[self.env.action_key])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next actions of the episode depend on, besides their observations."""
+        parts = {"acted": self._acted, "executed": self._executed}
+        state: dict[str, Any] = {
+            name: None if part is None else part.to_dict() for name, part in parts.items()
+        }
+        return state | {"transforms": copy.deepcopy(self.env.transform.state_dict())}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        batch = self.env.batch_size
+        self._acted, self._executed = (
+            None if state[name] is None else TensorDict.from_dict(state[name], batch_size=batch)
+            for name in ("acted", "executed")
+        )
+        self.env.transform.load_state_dict(state["transforms"])
+
+    def _state(self, entries: TensorDictBase) -> TensorDictBase:
+        """Return what the policy sees: the entries of the env after all transforms."""
+        self.plant._complete_done(self.plant.full_done_spec, entries)
+        transform = self.env.transform
+        if self._acted is None or self._executed is None:
+            transform._reset_env_preprocess(None)
+            return transform._reset(entries.empty(), entries)
+        entries.update(self.plant.full_reward_spec.zero())
+        after = transform._step(self._executed, entries)
+        after = self.env._step_proc_data(after)
+        return self.env.step_mdp(self._acted.set("next", after))
+
+    def _entries(self, observation: Any) -> TensorDictBase:
+        """Return the entries of the env for an observation, with the batch dimension."""
+        if hasattr(self.plant, "encode"):
+            return self.plant.encode(observation)
+        spec = self.plant.full_observation_spec
+        entries = spec.zero()
+        if not isinstance(observation, Mapping) and not is_tensor_collection(observation):
+            (key, *others) = spec.keys(True, True)
+            if others:
+                names = ", ".join(map(str, (key, *others)))
+                raise ValueError(f"this env has the entries {names}; give a mapping with them")
+            observation = {key: observation}
+        for key, value in observation.items():
+            if key not in spec.keys(True):
+                continue
+            if isinstance(value, Mapping) or is_tensor_collection(value):
+                for inner, part in value.items():
+                    if (key, inner) in spec.keys(True, True):
+                        _put(entries, (key, inner), part)
+            else:
+                _put(entries, key, value)
+        return entries
+
+    def _decoded(self, action: Tensor) -> Any:
+        if hasattr(self.plant, "decode"):
+            return self.plant.decode(action)
+        return action.reshape(action.shape[len(self.env.batch_size) :]).cpu().numpy()
+
+
+def _put(entries: TensorDictBase, key: Any, value: Any) -> None:
+    """Set an entry of one row; raises a `ValueError` for a value of another size."""
+    zero = entries[key]
+    given = torch.as_tensor(np.asarray(value) if not isinstance(value, Tensor) else value)
+    if given.shape != zero.shape[len(entries.batch_size) :]:
+        expected = list(zero.shape[len(entries.batch_size) :])
+        raise ValueError(f"{key} has the shape {list(given.shape)}, but must have {expected}")
+    entries.set(key, given.to(zero).reshape(zero.shape))

@@ -1,0 +1,180 @@
+"""The evaluation curve of a run: the returns of policies that were kept during the training.
+
+The return in training says little about a policy: its actions are sampled, and it is the mean of
+the episodes that happen to end. The kept policies act deterministically, all of them in one batch,
+each in the same cases.
+"""
+
+import math
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from itertools import pairwise
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coil_rl.files import whole_file
+from coil_rl.report.measures import Measure
+from coil_rl.report.runs import CHOICE, RETURN
+from coil_rl.run import checkpoint
+from coil_rl.run.evaluation import Totals, episodes
+from coil_rl.run.metrics import Metrics
+from coil_rl.run.policy_batch import policy_batch
+
+POLICIES = "policies"  # subfolder with the kept policies
+Watch = Mapping[str, Mapping[str, Sequence[str]]]  # name to key, of "episode" and of "step"
+
+
+@dataclass(eq=False)
+class EvaluationCurve:
+    """Keeps policies of a run, evaluates them in sets of cases, and keeps the best; a `Callback`.
+
+    It writes `policies/FRAMES.pt`, and `policy_best.pt`, the kept policy with the highest return in
+    the cases of the selection. The results are filled into the rows of the updates after which the
+    policies were kept.
+
+    Args:
+        folder: of the run.
+        policy: of the learner; copies of it act.
+        envs: for each set of cases, makes an env with all of them for a number of policies.
+        watch: further measures, "episode" at the end of an episode, "step" as the mean over its
+            steps.
+        points: number of policies that are kept, besides the first one.
+        batches: number of evaluations over the run. Each is of the policies that were kept since
+            the one before, and takes as long as one episode.
+
+    Attributes:
+        columns: names of its numbers in the log.
+    """
+
+    folder: Path
+    policy: TensorDictModuleBase
+    envs: Mapping[str, Callable[[int], EnvBase]]
+    _: KW_ONLY
+    watch: Watch = field(default_factory=dict)
+    points: int = 16
+    batches: int = 1
+
+    names: Sequence[str] = field(default=(), init=False)  # it acts after the row of an update was logged
+
+    def __post_init__(self) -> None:
+        measured = ["return", *(name for group in self.watch.values() for name in group)]
+        self.columns = [f"{cases}/{name}" for cases in self.envs for name in measured]
+
+    def attach(self, metrics: Metrics, stages: Sequence[int], frames: int) -> None:
+        """Set the log to fill, the updates at which the run ends, and the frames of an update.
+
+        A run that was made longer has several ends. Its policies are kept as in a run of each
+        length: evenly from one end to the next.
+        """
+        self.metrics, self.stages, self.frames_of_update = metrics, list(stages), frames
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether a policy is to be kept, or the kept ones to be evaluated."""
+        return update in self.kept() or bool(self.batch(update))
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Keep the policy, and evaluate the kept ones, if it is time and it is not done."""
+        if update in self.kept():
+            self.keep(update * self.frames_of_update)
+        batch = self.batch(update)
+        if batch and math.isnan(self.metrics.rows[batch[-1]][RETURN]):
+            frames = [each * self.frames_of_update for each in batch]
+            results = dict(zip(batch, self.evaluate(frames), strict=True))
+            self._keep_best(results)
+            self.metrics.fill(results)
+        return {}
+
+    def kept(self) -> list[int]:
+        """Return the updates of the run after which the policy is kept."""
+        return _evenly([0, *self.stages], self.points)
+
+    def batch(self, update: int) -> list[int]:
+        """Return the updates whose policies are evaluated after an update, if any."""
+        ends = _evenly([0, *self.stages], self.batches)
+        if update not in ends[1:]:
+            return []
+        begin = ends[ends.index(update) - 1]
+        return [each for each in self.kept() if begin < each <= update or begin == each == 0]
+
+    def keep(self, frames: int) -> None:
+        """Write the policy as it is."""
+        checkpoint.save(self.policy.state_dict(), self.file(frames))
+
+    def file(self, frames: int) -> Path:
+        """Return the file of the policy after some frames."""
+        return self.folder / POLICIES / f"{frames:012d}.pt"
+
+    def evaluate(self, frames: Sequence[int]) -> list[dict[str, float]]:
+        """Return the mean measures of the policies after some frames, by name.
+
+        A damaged file is a `UserError`.
+        """
+        states = [checkpoint.load(self.file(each)) for each in frames]
+        policies = policy_batch(self.policy, states)
+        rows: list[dict[str, float]] = [{} for _ in frames]
+        # The training's random numbers are left alone.
+        with (
+            torch.random.fork_rng(),
+            tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
+        ):
+            for cases, make_env in self.envs.items():
+                results = measures(make_env(len(frames)), policies, self.watch, bar.update)
+                for name, values in results.items():
+                    means = values.view(len(frames), -1).double().mean(1).tolist()
+                    for row, mean in zip(rows, means, strict=True):
+                        row[f"{cases}/{name}"] = mean
+        return rows
+
+    def _keep_best(self, results: Mapping[int, Mapping[str, float]]) -> None:
+        """Copy the best of all evaluated policies to `policy_best.pt`."""
+        rows = [
+            {**row, **results.get(number, {})} for number, row in enumerate(self.metrics.rows)
+        ]
+        judged = [row for row in rows if not math.isnan(row[CHOICE])]
+        best = int(max(judged, key=itemgetter(CHOICE))["frames"])
+        with whole_file(self.folder / "policy_best.pt") as unfinished:
+            shutil.copyfile(self.file(best), unfinished)
+
+
+def _evenly(ends: Sequence[int], parts: int) -> list[int]:
+    """Return numbers that divide each interval between consecutive ends into equal parts."""
+    numbers = set()
+    for begin, end in pairwise(ends):
+        numbers |= {begin + round((end - begin) * part / parts) for part in range(parts + 1)}
+    return sorted(numbers)
+
+
+@torch.no_grad()
+def measures(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    watch: Watch | None = None,
+    tick: Callable[[], Any] | None = None,
+) -> dict[str, Tensor]:
+    """Run one episode on every row of an env with deterministic actions, and return its measures.
+
+    Args:
+        env: of batch size [B].
+        policy: writes the action.
+        watch: further measures, as for `EvaluationCurve`.
+        tick: called after every step.
+
+    Returns:
+        The `return`, the sum of the rewards of the task, and the measures of `watch`, [B] each.
+    """
+    measured = {"return": Measure("episode_reward", "last")}
+    for group, reduction in (("episode", "last"), ("step", "mean")):
+        keys = (watch or {}).get(group, {})
+        measured |= {name: Measure.of(key, reduction=reduction) for name, key in keys.items()}
+    totals = Totals(measured)
+    for after, running in episodes(env, policy, tick=tick):
+        totals.add(after, running)
+    return totals.results()

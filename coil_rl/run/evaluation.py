@@ -1,0 +1,200 @@
+"""Evaluation of policies: one episode on every row of an env, reduced to its measures."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey, expand_as_right
+from torch import Tensor
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from coil_rl.report.measures import Measure
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Episodes of a policy, one per row of the env.
+
+    Attributes:
+        episodes: `case`, `reward` (sum), `steps`, and the measures.
+        histories: recorded entries of the steps of each episode, [steps, ...].
+        rate: control steps per second, the attribute `rate` of the env; NaN for an env without it.
+    """
+
+    episodes: list[dict[str, Any]]
+    histories: dict[str, list[NDArray[np.float64]]] = field(default_factory=dict)
+    rate: float = float("nan")
+
+    @property
+    def mean_reward(self) -> float:
+        """Mean of the episodes."""
+        return float(sum(episode["reward"] for episode in self.episodes) / len(self.episodes))
+
+    def split(self, parts: int) -> list[EvaluationResult]:
+        """Return consecutive parts of equally many episodes."""
+        size = len(self.episodes) // parts
+        return [self[end - size : end] for end in range(size, len(self.episodes) + 1, size)]
+
+    def __getitem__(self, rows: slice) -> EvaluationResult:
+        """Return the episodes of some rows."""
+        histories = {name: history[rows] for name, history in self.histories.items()}
+        return EvaluationResult(self.episodes[rows], histories, self.rate)
+
+
+@torch.no_grad()
+def evaluate_policy(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    sampled: bool | Tensor = False,
+    measures: Mapping[str, Measure] | None = None,
+    record: Mapping[str, NestedKey] | None = None,
+    cases: Sequence[str] = (),
+    tick: Callable[[], Any] | None = None,
+) -> EvaluationResult:
+    """Run one episode on every row of an env, with its transforms in evaluation mode.
+
+    Args:
+        env: of any batch size, also of none.
+        policy: writes the action.
+        sampled: whether to sample actions instead of taking the deterministic ones; bool, or [B]
+            for each row.
+        measures: by name.
+        record: entries after each step to keep, by name.
+        cases: names of the cases; row i is case i modulo their number. By default rows are
+            numbered.
+        tick: called after every step.
+    """
+    measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
+    totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
+    for after, running in episodes(env, policy, sampled=sampled, tick=tick):
+        totals.add(after, running)
+        for name, key in (record or {}).items():
+            recorded[name].append(after[key])
+    steps = totals.steps.tolist()
+    results = totals.results()
+    names = [cases[row % len(cases)] if cases else str(row) for row in range(len(steps))]
+    columns = {"case": names, "reward": results["reward"].tolist(), "steps": steps}
+    columns |= {name: results[name].tolist() for name in measures if name != "reward"}
+    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    histories = {}
+    for name, entries in recorded.items():
+        flat = torch.stack(entries).reshape(
+            len(entries), len(steps), *entries[0].shape[env.batch_dims :]
+        )
+        values = (flat.squeeze(-1) if flat.ndim > 2 else flat).cpu().double().numpy()
+        histories[name] = [values[:count, row] for row, count in enumerate(steps)]
+    return EvaluationResult(rows, histories, getattr(env, "rate", float("nan")))
+
+
+class Totals:
+    """Measures of the episodes of all rows of an env, reduced step by step.
+
+    Args:
+        measures: by name.
+
+    Attributes:
+        steps: number of steps of each episode so far, [rows].
+    """
+
+    def __init__(self, measures: Mapping[str, Measure]) -> None:
+        self.measures, self.steps = dict(measures), torch.zeros((), dtype=torch.int64)
+        self.groups: dict[str, list[str]] = {}  # names by reduction
+        for name, measure in measures.items():
+            self.groups.setdefault(measure.reduction, []).append(name)
+        self.state: dict[str, tuple[Tensor, Tensor]] = {}
+
+    def add(self, after: TensorDictBase, running: Tensor) -> None:
+        """Add the entries after a step of the rows that are `running`, one flag a row; several agents' are summed."""
+        running = running.reshape(-1)
+        self.steps = self.steps.to(running.device) + running.long()
+        for reduction, names in self.groups.items():
+            group = [self.measures[name] for name in names]
+            values = torch.stack(
+                [after[m.entry].double().reshape(len(running), -1).sum(-1) for m in group]
+            )
+            mask = running.expand_as(values)
+            if any(measure.where for measure in group):
+                mask = mask & torch.stack(
+                    [running if m.where is None else after[m.where].reshape(-1) for m in group]
+                )
+            if reduction in ("any", "count", "mean_nonzero"):
+                mask = mask & (values != 0)
+            extreme = reduction in ("min", "max", "last")
+            empty = torch.full_like(values, torch.nan if extreme else 0.0), torch.zeros_like(values)
+            value, count = self.state.get(reduction, empty)
+            if reduction == "last":
+                value = torch.where(mask, values, value)
+            elif reduction in ("min", "max"):
+                best = torch.fmin if reduction == "min" else torch.fmax
+                value = best(value, torch.where(mask, values, torch.nan))
+            else:
+                value = value + torch.where(mask, values, 0.0)
+            self.state[reduction] = value, count + mask
+
+    def results(self) -> dict[str, Tensor]:
+        """Return the measures by name, [rows] each: numbers (float64) or flags (bool)."""
+        results = {}
+        for reduction, names in self.groups.items():
+            values, counts = self.state[reduction]
+            if reduction in ("mean", "mean_nonzero"):
+                values = values / counts
+            elif reduction == "count":
+                values = counts
+            for name, number, count in zip(names, values, counts, strict=True):
+                measure = self.measures[name]
+                if measure.reduction == "any":
+                    number = count > 0
+                if measure.at_least is not None:
+                    number = number >= measure.at_least
+                elif measure.at_most is not None:
+                    number = number <= measure.at_most
+                results[name] = number
+        return results
+
+
+def episodes(
+    env: EnvBase,
+    policy: TensorDictModuleBase,
+    *,
+    sampled: bool | Tensor = False,
+    tick: Callable[[], Any] | None = None,
+) -> Iterator[tuple[TensorDictBase, Tensor]]:
+    """Yield the entries after each step of one episode on every row, and whether the row was still in it, [*B, 1].
+
+    Arguments as for `evaluate_policy`.
+    """
+    carrier = env.eval().reset()
+    running = torch.ones_like(env.full_done_spec["done"].zero())
+    for count in itertools.count(1):
+        step = env.step(_act(policy, carrier, sampled))
+        yield step["next"], running
+        running = running & ~step["next", "done"]
+        # The test waits for the device.
+        if count % 8 == 0 and not running.any():
+            return
+        carrier = env.step_mdp(step)
+        if tick is not None:
+            tick()
+
+
+def _act(
+    policy: TensorDictModuleBase, carrier: TensorDictBase, sampled: bool | Tensor
+) -> TensorDictBase:
+    if isinstance(sampled, Tensor):
+        drawn = _act(policy, carrier, True)["action"]
+        deterministic = _act(policy, carrier, False)
+        return deterministic.set(
+            "action", torch.where(expand_as_right(sampled, drawn), drawn, deterministic["action"])
+        )
+    with set_exploration_type(ExplorationType.RANDOM if sampled else ExplorationType.DETERMINISTIC):
+        return policy(carrier)

@@ -1,0 +1,301 @@
+"""The training loop: collect a batch, learn from it, log, and let the callbacks act."""
+
+import math
+import sys
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import KW_ONLY, dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.learners.learner import Callback, Learner
+from coil_rl.run import checkpoint
+from coil_rl.run.curve import EvaluationCurve, Watch
+from coil_rl.run.folder import check_same
+from coil_rl.run.metrics import Metrics
+from coil_rl.run.rollout import Rollout
+
+PUT_BACK = "put the files of the run back, or train again in another folder"
+
+
+@dataclass(eq=False)
+class Experiment:
+    """The training of one run in one folder.
+
+    Files: `metrics.csv` (a row for the state before the first update and after each update),
+    `checkpoint.pt` (the complete state), `checkpoint_previous.pt`, `policy_last.pt`,
+    `policy_best.pt` (the best of the kept ones; the last one without a curve) and `policies/` (the
+    kept ones). A run that was killed at any moment and resumed in a new process ends with the same
+    files, to the bit on a CPU.
+
+    Args:
+        learner: learns from the batches.
+        rollout: collects them. Its env must write `episode_reward` (TorchRL's RewardSum), and
+            `task_reward` if a transform adds to the reward of the task.
+        frames: length of the run; the last batch may exceed it.
+        folder: of the run; it exists.
+        logger: any TorchRL logger, in addition to the CSV file.
+        watch: further entries to log, as means over finished episodes ("episode") or over all steps
+            ("step").
+        checkpoint_every: updates between two checkpoints.
+        callbacks: called before the first update and between updates. One with `names` measures:
+            its numbers are columns of the log. One without acts after the row was logged.
+        curve: keeps policies and evaluates them; a callback that the log has columns of.
+        identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
+        stages: earlier lengths of a run that was made longer, in frames.
+    """
+
+    EPISODES: ClassVar[int] = 100  # the return is the mean over this many finished episodes
+
+    learner: Learner
+    rollout: Rollout
+    frames: int
+    folder: Path
+    _: KW_ONLY
+    logger: Any | None = None
+    watch: Watch = field(default_factory=dict)
+    checkpoint_every: int = 10
+    callbacks: Sequence[Callback] = ()
+    curve: EvaluationCurve | None = None
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    stages: Sequence[int] = ()
+
+    def __post_init__(self) -> None:
+        self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
+        self.updates = 0  # so far
+        self.returns: deque[float] = deque(maxlen=self.EPISODES)
+        self.measuring = [callback for callback in self.callbacks if callback.names]
+        self.acting = [callback for callback in self.callbacks if not callback.names]
+        self.acting.append(Checkpoints(self, self.checkpoint_every))
+        if self.curve is not None:
+            self.curve.attach(self.metrics, self.stage_updates, self.rollout.frames)
+            self.acting.append(self.curve)
+
+    @property
+    def stage_updates(self) -> list[int]:
+        """Numbers of updates at which the run ends, and ended before it was made longer."""
+        return [math.ceil(frames / self.rollout.frames) for frames in (*self.stages, self.frames)]
+
+    @property
+    def all_updates(self) -> int:
+        """Number of updates of the whole run."""
+        return self.stage_updates[-1]
+
+    def resume(self) -> None:
+        """Continue from the last intact checkpoint of the folder, or from the beginning without one.
+
+        Raises:
+            UserError: if the checkpoint or the log is damaged, or belongs to another run.
+        """
+        state = checkpoint.load_newest(self.folder)
+        if state is not None:
+            newest = self.folder / checkpoint.NEWEST
+            with file_of_a_run(newest, PUT_BACK):
+                self.check_identity(state["identity"], newest)
+                self.load_state_dict(state)
+        self.metrics.truncate(self.updates + 1 if self.updates else 0)
+        if self.curve is not None:
+            self.metrics.check_columns(self.curve.columns)
+        where = f"after update {self.updates}"
+        if not self.updates:
+            where = "from the beginning: there is no checkpoint yet"
+        print(f"{self.folder} continues {where}", file=sys.stderr)
+
+    def check_identity(self, saved: Mapping[str, Any], file: Path) -> None:
+        """Raise a `UserError` if a checkpoint belongs to a run with another configuration.
+
+        A run that was made longer has the checkpoint of the shorter one.
+        """
+        length = ("budget.frames", "budget.stages")
+        ours = {key: value for key, value in self.identity.items() if key not in length}
+        theirs = {key: value for key, value in saved.items() if key not in length}
+        check_same(theirs, ours, f"{file} belongs to a run", PUT_BACK)
+        frames = saved.get("budget.frames", self.frames)
+        if frames not in (self.frames, *self.stages):
+            raise UserError(
+                f"{file} belongs to a run with budget.frames={frames}, not {self.frames}; "
+                f"{PUT_BACK}"
+            )
+
+    def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
+        """Train to the end and return the rows of `metrics.csv`.
+
+        Args:
+            guide_return: mean return of the best guide, shown beside the agent's.
+
+        Raises:
+            UserError: for a NaN from the env, in the losses or in the weights.
+        """
+        updates, frames = self.all_updates, self.rollout.frames
+        with tqdm(
+            total=updates * frames,
+            initial=self.updates * frames,
+            unit="frame",
+            unit_scale=True,
+            desc="train",
+        ) as bar:
+            first = self._measure({}) if self.updates == 0 else {}
+            self._act({})
+            while self.updates < updates:
+                row = self.update(self.updates / updates)
+                row |= self._measure(row)
+                if not self.metrics.rows:
+                    self.metrics.append({**dict.fromkeys(row, math.nan), "frames": 0, **first})
+                self.metrics.append(row)
+                bar.update(frames)
+                self._show(bar, row, guide_return)
+                self._act(row)
+        policy = self.learner.policy.state_dict()
+        checkpoint.save(policy, self.folder / "policy_last.pt")
+        if self.curve is None:
+            checkpoint.save(policy, self.folder / "policy_best.pt")
+        return self.metrics.rows
+
+    def update(self, progress: float) -> dict[str, float]:
+        """Collect one batch, learn from it and return the row of the log.
+
+        Args:
+            progress: finished share of the run, in [0, 1], for all schedules.
+        """
+        with self.resume_hint():
+            batch = self.rollout.collect(progress)
+        columns = self.curve.columns if self.curve else []
+        row = dict.fromkeys(columns, math.nan) | self._describe(batch)
+        learned = {
+            f"learner/{name}": value for name, value in self.learner.update(batch, progress).items()
+        }
+        self.updates += 1
+        with self.resume_hint():
+            for name, value in learned.items():
+                if not math.isfinite(value):
+                    raise UserError(f"{name} is {value} in update {self.updates}")
+        return {"frames": self.updates * self.rollout.frames, **row, **learned}
+
+    def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
+        """Return the numbers of the callbacks that measure, NaN where they are not due."""
+        numbers: dict[str, float] = {}
+        for callback in self.measuring:
+            if callback.due(self.updates, self.all_updates, row):
+                numbers |= callback.after_update(self.updates)
+            else:
+                numbers |= dict.fromkeys(callback.names, math.nan)
+        return numbers
+
+    def _act(self, row: Mapping[str, float]) -> None:
+        for callback in self.acting:
+            if callback.due(self.updates, self.all_updates, row):
+                callback.after_update(self.updates)
+
+    def _show(self, bar: Any, row: Mapping[str, float], guide_return: float | None) -> None:
+        """Show the newest returns beside the progress bar."""
+        returns = {
+            "return": row["train/return"],
+            "evaluation": self.metrics.newest(),
+            "guide": guide_return,
+        }
+        shown = {name: f"{value:.0f}" for name, value in returns.items() if value is not None}
+        bar.set_postfix(shown)
+
+    @contextmanager
+    def resume_hint(self) -> Iterator[None]:
+        """Add to a `UserError` how the run is continued."""
+        try:
+            yield
+        except UserError as error:
+            raise UserError(
+                f"{error}; the last good checkpoint is kept: correct the cause and continue with "
+                f"coil-train resume={self.folder}, or train again with other values"
+            ) from error
+
+    def _describe(self, batch: TensorDictBase) -> dict[str, float]:
+        after = batch["next"]
+        done = after["done"]
+        self.returns.extend(after["episode_reward"][done].tolist())
+        row = {
+            "train/return": sum(self.returns) / len(self.returns) if self.returns else math.nan,
+            "train/episodes": float(done.sum()),
+            "train/reward": float(
+                after["task_reward" if "task_reward" in after else "reward"].mean()
+            ),
+        }
+        for name, key in self.watch.get("episode", {}).items():
+            ended = after[tuple(key)][done].float()
+            row[f"train/{name}"] = float(ended.mean()) if done.any() else math.nan
+        for name, key in self.watch.get("step", {}).items():
+            row[f"train/{name}"] = float(after[tuple(key)].float().mean())
+        return row
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the rest of the run depends on."""
+        return {
+            "learner": self.learner.state_dict(),
+            "rollout": self.rollout.state_dict(),
+            "identity": self.identity,
+            "updates": self.updates,
+            "returns": list(self.returns),
+            "torch_rng": torch.get_rng_state(),
+            "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state that `state_dict` returned."""
+        self.learner.load_state_dict(state["learner"])
+        self.rollout.load_state_dict(state["rollout"])
+        self.updates = state["updates"]
+        self.returns = deque(state["returns"], maxlen=self.EPISODES)
+        torch.set_rng_state(state["torch_rng"])
+        if state["cuda_rng"]:
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
+
+
+class Checkpoints:
+    """Writes the checkpoint of an experiment every few updates and at its end; a `Callback`.
+
+    Args:
+        experiment: the experiment.
+        every: updates between two checkpoints.
+    """
+
+    names: Sequence[str] = ()
+
+    def __init__(self, experiment: Experiment, every: int) -> None:
+        self.experiment, self.every = experiment, every
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether to write a checkpoint after an update; not before the first one."""
+        return bool(row) and (update % self.every == 0 or update == updates)
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Write the checkpoint; a NaN in it is a `UserError`."""
+        state = self.experiment.state_dict()
+        with self.experiment.resume_hint():
+            check_parameters(state["learner"], update)
+        self.experiment.metrics.flush()
+        checkpoint.save_newest(state, self.experiment.folder)
+        return {}
+
+
+def watched_keys(env: EnvBase, watch: Watch) -> list[NestedKey]:
+    """Return the entries that `Experiment` needs in a rollout, besides those of the learner."""
+    keys: list[NestedKey] = [("next", "done"), ("next", "reward"), ("next", "episode_reward")]
+    if "task_reward" in env.observation_spec:
+        keys.append(("next", "task_reward"))
+    for group in watch.values():
+        keys += [("next", *key) for key in group.values()]
+    return keys
+
+
+def check_parameters(state: Any, update: int, name: str = "learner") -> None:
+    """Raise a `UserError` if a tensor of a nested state holds NaN; bounds may be infinite."""
+    if isinstance(state, Mapping):
+        for key, value in state.items():
+            check_parameters(value, update, f"{name}/{key}")
+    elif isinstance(state, torch.Tensor) and state.is_floating_point() and state.isnan().any():
+        raise UserError(f"{name} is nan after update {update}")

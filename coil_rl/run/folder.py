@@ -1,0 +1,160 @@
+"""The folder of a run: its lock, configuration and software versions."""
+
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from filelock import FileLock, Timeout
+
+from coil_rl.errors import UserError
+from coil_rl.files import remove_unfinished, write_text
+from coil_rl.plain_yaml import yaml_of
+
+CONFIG, COMMAND = "config.yaml", "command.txt"
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = (
+    "coil-rl",
+    "torch",
+    "torchrl",
+    "tensordict",
+    "hydra-core",
+    "gymnasium",
+    "stable-baselines3",
+    "numpy",
+    "scipy",
+    "matplotlib",
+)
+
+
+@contextmanager
+def locked(folder: Path, *, wait: bool = False) -> Iterator[None]:
+    """Make a run folder and lock it until the block or this process ends.
+
+    If another process holds the lock, raise a `UserError`, or with `wait` wait for it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = folder / ".lock"
+    if lock.is_dir():
+        raise UserError(f"{lock} is a folder, but must be a file that locks the run; remove it")
+    try:
+        with FileLock(lock, timeout=-1 if wait else 0):
+            remove_unfinished(folder)
+            yield
+    except Timeout:
+        raise UserError(
+            f"another process is running in {folder}; wait until it ends, or end it"
+        ) from None
+
+
+def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -> None:
+    """Write the versions, the configuration and the command of a new run.
+
+    Args:
+        folder: of the run.
+        saved: the configuration, plain values only; written as `config.yaml`.
+        command: what was typed; written as `command.txt`, if there is any.
+
+    Raises:
+        UserError: if there is a run already.
+    """
+    if (folder / CONFIG).exists():
+        raise UserError(
+            f"{folder} already holds a run; resume it with coil-train resume={folder}, or choose "
+            "another folder with hydra.run.dir=FOLDER"
+        )
+    write_text(folder / "versions.json", json.dumps(versions(), indent=2))
+    if command:
+        write_text(folder / COMMAND, shlex.join(command))
+    write_config(folder, saved)
+
+
+def write_config(folder: Path, saved: Mapping[str, Any]) -> None:
+    """Write the configuration of a run."""
+    write_text(folder / CONFIG, yaml_of(saved))
+
+
+def weights_file(folder: Path, which: str = "last") -> Path:
+    """Return the file with the weights of the `last` or `best` policy of a run."""
+    return folder / f"policy_{which}.pt"
+
+
+def check_same(
+    saved: Mapping[str, Any], requested: Mapping[str, Any], holder: str, remedy: str
+) -> None:
+    """Raise a `UserError` if two results of `flat` differ; the message begins with the holder of the first one."""
+    for key in dict.fromkeys([*saved, *requested]):
+        if saved.get(key) != requested.get(key):
+            raise UserError(
+                f"{holder} with {key}={saved.get(key)}, not {requested.get(key)}; {remedy}"
+            )
+
+
+def is_begun(folder: Path) -> bool:
+    """Return whether a folder holds a run, finished or not."""
+    return (folder / CONFIG).exists()
+
+
+def is_evaluated(folder: Path) -> bool:
+    """Return whether a run is finished: its evaluation is the last thing it writes."""
+    return (folder / "evaluation.csv").exists()
+
+
+def report_changed_versions(folder: Path) -> None:
+    """Print one line on standard error if a run was begun with other versions of Python or of the packages."""
+    try:
+        begun = dict(json.loads((folder / "versions.json").read_text()))
+    except (OSError, TypeError, ValueError):
+        begun = {}
+    present = versions()
+    names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]
+    if names:
+        changes = ", ".join(
+            f"{name} {begun.get(name, 'unknown')} (here {present[name]})" for name in names
+        )
+        print(
+            f"{folder} was begun with {changes}; its numbers may differ from now on",
+            file=sys.stderr,
+        )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and important packages, the commit, and the machine."""
+    result = {"python": platform.python_version(), "platform": platform.platform()}
+    for name in PACKAGES:
+        try:
+            result[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            result[name] = "not installed"
+    # Not of a repository around this one, such as that of a project with an environment inside.
+    git = [
+        "git",
+        "-C",
+        str(ROOT),
+        "--git-dir=.git",
+        "describe",
+        "--always",
+        "--dirty",
+        "--abbrev=12",
+    ]
+    result["commit"] = _output(git) or "not a git checkout"
+    result["cpus"] = str(os.cpu_count())
+    result["gpu"] = (
+        _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]) or "not available"
+    )
+    return result
+
+
+def _output(command: list[str]) -> str:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=10)
+        return ", ".join(done.stdout.strip().splitlines())
+    except (OSError, subprocess.SubprocessError):
+        return ""

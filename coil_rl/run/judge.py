@@ -1,0 +1,349 @@
+"""The evaluation of a run: its policy and its guides in all cases, as tables and pictures."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+from tqdm import tqdm
+
+from coil_rl.compiled import compile_steps
+from coil_rl.errors import file_of_a_run
+from coil_rl.files import write_text
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.report import Returns, markdown_table, write_csv
+from coil_rl.report.measures import Measure, summarise
+from coil_rl.report.pictures import Picture
+from coil_rl.report.statistics import mean_interval
+from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
+from coil_rl.run.fallback import Fallback
+from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.policy_batch import TracedPolicy, is_tensors
+
+COLUMNS = {
+    "driver": ("driver", ""),
+    "advice": ("advice", ""),
+    "actions": ("actions", ""),
+    "case": ("case", ""),
+    "reward": ("reward", ".1f"),
+}
+MAX_CASES = 8  # in the table for people
+ALLOWED_LOSS = 0.01  # of the guide's mean reward, for a policy that is not worse
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What is measured in each episode, and on which cases.
+
+    Args:
+        cases: names of the cases; row i of an env is case i modulo their number.
+        measures: by name.
+        record: entries of every step that pictures need, by name.
+    """
+
+    cases: Sequence[str]
+    measures: Mapping[str, Measure] = field(default_factory=dict)
+    record: Mapping[str, NestedKey] = field(default_factory=dict)
+
+    def __hash__(self) -> int:
+        return hash(repr(self))
+
+    def run(self, env: EnvBase, policy: TensorDictModuleBase, **options: Any) -> EvaluationResult:
+        """Evaluate a policy on an env whose rows are the cases, perhaps several times.
+
+        `options` are those of `evaluate_policy`.
+        """
+        return evaluate_policy(
+            env, policy, cases=self.cases, measures=self.measures, record=self.record, **options
+        )
+
+
+GuideResults = Callable[[Evaluation], Mapping[str, EvaluationResult]]
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """How the policy of a run is evaluated, and what is made of it.
+
+    Args:
+        label: name of the policy in tables and pictures.
+        evaluation: cases and measures.
+        make_env: makes the env of the policy in the cases of the test.
+        pictures: of the deterministic episodes.
+        guides: names of the guides, as in tables.
+        guide_results: evaluates the guides alone, by these names; asked if the guides cannot act in
+            the policy's own env.
+        together: whether the policy's env is that of its guides: all that its method adds is their
+            advice. Then the guides act in rows beside the policy.
+        advice: names of further kinds of advice, with each of which the policy is evaluated too.
+        repeats: episodes a case with sampled actions.
+        count: number of cases, if it is not the env's own.
+        compiled: whether the steps of the env are compiled.
+        device: of the env.
+        notes: further sentences for the page.
+    """
+
+    label: str
+    evaluation: Evaluation
+    make_env: EnvMaker
+    _: KW_ONLY
+    pictures: Sequence[Picture] = field(default_factory=lambda: [Returns()])
+    guides: Sequence[str] = ()
+    guide_results: GuideResults = lambda evaluation: {}
+    together: bool = False
+    advice: Sequence[str] = ()
+    repeats: int = 0
+    count: int | None = None
+    compiled: bool = False
+    device: str = "cpu"
+    notes: Sequence[str] = ()
+
+    def env(self, rows: int, advice: str = "") -> EnvBase:
+        """Return the env of the policy in the cases of the test."""
+        return self.make_env(rows, TEST, advice, count=self.count)
+
+
+class Judgement:
+    """The results of an evaluation, as they come in.
+
+    Args:
+        measures: of each episode, by name.
+    """
+
+    def __init__(self, measures: Mapping[str, Measure]) -> None:
+        self.measures = measures
+        self.table: list[dict[str, Any]] = []  # means, for evaluation.csv
+        self.episodes: list[dict[str, Any]] = []
+        self.shown: dict[str, EvaluationResult] = {}  # deterministic episodes, by title
+
+    def add(
+        self,
+        result: EvaluationResult,
+        driver: str,
+        advice: str = "",
+        actions: str = "deterministic",
+    ) -> None:
+        """Add the episodes of a policy or a guide."""
+        label = {"driver": driver, "advice": advice, "actions": actions}
+        self.table += [label | row for row in summarise(result.episodes, self.measures)]
+        self.episodes += [label | row for row in result.episodes]
+        if actions == "deterministic":
+            self.shown[f"{driver}, {advice}" if advice else driver] = result
+
+
+def judge(
+    trial: Trial,
+    policy: TensorDictModuleBase | None,
+    folder: Path,
+    seed: int,
+    fallback: Fallback | None = None,
+) -> Judgement:
+    """Evaluate a policy beside its guides; write tables and pictures.
+
+    Each guide acts once in each case, beside the policy where both have the same env. A policy acts
+    once with deterministic actions, `trial.repeats` times with sampled ones if it samples, once
+    with each advice of `trial.advice` instead of its own, and once with a `fallback`.
+
+    The files are `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
+
+    Args:
+        trial: cases, measures, pictures.
+        policy: of the run; None for the guides alone.
+        folder: for the files.
+        seed: of the sampled actions.
+        fallback: the policy with a guide to fall back to.
+    """
+    judgement = Judgement(trial.evaluation.measures)
+    if policy is None or not trial.together:
+        for name, result in trial.guide_results(trial.evaluation).items():
+            judgement.add(result, name)
+    share = None
+    torch.manual_seed(seed)
+    with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
+        if policy is not None:
+            _evaluate(trial, policy, judgement, bar)
+        if fallback is not None:
+            result = trial.evaluation.run(trial.env(len(trial.evaluation.cases)), fallback)
+            judgement.add(result, f"{trial.label} or guide")
+            share = fallback.share(result)
+    write_csv(judgement.episodes, folder / "episodes.csv")
+    for picture in trial.pictures:
+        picture.draw(judgement.shown, folder)
+    page = _page(trial, judgement, has_policy=policy is not None, share=share)
+    write_text(folder / "evaluation.md", page)
+    write_csv(judgement.table, folder / "evaluation.csv")
+    return judgement
+
+
+def _evaluate(trial: Trial, policy: TensorDictModuleBase, judgement: Judgement, bar: Any) -> None:
+    """Add the episodes of a policy with each kind of advice, and of the guides beside it."""
+    repeats = trial.repeats if hasattr(policy, "get_dist") else 0
+    acting = TracedPolicy(policy) if is_tensors(policy) else policy
+    for advice in ("", *trial.advice):
+        bar.set_postfix_str(", ".join(filter(None, (trial.label, advice))))
+        beside = list(trial.guides) if trial.together and not advice else []
+        _evaluate_with(trial, acting, judgement, bar, advice, beside, 0 if advice else repeats)
+
+
+def _evaluate_with(
+    trial: Trial,
+    policy: TensorDictModuleBase,
+    judgement: Judgement,
+    bar: Any,
+    advice: str,
+    beside: Sequence[str],
+    repeats: int,
+) -> None:
+    """Add the episodes of a policy with one kind of advice, and of the guides beside it.
+
+    All episodes run in one batch: the time of a step hardly depends on its size.
+    """
+    count = len(trial.evaluation.cases)
+    own = (1 + repeats) * count
+    rows = torch.arange(own + len(beside) * count, device=trial.device)
+    env = trial.env(len(rows), advice)
+    if trial.compiled:
+        compile_steps(env)
+    watching = [] if advice else trial.pictures
+    if beside:
+        policy = PolicyAndGuides(env, policy, own, len(beside))
+    sampled = repeats > 0 and (rows >= count) & (rows < own)
+    tick = partial(_tick, env, watching, bar.update)
+    result = trial.evaluation.run(env, policy, sampled=sampled, tick=tick)
+    if beside:
+        for name, of_guide in zip(beside, result[own:].split(len(beside)), strict=True):
+            judgement.add(of_guide, name)
+    judgement.add(result[:count], trial.label, advice)
+    if repeats:
+        judgement.add(result[count:own], trial.label, advice, "sampled")
+
+
+def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float | None) -> str:
+    """Return the page for people: a table and sentences."""
+    columns = dict(COLUMNS)
+    if not trial.advice:
+        del columns["advice"]
+    for name, measure in trial.evaluation.measures.items():
+        if measure.title:
+            columns[name] = (measure.title, measure.format)
+    count = len(trial.evaluation.cases)
+    rows = judgement.table
+    if count > MAX_CASES:
+        rows = [row for row in rows if row["case"] == "mean"]
+    page = [markdown_table(rows, columns)]
+    if count > MAX_CASES:
+        page.append(f"Means of {count} cases; all are in evaluation.csv.")
+    if has_policy and count > 1:
+        for guide in trial.guides:
+            page.append(not_worse(judgement.shown[trial.label], judgement.shown[guide], guide))
+    if share is not None:
+        page.append(f"With fallback the guide acted in {share:.1%} of the steps.")
+    return "\n\n".join([*page, *trial.notes])
+
+
+class PolicyAndGuides(TensorDictModuleBase):
+    """A policy on the first rows of an env with advice, and its guides on the others.
+
+    Args:
+        env: the env.
+        policy: writes the action.
+        count: number of rows of the policy.
+        guides: number of guides; each acts on as many of the other rows.
+    """
+
+    def __init__(self, env: EnvBase, policy: TensorDictModuleBase, count: int, guides: int) -> None:
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        super().__init__()
+        cases = (env.batch_size[0] - count) // guides
+        # Of the guides' action on the rows of the policy nothing is used.
+        of_row = [0] * count + [guide for guide in range(guides) for _ in range(cases)]
+        self.guides = FollowAdvice(env, of_row)
+        self.policy, self.count = policy, count
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        advised = self.guides(tensordict.copy())["action"]
+        tensordict = self.policy(tensordict)
+        action = torch.cat([tensordict["action"][: self.count], advised[self.count :]])
+        return tensordict.set("action", action)
+
+
+def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> str:
+    """Return the sentence whether a policy is not worse than a guide in the same cases.
+
+    The answer is yes if the whole t interval of the difference is above minus 1 % of the guide's
+    mean reward, no if it is below.
+    """
+    pairs = zip(policy.episodes, guide.episodes, strict=True)
+    _, low, high = mean_interval([mine["reward"] - other["reward"] for mine, other in pairs])
+    margin = -ALLOWED_LOSS * abs(guide.mean_reward)
+    answer = "undecided"
+    if low >= margin:
+        answer = "yes"
+    elif high < margin:
+        answer = "no"
+    return (
+        f"Not worse than {name} on these {len(policy.episodes)} cases: {answer} "
+        f"(difference of the rewards {low:+.1f} to {high:+.1f}, 95 % interval; 1 % is allowed)."
+    )
+
+
+def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) -> None:
+    update()
+    for picture in pictures:
+        picture.watch(env)
+
+
+def report_outcome(folder: Path) -> float:
+    """Print the evaluation of a run, and return the mean reward of its deterministic policy.
+
+    Without a policy it is that of the guide. A damaged file is a `UserError`.
+    """
+    path = folder / "evaluation.csv"
+    with file_of_a_run(path, "remove the file, and evaluate again"):
+        with path.open(newline="") as file:
+            rows = list(csv.DictReader(file))
+        means = [row for row in rows if (row["case"], row["actions"]) == ("mean", "deterministic")]
+        last = [row for row in means if not row["advice"]][-1]
+        reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
+        page = (folder / "evaluation.md").read_text().rstrip()
+    print(page)
+    share = "" if math.isnan(completed) else f", {completed:.0%} completed"
+    print(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
+    return reward
+
+
+def evaluate_guides(
+    make_env: EnvMaker,
+    evaluation: Evaluation,
+    guides: Mapping[str, TensorDictModuleBase],
+    count: int | None = None,
+) -> dict[str, EvaluationResult]:
+    """Evaluate each guide alone, once in each case of the test; return the results by `guide_titles`.
+
+    Args:
+        make_env: makes the env.
+        evaluation: cases and measures.
+        guides: by name.
+        count: number of cases, if it is not the env's own.
+    """
+    cases = len(evaluation.cases)
+    env, policy = make_env.guided(cases, TEST, guides, count=count)
+    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+        result = evaluation.run(env, policy, tick=bar.update)
+    return dict(zip(guide_titles(guides), result.split(len(guides)), strict=True))
+
+
+def guide_titles(guides: Iterable[str]) -> list[str]:
+    """Return the names of guides in tables: `guide` for a single one, otherwise `guide NAME`."""
+    names = list(guides)
+    return ["guide"] if len(names) == 1 else [f"guide {name}" for name in names]

@@ -1,0 +1,126 @@
+"""The log of a run: one row of numbers for each update, in a CSV file and in any TorchRL logger."""
+
+import csv
+import io
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.files import whole_file
+from coil_rl.report.runs import RETURN, read_curve
+
+REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
+
+
+class Metrics:
+    """Log of a run: its rows in memory, in a CSV file, and in any TorchRL logger.
+
+    After a resume the rows since the checkpoint are written again. They are removed from the CSV
+    file and from TensorBoard first; other loggers may show a point twice, with the same value.
+
+    Args:
+        path: of the CSV file, `metrics.csv`.
+        logger: any TorchRL logger; None for the file alone.
+
+    Attributes:
+        rows: the rows so far, the first one for the state before the first update.
+    """
+
+    def __init__(self, path: Path, logger: Any | None = None) -> None:
+        self.path, self.logger = path, logger
+        self.rows: list[dict[str, float]] = []
+        writer = getattr(logger, "experiment", None)
+        self.tensorboard: Any | None = writer if hasattr(writer, "purge_step") else None
+
+    def append(self, row: dict[str, float]) -> None:
+        """Log a row; `frames` is the step of the logger."""
+        self.rows.append(row)
+        first = not self.path.exists()
+        with self.path.open("a", newline="") as file:
+            writer = csv.DictWriter(file, list(row))
+            if first:
+                writer.writeheader()
+            writer.writerow(row)
+        self.log(row, int(row["frames"]))
+
+    def log(self, values: Mapping[str, float], frames: int) -> None:
+        """Log values with the TorchRL logger, if there is one; NaN is left out."""
+        if self.logger is None:
+            return
+        for name, value in values.items():
+            if not math.isnan(value):
+                self.logger.log_scalar(name, value, step=frames)
+
+    def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
+        """Put values into rows that were logged before, by their numbers.
+
+        The other cells of the CSV file keep their text.
+        """
+        for number, values in results.items():
+            self.rows[number] |= values
+            self.log(values, int(self.rows[number]["frames"]))
+        text = pd.read_csv(self.path, dtype=str, keep_default_na=False)
+        for number, values in results.items():
+            text.loc[number, list(values)] = list(map(str, values.values()))
+        with whole_file(self.path) as unfinished:
+            text.to_csv(unfinished, index=False, lineterminator="\r\n")
+
+    def newest(self, name: str = RETURN) -> float | None:
+        """Return the newest number in a column; None if there is none yet."""
+        for row in reversed(self.rows):
+            value = row.get(name, math.nan)
+            if not math.isnan(value):
+                return value
+        return None
+
+    def flush(self) -> None:
+        """Wait until all rows are on the disk."""
+        if self.path.exists():
+            with self.path.open("a") as file:
+                os.fsync(file.fileno())
+        if self.tensorboard is not None:
+            self.tensorboard.flush()
+
+    def truncate(self, count: int) -> None:
+        """Keep only the first rows, those that belong to a checkpoint.
+
+        Raises:
+            UserError: if there are fewer rows, or the file is damaged.
+        """
+        lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
+        if len(lines) <= count and count:
+            found = max(len(lines) - 1, 0)
+            raise UserError(
+                f"{self.path} has {found} of the {count} rows that belong to the checkpoint; "
+                f"{REMEDY}"
+            )
+        self.rows = []
+        if count:
+            kept = b"".join(lines[: count + 1])
+            with file_of_a_run(self.path, REMEDY):
+                self.rows = read_curve(io.BytesIO(kept))
+            with whole_file(self.path) as unfinished:
+                unfinished.write_bytes(kept)
+        else:
+            self.path.unlink(missing_ok=True)
+        self._truncate_tensorboard()
+
+    def check_columns(self, names: list[str]) -> None:
+        """Raise a `UserError` if the rows lack one of some columns."""
+        for name in names:
+            if self.rows and name not in self.rows[0]:
+                raise UserError(f"{self.path} has no column {name}; {REMEDY}")
+
+    def _truncate_tensorboard(self) -> None:
+        if self.logger is None or self.tensorboard is None:
+            return
+        self.tensorboard.close()
+        frames = int(self.rows[-1]["frames"]) if self.rows else 0
+        writer = type(self.tensorboard)
+        self.tensorboard = writer(self.tensorboard.log_dir, purge_step=frames + 1)
+        self.logger.experiment = self.tensorboard

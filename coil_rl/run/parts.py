@@ -1,0 +1,111 @@
+"""The sets of cases of a run, and the maker of its envs.
+
+The other parts of a run are its learner and its callbacks, see `coil_rl.learners.learner`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field
+from typing import Protocol
+
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
+
+from coil_rl.errors import UserError
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.transforms import GuideActions
+
+TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
+TEST = "test"  # cases of the table, which training never sees
+
+
+class BareEnv(Protocol):
+    """Maker of an env without the transforms of a method."""
+
+    def __call__(self, rows: int | None, cases: str, count: int | None) -> EnvBase:
+        """Return an env of some rows in a set of cases; arguments as for `EnvMaker`."""
+
+
+@dataclass(eq=False)
+class EnvMaker:
+    """Makes the envs of a run, with the transforms of its method: the only way to an env.
+
+    Args:
+        bare: makes the env without transforms for a number of rows, a set of cases and the number
+            of different cases.
+        transforms: makes the transforms of the method; its argument is the name of a further kind
+            of advice, or empty.
+        guides: makes the guides by name.
+        degrade: makes the transforms that degrade the advice of guides that act alone.
+        sizes: number of cases in each set that the env has, by its name.
+    """
+
+    bare: BareEnv
+    _: KW_ONLY
+    transforms: Callable[[str], Sequence[Transform]] = lambda advice: ()
+    guides: Callable[[], Mapping[str, TensorDictModuleBase]] = dict
+    degrade: Callable[[], Sequence[Transform]] = tuple
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+    def __call__(
+        self,
+        rows: int | None = None,
+        cases: str = TRAIN,
+        advice: str = "",
+        *,
+        count: int | None = None,
+    ) -> EnvBase:
+        """Return an env with all transforms; it also writes the sum of the rewards, `episode_reward`.
+
+        Args:
+            rows: number of rows; None: as many as a training has.
+            cases: name of the set of cases.
+            advice: name of a further kind of advice for the agent.
+            count: number of different cases in the set, instead of its own. Row i is case
+                `i % count`.
+
+        Raises:
+            UserError: if the transforms do not fit the env, or each other.
+        """
+        return self.around(self.bare(rows, cases, count), advice)
+
+    def around(self, env: EnvBase, advice: str = "") -> EnvBase:
+        """Return any env with the transforms of the method; arguments and errors as above."""
+        return transformed(env, self.transforms(advice), "method.transforms")
+
+    def guided(
+        self,
+        rows: int,
+        cases: str,
+        guides: Mapping[str, TensorDictModuleBase] | None = None,
+        *,
+        count: int | None = None,
+    ) -> tuple[EnvBase, TensorDictModuleBase]:
+        """Return an env in which the guides act alone, with degraded advice, and the policy that does so.
+
+        Args:
+            rows: number of rows for each guide. Those of the first guide come first.
+            cases: as above.
+            guides: instead of those of the run.
+            count: as above.
+        """
+        guides = guides or self.guides()
+        env = self.bare(rows * len(guides), cases, count)
+        env = transformed(env, [GuideActions(guides), *self.degrade()], "degrade")
+        of_row = [guide for guide in range(len(guides)) for _ in range(rows)]
+        return env, FollowAdvice(env, of_row)
+
+
+def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
+    """Return an env with the sum of its rewards, `episode_reward`, and with transforms.
+
+    Transforms that do not fit are a `UserError` that begins with `name`.
+    """
+    # The sum comes first, before a method changes the reward.
+    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    try:
+        env.observation_spec  # noqa: B018  transforms check the specs when these are computed
+    except (KeyError, ValueError) as error:
+        raise UserError(f"{name}: {error.args[0]}") from error
+    return env

@@ -1,0 +1,98 @@
+"""Faster evaluation of policies: several in one batch, and operations that are traced once and repeated."""
+
+import copy
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs.utils import exploration_type
+
+from coil_rl.compiled import record
+
+
+def policy_batch(
+    policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]
+) -> TensorDictModuleBase:
+    """Return a policy for rows [S * C] that acts in state s, one of S, on rows s C to (s + 1) C."""
+    return StackedPolicies(policy, states) if is_tensors(policy) else PoliciesInTurn(policy, states)
+
+
+def is_tensors(policy: TensorDictModuleBase) -> bool:
+    """Return whether a policy has no state but its parameters and buffers, and no memory within an episode."""
+    tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
+    return tensors == set(policy.state_dict()) and not memory_keys(policy)
+
+
+def memory_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
+    """Return the entries that a policy writes for its next step, `("next", ...)`; none without a memory."""
+    return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
+
+
+class TracedPolicy(TensorDictModuleBase):
+    """A policy with fixed weights and no other state, see `is_tensors`.
+
+    Its operations are traced at the first call for a number of rows, once for each type of
+    exploration, and repeated afterwards, which takes half of the time or less.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase) -> None:
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action"]
+        super().__init__()
+        self._policy = (policy,)  # a tuple, so that it is no submodule
+        self.traced: dict[Any, Callable[..., Sequence[Tensor]]] = {}
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the `action`."""
+        entries = [tensordict[key] for key in self.in_keys]
+        kind = exploration_type(), len(entries[0])
+        if kind not in self.traced:
+            self.traced[kind] = record(self._actions, entries)
+        return tensordict.set("action", self.traced[kind](*entries)[0])
+
+    def _actions(self, *entries: Tensor) -> list[Tensor]:
+        rows = TensorDict(dict(zip(self.in_keys, entries, strict=True)), [len(entries[0])])
+        return [self._act(rows)]
+
+    def _act(self, rows: TensorDictBase) -> Tensor:
+        (policy,) = self._policy
+        action: Tensor = policy(rows)["action"]
+        return action
+
+
+class StackedPolicies(TracedPolicy):
+    """Copies of a policy with different weights, computed in one batch, each for its own part of the rows."""
+
+    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
+        super().__init__(copy.deepcopy(policy))
+        policies = PoliciesInTurn(policy, states).policies
+        self.states = torch.stack([TensorDict.from_module(each) for each in policies]).detach()
+
+    def _act(self, rows: TensorDictBase) -> Tensor:
+        actions: Tensor = torch.vmap(self._act_in)(self.states, rows.view(len(self.states), -1))
+        return actions.flatten(0, 1)
+
+    def _act_in(self, state: TensorDictBase, rows: TensorDictBase) -> Tensor:
+        with state.to_module(self._policy[0]):
+            return super()._act(rows)
+
+
+class PoliciesInTurn(TensorDictModuleBase):
+    """Copies of any policy with different states, called in turn, each for its own part of the rows."""
+
+    def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = list(policy.in_keys), ["action", *memory_keys(policy)]
+        self.policies = torch.nn.ModuleList(copy.deepcopy(policy) for _ in states)
+        for each, state in zip(self.policies, states, strict=True):
+            each.load_state_dict(state)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the `action` of the policy of each row, and what that policy remembers."""
+        parts = tensordict.select(*self.in_keys).chunk(len(self.policies))
+        parts = [policy(part) for policy, part in zip(self.policies, parts, strict=True)]
+        for key in self.out_keys:
+            tensordict.set(key, torch.cat([part[key] for part in parts]))
+        return tensordict

@@ -1,0 +1,545 @@
+"""A run: one training of one method with one seed, its evaluation, and its folder."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from tensordict.nn import TensorDictModuleBase
+from torchrl.envs import EnvBase
+
+from coil_rl.compiled import compile_steps
+from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
+from coil_rl.files import write_text
+from coil_rl.learners.learner import Callback, Learner
+from coil_rl.report import draw_learning_curves, draw_phases
+from coil_rl.report.measures import Measure
+from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.run import checkpoint
+from coil_rl.run.cases import SelectionCases
+from coil_rl.run.controller import Controller
+from coil_rl.run.curve import EvaluationCurve, Watch, measures
+from coil_rl.run.experiment import Experiment, watched_keys
+from coil_rl.run.fallback import Fallback, make_fallback
+from coil_rl.run.folder import (
+    begin,
+    check_same,
+    is_begun,
+    is_evaluated,
+    locked,
+    report_changed_versions,
+    weights_file,
+    write_config,
+)
+from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
+from coil_rl.run.parts import TRAIN, EnvMaker
+from coil_rl.run.rollout import Rollout
+
+FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
+INIT = "init.pt"  # the policy that a run began from
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much a run learns, and how often it looks at itself.
+
+    Args:
+        frames: length of the run; the last batch may exceed it.
+        steps: length of a batch in steps of each row.
+        rows: number of rows of the training env; None for its own number.
+        stages: earlier lengths, in frames, of a run that was made longer.
+        points: number of policies that are kept for the evaluation curve, besides the first one.
+        batches: number of evaluations of kept policies over the run.
+        checkpoint_every: updates between two checkpoints.
+    """
+
+    frames: int
+    steps: int
+    rows: int | None = None
+    stages: Sequence[int] = ()
+    points: int = 16
+    batches: int = 1
+    checkpoint_every: int = 10
+
+
+@dataclass(eq=False)
+class Run:
+    """One training of one method with one seed, and its evaluation.
+
+    `coil_rl.train` makes one from names, `coil_rl.open_run` from a folder, and this constructor
+    from parts. A folder is a run for every program.
+
+    Args:
+        folder: for everything that the run writes.
+        make_env: makes its envs.
+        make_learner: makes its learner for an env; None for a guide alone.
+        make_trial: makes what says how it is evaluated.
+        budget: how much it learns.
+        label: name of the policy in tables and pictures; runs with one label differ by their seed.
+        seed: of the learner's first weights, of the exploration and of sampled evaluations.
+        watch: further entries to log, see `Experiment`.
+        failure: measure that is true for an episode that failed, if there is one.
+        noise_correlation: of the exploration noise, see `Rollout`.
+        logger: makes a TorchRL logger, in addition to the CSV file.
+        callbacks: makes further callbacks for a learner; `GuideReturns` for one that trains guides.
+        prepare: called before the training, for what the learner needs.
+        init: policy file that the run begins with, instead of random weights.
+        which: policy that is evaluated, "last" or "best" of the kept ones.
+        fallback: whether to evaluate the policy also with its guide to fall back to.
+        compiled: whether to compile the steps of env and guides where they can be.
+        device: of everything.
+        threads: of torch.
+        settings: what is written as `config.yaml`: plain values, with `label`, `seed`,
+            `method.needs_guide` and `evaluation.measures` for reports.
+        identity: values on which the numbers depend, by name; a resumed run must have the same.
+        command: what was typed to make the run.
+
+    Example:
+        >>> import coil_rl
+        >>> run = coil_rl.open_run("outputs/tank")  # doctest: +SKIP
+        >>> action = run.controller().act(observation)  # doctest: +SKIP
+    """
+
+    folder: Path
+    make_env: EnvMaker
+    make_learner: Callable[[EnvBase], Learner] | None
+    make_trial: Callable[[], Trial]
+    budget: Budget
+    _: KW_ONLY
+    label: str
+    seed: int = 0
+    watch: Watch = field(default_factory=dict)
+    failure: Measure | None = None
+    noise_correlation: float = 0.0
+    logger: Callable[[], Any] | None = None
+    callbacks: Callable[[Learner], Sequence[Callback]] = lambda learner: ()
+    prepare: Callable[[], None] = lambda: None
+    init: Path | None = None
+    which: str = "last"
+    fallback: bool = False
+    compiled: bool = False
+    device: str = "cpu"
+    threads: int = 1
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    command: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        self.folder = Path(self.folder)
+        if not self.settings:
+            self.settings = self._settings_of_parts()
+        if not self.identity:
+            self.identity = {"label": self.label, "budget.frames": self.budget.frames}
+
+    @cached_property
+    def trial(self) -> Trial:
+        """How the run is evaluated."""
+        return self.make_trial()
+
+    def train(self, frames: int | None = None) -> Run:
+        """Train to the end, evaluate, and return the run; one that was stopped or is shorter goes on.
+
+        Args:
+            frames: new length of the run. Schedules over the run, such as a learning rate, then
+                refer to the new length.
+
+        Raises:
+            UserError: if another process uses the folder, if it holds another run, or if the run is
+                longer than `frames`.
+        """
+        with locked(self.folder):
+            if frames is not None:
+                self.lengthen(frames)
+            if is_begun(self.folder):
+                self.finish_begun()
+            else:
+                self.begin()
+                self.finish()
+        return self
+
+    def resume(self) -> float:
+        """Finish a run that was stopped; return the mean test reward of its deterministic policy."""
+        with locked(self.folder):
+            return self.finish_begun()
+
+    def evaluate(self, cases: int | None = None, folder: Path | None = None) -> pd.DataFrame:
+        """Evaluate the policy and the guides, and return the rows of `evaluation.csv`.
+
+        Args:
+            cases: number of cases, for an env whose cases are numbered; by default those of the run.
+            folder: for tables and pictures; by default they are not kept.
+
+        Raises:
+            UserError: if the cases of the env have names, so that there is no other number of them.
+        """
+        trial = self.trial if cases is None else trial_with_cases(self.trial, cases)
+        policy = self.policy()
+        fallback = self.make_fallback(policy) if self.fallback else None
+        with tempfile.TemporaryDirectory() as temporary:
+            judgement = judge(trial, policy, folder or Path(temporary), self.seed, fallback)
+        return pd.DataFrame(judgement.table)
+
+    def controller(self, which: str | None = None) -> Controller:
+        """Return what a machine is sent: the whole policy, with guide, normaliser and memory inside.
+
+        Args:
+            which: policy, "last" or "best" of the kept ones; by default the one that is evaluated.
+        """
+        env = self.make_env(1, TRAIN)
+        if self.make_learner is None:
+            env, policy = self.make_env.guided(1, TRAIN)
+            return Controller(env, policy, self.folder)
+        return Controller(env, self.load_policy(env, which or self.which), self.folder)
+
+    def policy(self, env: EnvBase | None = None, which: str | None = None) -> Any:
+        """Return the policy of a finished run for an env with its transforms; None without an agent.
+
+        Args:
+            env: of the run, such as `run.make_env(rows)`; by default a new one.
+            which: policy, "last" or "best" of the kept ones; by default the one that is evaluated.
+        """
+        if self.make_learner is None:
+            return None
+        return self.load_policy(self.make_env() if env is None else env, which or self.which)
+
+    def begin(self) -> None:
+        """Write the configuration of a new run; a `UserError` if the folder holds one already."""
+        begin(self.folder, self.settings, self.command)
+
+    def lengthen(self, frames: int) -> None:
+        """Set a new length, before the run goes on.
+
+        Raises:
+            UserError: if the run has been trained for longer.
+        """
+        budget = self.budget
+        if frames == budget.frames:
+            return
+        if frames < budget.frames:
+            raise UserError(
+                f"{self.folder} has budget.frames={budget.frames}, more than {frames}; give a "
+                "larger number, or train another run"
+            )
+        begun = is_begun(self.folder)
+        stages = [*budget.stages, budget.frames] if begun else []
+        self.budget = replace(budget, frames=frames, stages=stages)
+        saved = dict(self.settings.get("budget", {})) | {"frames": frames, "stages": stages}
+        self.settings = dict(self.settings) | {"budget": saved}
+        self.identity = dict(self.identity) | {"budget.frames": frames, "budget.stages": stages}
+        if not begun:
+            return
+        write_config(self.folder, self.settings)
+        for file in ("evaluation.csv", "evaluation.md", "training_time.json"):
+            (self.folder / file).unlink(missing_ok=True)
+        print(
+            f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
+            f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
+            file=sys.stderr,
+        )
+
+    def finish_begun(self) -> float:
+        """Finish the run in the folder, and return the mean test reward of its deterministic policy.
+
+        Raises:
+            UserError: if its configuration was edited since it began.
+        """
+        if is_evaluated(self.folder):
+            self.check_unchanged()
+            return report_outcome(self.folder)
+        return self.finish(resumed=True)
+
+    def check_unchanged(self) -> None:
+        """Raise a `UserError` if the configuration of a trained run is not that of its checkpoint."""
+        state = checkpoint.load_newest(self.folder)
+        if state is not None:
+            newest = self.folder / checkpoint.NEWEST
+            check_same(
+                state["identity"],
+                self.identity,
+                f"{newest} belongs to a run",
+                "put the files of the run back, or train again in another folder",
+            )
+
+    def finish(self, *, resumed: bool = False) -> float:
+        """Train and evaluate in the folder, which is locked and holds the configuration."""
+        torch.set_num_threads(self.threads)
+        try:
+            if resumed:
+                report_changed_versions(self.folder)
+            policy = None if self.make_learner is None else self.learn(resumed=resumed)
+            fallback = self.make_fallback(policy) if self.fallback else None
+            judge(self.trial, policy, self.folder, self.seed, fallback)
+            return report_outcome(self.folder)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"continue with: coil-train resume={self.folder}") from None
+        except OSError as error:
+            if error.errno not in NO_SPACE:
+                raise
+            raise UserError(
+                f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
+                f"and continue with coil-train resume={self.folder}"
+            ) from error
+
+    def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
+        """Train, draw the learning curve and return the policy to evaluate."""
+        self.prepare()
+        torch.set_num_threads(self.threads)  # what prepares may have set another number
+        guide_returns = self._saved_guide_returns()
+        # After the guides, which a resumed run does not evaluate again.
+        torch.manual_seed(self.seed)
+        experiment = self._experiment()
+        if resumed:
+            experiment.resume()
+        start = time.monotonic()
+        rows = experiment.run(max(guide_returns.values(), default=None))
+        if not resumed:  # the time before the interruption is unknown
+            seconds = {"seconds": time.monotonic() - start}
+            write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
+        learner = experiment.learner
+        self._draw(rows, learner, guide_returns)
+        learner.export(self.folder)
+        state = checkpoint.load(weights_file(self.folder, self.which), self.device)
+        learner.policy.load_state_dict(state)
+        return learner.policy
+
+    def _experiment(self) -> Experiment:
+        make_learner = self.make_learner
+        require_agent(make_learner, self.folder)
+        env = self.make_env(self.budget.rows)
+        if self.compiled:
+            compile_steps(env)
+        learner = make_learner(env)  # type: ignore[misc]
+        if self.init is not None:
+            load_weights(learner.policy, self._init_file(), self.device)
+        keys = [*learner.keys, *watched_keys(env, self.watch)]
+        rollout = Rollout(env, learner.policy, self.budget.steps, keys, self.noise_correlation)
+        return Experiment(
+            learner,
+            rollout,
+            self.budget.frames,
+            self.folder,
+            logger=self.logger() if self.logger is not None else None,
+            watch=self.watch,
+            checkpoint_every=self.budget.checkpoint_every,
+            callbacks=[*learner.callbacks(self._selection(learner)), *self.callbacks(learner)],
+            curve=self._curve(learner.policy),
+            identity=self.identity,
+            stages=self.budget.stages,
+        )
+
+    def _init_file(self) -> Path:
+        """Return the run's own copy of the policy that it begins with."""
+        copy = self.folder / INIT
+        if not copy.exists():
+            checkpoint.save(checkpoint.load(Path(self.init or "")), copy)
+        return copy
+
+    def _selection(self, learner: Learner) -> SelectionCases:
+        """Return the cases in which the learner may compare policies."""
+
+        def make(policies: int, count: int) -> EnvBase:
+            if SELECTION not in self.make_env.sizes:
+                raise UserError(
+                    f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its "
+                    "drives; give it"
+                )
+            return self.make_env(policies * count, SELECTION, count=count)
+
+        # Rare failures do not show in a few cases.
+        count = FEW_CASES if self.failure is None else MANY_CASES
+        return SelectionCases(learner.policy, make, count, self.failure)
+
+    def _curve(self, policy: TensorDictModuleBase) -> EvaluationCurve | None:
+        """Return the evaluation curve of the run; None without cases."""
+        sizes = self.make_env.sizes
+        if EVALUATION not in sizes:
+            return None
+        envs = {cases: partial(self._rows_of_policies, cases) for cases in sizes}
+        return EvaluationCurve(
+            self.folder,
+            policy,
+            envs,
+            watch=self.watch,
+            points=self.budget.points,
+            batches=self.budget.batches,
+        )
+
+    def _rows_of_policies(self, cases: str, policies: int) -> EnvBase:
+        """Return an env with all cases of a set for each of some policies."""
+        return self.make_env(policies * self.make_env.sizes[cases], cases)
+
+    def _draw(
+        self,
+        rows: Sequence[dict[str, float]],
+        learner: Learner,
+        guide_returns: Mapping[str, float],
+    ) -> None:
+        path, label = self.folder / "learning_curve.png", self.label
+        if learner.kind == "guides":
+            draw_phases(rows, list(learner.guides), path, title=label)
+        else:
+            draw_learning_curves({label: [rows]}, path, guides=guide_returns)
+
+    def _saved_guide_returns(self) -> dict[str, float]:
+        """Return the mean return of each guide in the cases of the curve, measured once."""
+        file = self.folder / "guide_return.json"
+        if file.exists():
+            with file_of_a_run(file, "remove it, and the run measures it again"):
+                numbers = json.loads(file.read_text())
+                return {name: float(numbers[name]) for name in self.trial.guides}
+        returns = guide_returns(self.make_env, self.make_env.guides())
+        write_text(file, json.dumps(returns, indent=2))
+        return returns
+
+    def load_policy(self, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
+        """Return the policy of the run for an env with its transforms.
+
+        Args:
+            env: with the transforms of the run.
+            which: "last", or "best" of the kept ones, in the cases of selection.
+
+        Raises:
+            UserError: if the policy is missing, damaged, or does not fit the configuration.
+        """
+        make_learner = self.make_learner
+        require_agent(make_learner, self.folder)
+        policy = make_learner(env).policy  # type: ignore[misc]
+        load_weights(policy, weights_file(self.folder, which), self.device)
+        return policy
+
+    def in_env(self, env: EnvBase, which: str = "last") -> tuple[EnvBase, TensorDictModuleBase]:
+        """Return any env with the guides and transforms of the run, and the policy of the run.
+
+        The own env and tracks of the run are not built. Arguments and errors are those of
+        `load_policy`; a policy that cannot act in this env is a `UserError` too.
+        """
+        require_agent(self.make_learner, self.folder)
+        try:
+            transformed = self.make_env.around(env)
+            return transformed, self.load_policy(transformed, which)
+        except UserError as error:
+            raise UserError(f"run {self.folder}: {error}") from error
+
+    def make_fallback(self, policy: TensorDictModuleBase | None) -> Fallback:
+        """Return the policy of the run with its first guide to fall back to, see `make_fallback`."""
+        return make_fallback(policy, self.make_env, self.make_learner, self.folder, self.device)
+
+    def _settings_of_parts(self) -> dict[str, Any]:
+        """Return what reports need of a run that was made from parts."""
+        measured = {
+            name: {
+                "entry": measure.entry if isinstance(measure.entry, str) else list(measure.entry),
+                "reduction": measure.reduction,
+                "title": measure.title,
+                "format": measure.format,
+            }
+            for name, measure in self.trial.evaluation.measures.items()
+        }
+        return {
+            "made_from_parts": True,
+            "label": self.label,
+            "seed": self.seed,
+            "method": {"name": self.label, "needs_guide": bool(self.trial.guides)},
+            "budget": {"frames": self.budget.frames, "steps": self.budget.steps},
+            "evaluation": {"measures": measured},
+        }
+
+
+class GuideReturns:
+    """Mean return of each guide of a learner that trains its guides, with its present parameters.
+
+    A `Callback`.
+
+    Args:
+        make_env: makes the env.
+        guides: of the learner, by name.
+        each_phase: whether to measure after each phase that changed a guide, not only before and
+            after the training.
+    """
+
+    def __init__(
+        self,
+        make_env: EnvMaker,
+        guides: Mapping[str, TensorDictModuleBase],
+        *,
+        each_phase: bool = True,
+    ) -> None:
+        self.make_env, self.guides, self.each_phase = make_env, guides, each_phase
+        self.names: Sequence[str] = [f"guide/{name}" for name in guides]
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether the guides have changed, or the training begins or ends."""
+        if update in (0, updates):
+            return True
+        return self.each_phase and bool(row["learner/guides_changed"])
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Return the means by their names in the log."""
+        returns = guide_returns(self.make_env, self.guides)
+        return dict(zip(self.names, returns.values(), strict=True))
+
+
+def guide_returns(
+    make_env: EnvMaker, guides: Mapping[str, TensorDictModuleBase]
+) -> dict[str, float]:
+    """Return the mean return of each guide in the cases of the curve; empty without cases or guides."""
+    if EVALUATION not in make_env.sizes or not guides:
+        return {}
+    env, policy = make_env.guided(make_env.sizes[EVALUATION], EVALUATION, guides)
+    with torch.random.fork_rng():
+        returns = measures(env, policy)["return"].view(len(guides), -1).mean(1)
+    return dict(zip(guide_titles(guides), returns.tolist(), strict=True))
+
+
+def trial_with_cases(trial: Trial, cases: int) -> Trial:
+    """Return a trial with another number of cases.
+
+    Raises:
+        UserError: if the cases have names, such as tracks.
+    """
+    names = list(trial.evaluation.cases)
+    if names != list(map(str, range(len(names)))):
+        raise UserError(
+            f"cases={cases}: the cases of this env have names ({', '.join(names[:3])} ...), so "
+            "there is no other number of them; leave it out"
+        )
+    evaluation = replace(trial.evaluation, cases=list(map(str, range(cases))))
+    return replace(trial, evaluation=evaluation, count=cases)
+
+
+def load_weights(policy: TensorDictModuleBase, path: Path, device: str = "cpu") -> None:
+    """Load the weights of a file into a policy.
+
+    Raises:
+        UserError: if the file is missing or damaged, does not fit the policy, or holds weights that
+            are not finite.
+    """
+    state = checkpoint.load(path, device)
+    try:
+        policy.load_state_dict(state)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from error
+    except (RuntimeError, TypeError, AttributeError) as error:
+        raise UserError(
+            f"{path} does not fit the networks in {path.parent / 'config.yaml'}; one of them was "
+            "changed after the run"
+        ) from error
+    if not all(parameter.isfinite().all() for parameter in policy.parameters()):
+        raise UserError(
+            f"{path} holds weights that are NaN or infinite; train again or use another"
+        )
+
+
+def require_agent(make_learner: Any, folder: Path) -> None:
+    """Raise a `UserError` for a run without an agent."""
+    if make_learner is None:
+        raise UserError(f"{folder} has no agent: its guide drives alone; give that guide instead")

@@ -1,0 +1,87 @@
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, Protocol
+
+import pytest
+
+from coil_rl.envs import Track
+from coil_rl.errors import UserError
+from coil_rl.config.arguments import check_arguments
+
+
+class NotRuntimeCheckable(Protocol):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("annotation", "good", "bad"),
+    [
+        (float, [1, 1.5, -2], ["1", None, True, float("nan"), float("inf"), 10**400, [1.0]]),
+        (int, [1, -1, 2**63 - 1], [1.0, True, None, 2**63, "1"]),
+        (bool, [True], [1, 0, "true", None]),
+        (str, ["", "a"], [1, None, ["a"]]),
+        (float | None, [None, 1], ["a"]),
+        (Literal["a", 1], ["a", 1], ["b", None]),
+        (Sequence[int], [[], [1, 2]], ["12", 1, [1, "a"], None]),
+        (tuple[int, str], [[1, "a"]], [["a"], "a"]),
+        (dict[str, float], [{}, {"a": 1}], [{"a": "b"}, [1], 1]),
+        (Mapping, [{"a": "b"}], [[1]]),
+        (float | Callable[[float], float], [1, {"_target_": "math.sqrt"}], ["sqrt"]),
+        (
+            Sequence[Track],
+            [{"_target_": "coil_rl.envs.shipped_tracks"}, [{"_target_": "x"}]],
+            [5, [1, 2], "abc"],
+        ),
+        (Any, [1, None, "a", []], []),
+        (NotRuntimeCheckable, [1], []),
+    ],
+)
+def test_value_is_checked_against_the_annotation(annotation, good, bad):
+    def function(value):
+        pass
+
+    function.__annotations__["value"] = annotation
+    for value in good:
+        check_arguments(function, {"value": value}, "part")
+    for value in bad:
+        with pytest.raises(UserError, match=r"part\.value.*=.* must be "):
+            check_arguments(function, {"value": value}, "part")
+
+
+class Base:
+    def __init__(
+        self, needed: int, scale: float = 1.0, *, table: dict[str, float] | None = None, free=None
+    ):
+        pass
+
+
+class Part(Base):
+    def __init__(self, own: Sequence[int] | None = None, **options):
+        super().__init__(**options)
+
+
+Part.__module__ = "coil_rl.part"  # only classes of this project are known to pass their options on
+
+
+@pytest.mark.parametrize(
+    ("node", "program", "message"),
+    [
+        ({}, (), r"part: Part needs needed; give part\.needed=VALUE"),
+        ({"needed": 1, "scal": 1}, (), "Part takes no scal; it takes own, .*; did you mean scale?"),
+        ({"needed": 1}, ("needed",), "needed of Part is set by the program; leave it out"),
+        (
+            {"table": {"a": 1, "b": "x"}},
+            ("needed",),
+            r"^part\.table\.b='x' must be a valid number$",
+        ),
+        ({"own": [1, "x"]}, ("needed",), r"^part\.own\[1\]='x' must be a valid integer$"),
+        ({"needed": 1, "_args_": [1]}, (), "Part takes no _args_"),
+    ],
+)
+def test_wrong_arguments_are_refused(node, program, message):
+    with pytest.raises(UserError, match=message):
+        check_arguments(Part, node, "part", program)
+
+
+def test_arguments_without_annotations_are_not_checked():
+    check_arguments(Part, {"needed": 1, "free": object()}, "part")
+    check_arguments(dict, {"anything": 1}, "part")

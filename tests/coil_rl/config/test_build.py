@@ -1,0 +1,151 @@
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl.errors import UserError
+from coil_rl.testing import check_env, check_guide
+from coil_rl.config.build import (
+    build,
+    build_bare_env,
+    build_env,
+    build_guided_env,
+    build_guides,
+    build_learner,
+    cases_node,
+    trains_guides,
+)
+from coil_rl.config.distillation import guides_with_untrained_proxies
+
+CONF = Path(__file__).parents[3] / "conf"
+SMALL = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "budget.num_envs=4",
+    "run_dir=unused",
+]
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*SMALL, *overrides])
+
+
+def choices(group):
+    return sorted(file.stem for file in (CONF / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("preset", choices("preset"))
+@pytest.mark.parametrize("method", choices("method"))
+def test_env_of_every_method_passes_check_env(preset, method):
+    env = build_env(composed(f"preset={preset}", f"method={method}"))
+    check_env(env, steps=3)
+    assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
+
+
+NOT_ALONE = {
+    "controller",
+    "entry",
+    "learned",
+    "recorded",
+}  # need a class, an entry, a run or a file
+WITH_MEMORY = {"authors", "spline_memory"}
+OF_OTHER_ENVS = {
+    "bot",
+    "energy_pump",
+    "lander",
+    "linear_feedback",
+    "oscillator",
+    "swing_up",
+    "walker",
+}
+
+
+@pytest.mark.parametrize(
+    "guide", sorted({*choices("guide")} - {"none", *NOT_ALONE, *OF_OTHER_ENVS})
+)
+def test_every_guide_acts_on_the_observations_of_the_env(guide):
+    config = composed(f"guide={guide}")
+    (guide_module,), env = build_guides(config).values(), build_bare_env(config)
+    if guide in WITH_MEMORY:
+        check_guide(guide_module, env)
+        return
+    data = env.reset()
+    assert guide_module(data.copy())["action"].shape == (4, 1)
+    if guide != "random":
+        check_guide(guide_module, data)
+
+
+def test_override_with_another_target_replaces_all_arguments():
+    config = composed("env=simulated_robot")
+    tracks = {"_target_": "coil_rl.envs.robot_tracks", "scale": 1.0}
+    env = build_bare_env(config, {"tracks": tracks, "reward": {"finish": 1.0}, "num_envs": 2})
+    assert (env.batch_size, config.budget.num_envs) == ((2,), 4)
+    assert [track.name for track in env.tracks] == ["robot (simulated)"]
+    assert env.weights["finish"] == 1
+    assert env.weights["crash"] == -100
+
+
+def lists_its_arguments(**options):
+    raise TypeError(f"unexpected {options}")
+
+
+def test_long_message_of_a_part_is_cut():
+    node = {"_target_": f"{__name__}.lists_its_arguments", "numbers": list(range(9999))}
+    with pytest.raises(
+        UserError, match=r"^env: unexpected {'numbers': \[0, 1, 2,[ 0-9,]{300,500} \.\.\.$"
+    ):
+        build(node, "env")
+
+
+def test_guide_drives_with_degraded_advice():
+    config = composed("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
+    env, policy = build_guided_env(config, {"num_envs": 4})
+    step = env.step(policy(env.reset()))
+    torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.4 * 0.5 + 0.2))
+
+
+def test_advice_is_degraded_after_the_transforms_of_the_method():
+    config = composed(
+        "method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]"
+    )
+    step = (env := build_env(config)).step(env.reset().set("action", torch.full((4, 1), 0.5)))
+    torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
+
+
+@pytest.mark.parametrize("learner", choices("learner"))
+def test_every_learner_is_built(learner):
+    config = composed(f"learner={learner}")
+    env = build_env(config)
+    built = build_learner(
+        config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None
+    )
+    assert built.policy(env.reset())["action"].shape == env.action_spec.shape
+
+
+SLOW_TRACKS = [pytest.param("unseen", marks=pytest.mark.slow)]  # many generated tracks
+
+
+@pytest.mark.parametrize(
+    "track", [*sorted({*choices("track")} - {"folder", "unseen"}), *SLOW_TRACKS]
+)
+def test_every_track_group_has_tracks(track):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        node = compose("train", [f"track={track}", "run_dir=unused"]).track
+    fewest = 1 if track == "robot" else 3
+    assert min(len(build(node.train, "track.train")), len(build(node.test, "track.test"))) >= fewest
+
+
+@pytest.mark.parametrize(
+    ("env", "key"), [("cone_track", "starts"), ("simulated_robot", "starts"), ("pendulum", "cases")]
+)
+def test_cases_of_several_drivers_are_the_same_ones(env, key):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        evaluation = compose("train", [f"env={env}", "run_dir=unused"]).evaluation
+    # In the file of a run all references are resolved.
+    stored = OmegaConf.create({"evaluation": OmegaConf.to_container(evaluation, resolve=True)})
+    node = cases_node(stored, "selection", drivers=2, count=3)
+    assert (node[key], node["num_envs"]) == (3, 6)

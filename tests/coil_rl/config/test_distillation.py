@@ -1,0 +1,131 @@
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+
+from coil_rl.errors import UserError
+from coil_rl.programs import evaluate
+from coil_rl.programs.distill import distill
+from coil_rl.programs.train import train
+from coil_rl.config import distillation, load
+from coil_rl.config.check import check
+
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=1",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "proxy.budget.frames=256",
+    "proxy.budget.num_envs=4",
+    "proxy.budget.steps=16",
+    "proxy.learner.regressor.epochs=20",
+]
+
+
+def composed(*overrides, name="train"):
+    tiny = TINY[:5] if name == "evaluate" else TINY
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*tiny, *overrides])
+
+
+@pytest.fixture(scope="module")
+def proxies(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("distill")
+    config = composed(
+        "guide=[spline,constant]",
+        f"proxy.folder={folder / 'proxies'}",
+        f"run_dir={folder}",
+        name="distill",
+    )
+    distill(config)
+    return folder / "proxies"
+
+
+def test_folder_of_a_proxy_follows_from_guide_env_and_settings():
+    def folder(*overrides, guide="spline"):
+        config = composed("guide=[spline,constant]", "run_dir=unused", *overrides)
+        return Path(distillation.proxy_config(config, guide).run_dir)
+
+    assert folder() == folder("seed=3", "method=ppo", "budget.frames=64", "run_dir=other")
+    assert folder().parent == Path("outputs/proxies")
+    others = [
+        folder(other)
+        for other in ("guide.spline.gain=0.9", "env.rate=20", "proxy.seed=1", "track.train.seed=5")
+    ]
+    assert len({folder(), folder(guide="constant"), *others}) == 6
+
+
+def test_distilling_reports_the_error_of_the_network_and_reuses_it(proxies, capsys):
+    folder = next(proxies.glob("constant_*"))
+    with (folder / "metrics.csv").open(newline="") as file:
+        *_, last = csv.DictReader(file)
+    assert float(last["learner/mse_training"]) < 0.01
+    assert float(last["learner/mse_ahead"]) < 0.01
+    distill(
+        composed(
+            "guide=constant", f"proxy.folder={proxies}", f"run_dir={proxies.parent}", name="distill"
+        )
+    )
+    output = capsys.readouterr().out
+    assert str(folder) in output
+    assert "distill: made 1; the lowest mean reward is" in output
+
+
+def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
+    (tmp_path / "run").mkdir()
+    overrides = [
+        "method=dynamic_coil_sequential",
+        "guide=[spline,zero]",
+        f"proxy.folder={proxies}",
+        "budget.frames=64",
+        f"run_dir={tmp_path / 'run'}",
+    ]
+    config = composed(*overrides)
+    check(config)
+    train(config)
+    assert sorted(path.name for path in (tmp_path / "run" / "proxies").iterdir()) == [
+        "spline",
+        "zero",
+    ]
+    assert len(list(proxies.glob("zero_*"))) == 1
+    guides = load.load_guides(tmp_path / "run", config)
+    network, state = (
+        guides["spline"],
+        torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True),
+    )
+    assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
+    config = composed(f"run={tmp_path / 'run'}", f"run_dir={tmp_path}", name="evaluate")
+    _, policy = evaluate.restore(tmp_path / "run", config)
+    assert policy[0].names == ["spline", "zero"]
+
+
+def test_degraded_advice_is_refused_for_guides_that_learn():
+    config = composed("method=dynamic_coil_joint", "degrade=[noisy]", "run_dir=unused")
+    with pytest.raises(
+        UserError, match=r"degrade=\['noisy'\] has no effect on guides that are trained"
+    ):
+        check(config)
+
+
+def test_proxies_are_copied_whole_or_not_at_all(tmp_path):
+    run, folder = tmp_path / "run", tmp_path / "folder"
+    for made in (run, folder):
+        made.mkdir()
+    (folder / load.PROXIES).write_text("a file in their place")
+    with pytest.raises(
+        UserError, match="proxies is a file, but a folder is to be made there; remove it"
+    ):
+        distillation.copy_proxies({"guide": run}, folder)
+    (folder / load.PROXIES).unlink()
+    with pytest.raises(FileNotFoundError):
+        distillation.copy_proxies({"guide": run}, folder)
+    assert not list(folder.iterdir())

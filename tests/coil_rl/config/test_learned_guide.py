@@ -1,0 +1,111 @@
+import shutil
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from run_folders import make_untrained_run
+
+from coil_rl.errors import UserError
+from coil_rl.config.learned_guide import LONGEST_CHAIN, LearnedGuide
+from coil_rl.programs.evaluate import restore
+from coil_rl.testing import check_guide
+from coil_rl.config.build import build_env, build_guides
+from coil_rl.run.evaluation import evaluate_policy
+
+TINY = [
+    "track=generated",
+    "track.train.count=1",
+    "track.test.count=1",
+    "env.laps=1",
+    "env.time_limit=1",
+    "evaluation.repeats=1",
+    "evaluation.gif=false",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+]
+
+
+def composed(*overrides, name="train"):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose(name, [*overrides])
+
+
+@pytest.fixture(
+    scope="module", params=["ppo", "coil action=choices", "residual_coil", "jump_start"]
+)
+def run(request, tmp_path_factory):
+    return make_untrained_run(
+        tmp_path_factory.mktemp("runs") / "run", *TINY, *f"method={request.param}".split()
+    )
+
+
+def test_guide_drives_as_the_policy_in_its_own_env(run):
+    config, agent = restore(
+        run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate")
+    )
+    overrides = {"num_envs": 3, "assignment": "cyclic"}
+    policy = evaluate_policy(build_env(config, overrides), agent)
+    guided = composed(
+        *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+    )
+    learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
+    assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
+
+
+def test_guide_is_deterministic_and_advises_another_agent(run):
+    env = build_env(composed(*TINY, "method=ppo", "run_dir=unused"))
+    data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
+    check_guide(guide, data, tolerance=1e-6)
+    assert not any(p.requires_grad for p in guide.parameters())
+    assert set(guide(data.select(*guide.in_keys)).keys()) == {*guide.in_keys, "action"}
+    config = composed(
+        *TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+    )
+    step = build_env(config).rollout(5, break_when_any_done=False)[:, -1]
+    assert torch.equal(step["guide_action"][:, 0], guide(step.clone())["action"])
+
+
+def test_run_without_an_agent_is_refused(tmp_path):
+    run = make_untrained_run(tmp_path / "guide", *TINY, "method=guide")
+    with pytest.raises(
+        ValueError, match="trained no agent: its method is guide; name its guide instead"
+    ):
+        LearnedGuide(str(run))
+
+
+def test_run_whose_advice_needs_earlier_steps_is_refused(tmp_path):
+    (tmp_path / "actions.csv").write_text("0.1\n0.2\n")
+    options = ["method=coil", "guide=recorded", f"guide.recorded.file={tmp_path / 'actions.csv'}"]
+    run = make_untrained_run(tmp_path / "run", *TINY, *options)
+    with pytest.raises(
+        ValueError, match="run has GuideActions, which needs earlier steps; its policy is no guide"
+    ):
+        LearnedGuide(str(run))
+
+
+def guided_by(run, guide):
+    """Replace the guide of a run by the policy of another one."""
+    config = OmegaConf.load(run / "config.yaml")
+    guides = {"learned": {"_target_": "coil_rl.config.learned_guide.LearnedGuide", "run": str(guide)}}
+    config.guide = config.method.transforms.advice.guides = guides
+    OmegaConf.save(config, run / "config.yaml")
+
+
+@pytest.mark.parametrize("length", [1, 3, LONGEST_CHAIN + 1])
+def test_run_that_is_its_own_guide_is_refused(length, tmp_path):
+    make_untrained_run(tmp_path / "0", *TINY, "method=coil")
+    for number in range(1, length):
+        shutil.copytree(tmp_path / "0", tmp_path / str(number))
+    for number in range(length):
+        guided_by(tmp_path / str(number), tmp_path / str((number + 1) % length))
+    message = (
+        "is its own guide"
+        if length <= LONGEST_CHAIN
+        else f"a chain of more than {LONGEST_CHAIN} learned guides"
+    )
+    for _ in range(2):  # the first refusal leaves nothing behind
+        with pytest.raises(UserError, match=message):
+            LearnedGuide(str(tmp_path / "0"))

@@ -1,0 +1,92 @@
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl.config.schema import fingerprint
+
+
+def composed(*overrides, **options):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", list(overrides), **options)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "label"),
+    [
+        ("", "coil"),
+        ("method=ppo", "ppo"),
+        ("method=ppo learner=a2c", "a2c"),
+        ("method=coil learner=trpo", "coil_trpo"),
+        ("learner._target_=others.Q", "coil_q"),
+        ("method=oil learner=linear", "oil"),
+        ("method=dynamic_coil_stochastic", "dynamic_coil_stochastic"),
+        ("method=ppo learner=a2c label=mine", "mine"),
+    ],
+)
+def test_label_is_the_method_and_an_unusual_learner(overrides, label):
+    assert composed(*overrides.split(), "run_dir=unused").label == label
+
+
+@pytest.mark.parametrize(
+    ("overrides", "values"),
+    [
+        ("preset=default", (3e-3, 224, 0.15)),
+        ("preset=paper", (1e-3, None, 0.3)),
+        ("preset=authors", (1e-3, None, 0.1)),
+        ("env=lunar_lander", (1e-3, None, 0.3)),
+        (
+            "env=lunar_lander training.learning_rate=0.1 training.anchored.margin=0.2",
+            (0.1, None, 0.2),
+        ),
+    ],
+)
+def test_learning_rate_and_looks_of_anchored_coil_are_those_of_the_world(overrides, values):
+    learner = composed("method=coil_anchored", *overrides.split(), "run_dir=unused").learner
+    assert (learner.learning_rate.start, learner.anchor.cases, learner.anchor.margin) == values
+
+
+def test_learning_rate_of_anchored_coil_is_not_that_of_coil():
+    assert composed("method=coil", "run_dir=unused").learner.learning_rate.start == 1e-3
+
+
+@pytest.mark.parametrize(
+    ("overrides", "correlation"),
+    [
+        ("method=coil", 0.7),
+        ("method=coil_anchored", 0.0),
+        ("method=coil preset=paper", 0.0),
+        ("method=coil preset=authors", 0.0),
+        ("method=coil_anchored preset=authors", 0.0),
+        ("method=coil_anchored preset=authors training.noise_correlation=0.5", 0.5),
+        ("method=ppo env=driving_tasks", 0.0),
+        ("method=ppo env=lunar_lander", 0.0),
+    ],
+)
+def test_correlation_of_the_noise_is_that_of_the_world(overrides, correlation):
+    assert composed(*overrides.split(), "run_dir=unused").training.noise_correlation == correlation
+
+
+def test_fingerprint_depends_on_everything_that_changes_the_numbers():
+    one = fingerprint(composed())
+    assert one == fingerprint(composed("run_dir=elsewhere", "logger=none", "existing=resume"))
+    others = [
+        ("seed=1",),
+        ("learner.gamma=0.98",),
+        ("method=ppo",),
+        ("track.train.split=test",),
+        ("label=mine",),
+    ]
+    assert len({one, *(fingerprint(composed(*other)) for other in others)}) == 1 + len(others)
+
+
+def test_saved_configuration_has_the_same_fingerprint():
+    config = composed("run_dir=here")
+    assert fingerprint(
+        OmegaConf.create(OmegaConf.to_container(config, resolve=True))
+    ) == fingerprint(config)
+
+
+def test_fingerprint_in_the_name_of_a_sweep_folder():
+    subdir = "hydra.sweep.subdir=${label}_seed${seed}_${fingerprint:}"
+    config = composed("seed=3", subdir, return_hydra_config=True)
+    assert config.hydra.sweep.subdir == f"coil_seed3_{fingerprint(composed('seed=3'))}"

@@ -1,0 +1,405 @@
+import importlib.resources
+import sys
+from itertools import zip_longest
+
+import hydra.utils
+import pytest
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+
+from coil_rl.errors import UserError
+from coil_rl.programs import train
+from coil_rl.run import run as runs
+from coil_rl.config import trust
+from coil_rl.run import folder as run_folder
+from coil_rl.config.schema import TrainConfig
+from coil_rl.config.distillation import proxy_config
+from coil_rl.run.folder import begin, read_config
+
+CODE = """
+    os.system os.popen os.execv posix.system subprocess.run subprocess.Popen subprocess.check_output builtins.eval
+    builtins.exec builtins.open builtins.__import__ builtins.getattr joblib.load torch.load torch.save torch.compile
+    torch.hub.load torch.utils.collect_env.run torch.utils.cpp_extension.load_inline numpy.load numpy.save
+    numpy.distutils.exec_command.exec_command distutils.spawn.spawn sympy.sympify shutil.copyfile shutil.rmtree
+    pickle.loads marshal.loads importlib.import_module runpy.run_path pydoc.locate hydra.utils.call
+    hydra.utils.get_method hydra.utils.instantiate timeit.timeit code.interact pty.spawn webbrowser.open ctypes.CDLL
+    pathlib.Path.write_text functools.partial operator.methodcaller antigravity.this pandas.read_pickle
+    omegaconf.OmegaConf.save tensordict.load sklearn.utils.fixes.os.system torchrl.envs.GymEnv cloudpickle.loads
+    coil_rl.programs.app.os.system coil_rl.programs.app.shutil.rmtree coil_rl.files.write_text coil_rl.envs.save_track
+    coil_rl.envs.save_drive coil_rl.envs.RecordingWriter coil_rl.run.run.run coil_rl.config.trust.trust_packages
+    coil_rl.guides.SplineGuide.__init__ coil_rl.guides.spline.math.sqrt сoil_rl.guides.SplineGuide
+    torchrl.record.loggers.WandbLogger
+""".split()  # noqa: SIM905
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    yield
+    trust.trust_packages([])
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Return the configuration of a run as coil-train saves it."""
+    return composed(tmp_path_factory.mktemp("saved") / "run")
+
+
+def composed(folder, *overrides):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*overrides, f"run_dir={folder}"])
+    folder.mkdir()
+    begin(config, folder)
+    return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
+
+
+def changed(saved, key, value):
+    config = OmegaConf.create(saved)
+    OmegaConf.update(config, key, value, merge=False, force_add=True)
+    return config
+
+
+def read(folder, content):
+    (folder / "config.yaml").write_text(
+        content if isinstance(content, str) else OmegaConf.to_yaml(content)
+    )
+    return read_config(folder, "run")
+
+
+def no_import(name, *_):
+    raise AssertionError(f"{name} was imported")
+
+
+@pytest.mark.parametrize("target", CODE)
+def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp_path, monkeypatch):
+    trust._shipped_targets()
+    modules = set(sys.modules)
+    monkeypatch.setattr(hydra.utils, "get_object", no_import)
+    monkeypatch.setattr(importlib, "import_module", no_import)
+    with pytest.raises(UserError, match="could run code") as error:
+        read(tmp_path, changed(saved, "method.transforms.x", {"_target_": target, "a": 1}))
+    assert str(tmp_path / "config.yaml") in str(error.value)
+    assert "method.transforms.x._target_" in str(error.value)
+    assert target in str(error.value)
+    assert set(sys.modules) == modules
+
+
+@pytest.mark.parametrize(
+    "path", ["os:system", "posix:system", "os.system", "builtins:eval", "coil_rl.files:os.system"]
+)
+@pytest.mark.parametrize(
+    "key", ["guide.theirs.of", "env.controllers.theirs", "env.of", "evaluation.env.controllers.x.y"]
+)
+def test_controller_outside_the_list_is_refused_before_any_import(
+    key, path, saved, tmp_path, monkeypatch
+):
+    trust._shipped_targets()
+    monkeypatch.setattr(hydra.utils, "get_object", no_import)
+    monkeypatch.setattr(importlib, "import_module", no_import)
+    for value in (path, {"a.b": path} if "controllers" in key else path):
+        with pytest.raises(
+            UserError,
+            match=rf"{key}[a-b.]* names '.*', which is no part of a run and could run code",
+        ):
+            read(tmp_path, changed(saved, key, value))
+
+
+def test_gymnasium_env_of_a_module_is_refused_like_the_module(package, saved, tmp_path):
+    for env, message in (
+        ("os:x-v0", "no part of a run"),
+        ("their_package:Env-v0", r"trust=\[their_package\]"),
+    ):
+        with pytest.raises(UserError, match=message):
+            read(tmp_path, changed(saved, "env.id", env))
+    assert "their_package" not in sys.modules
+    trust.trust_packages(["their_package"])
+    assert (
+        read(tmp_path, changed(saved, "env.id", "their_package:Env-v0")).env.id
+        == "their_package:Env-v0"
+    )
+    assert read(tmp_path, changed(saved, "env.id", "LunarLander-v3")).env.id == "LunarLander-v3"
+
+
+def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package, saved, tmp_path):
+    theirs = changed(
+        saved,
+        "guide.theirs",
+        {"_target_": "coil_rl.guides.ControllerGuide", "of": "their_package:TheirGuide"},
+    )
+    with pytest.raises(
+        UserError,
+        match=r"guide\.theirs\.of names .*; if you know .* allow it with trust=\[their_package\]",
+    ):
+        read(tmp_path, theirs)
+    assert "their_package" not in sys.modules
+    trust.trust_packages(
+        [], OmegaConf.create({"guide": {"mine": {"of": "their_package:TheirGuide"}}})
+    )
+    assert read(tmp_path, theirs).guide.theirs
+    trust.trust_packages(["their_package"])
+    assert read(tmp_path, theirs).guide.theirs
+    with pytest.raises(UserError, match="which is defined elsewhere"):
+        read(tmp_path, changed(theirs, "guide.theirs.of", "their_package:os.system"))
+    for name in ("mine", "id"):
+        with pytest.raises(UserError, match="which is defined elsewhere"):
+            read(tmp_path, changed(saved, "env.controllers", {name: "their_package:os.system"}))
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "guide.spline",
+        "guide.other",
+        "env",
+        "env.reward",
+        "learner.x",
+        "track.train",
+        "track.test.deep.er",
+        "logger",
+        "logger.x",
+        "evaluation.advice.x",
+        "evaluation.env.tracks",
+        "watch.step.x",
+        "proxy.learner",
+        "proxy.method.x",
+        "action",
+        "degrade.x",
+        "preset.perception",
+        "budget.x",
+        "unknown.key",
+        "label",
+    ],
+)
+def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
+    for value in ({"_target_": "os.system"}, [[1, {"deep": [{"_target_": "os.system"}]}]]):
+        with pytest.raises(
+            UserError,
+            match=r"config\.yaml: .*_target_ names 'os\.system', which is no part of a run",
+        ):
+            read(tmp_path, changed(saved, key, value))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        (
+            "env.x",
+            {"_target_": ["os.system"]},
+            r"names \['os.system'\], which is not the full name of a class",
+        ),
+        (
+            "env.x",
+            {"_target_": {"_target_": "os.system"}},
+            "names {.*}, which is not the full name of a class",
+        ),
+        ("env.x", {"_target_": "${label}"}, "which is not the full name of a class"),
+        ("env.x", {"_target_": None}, "names None, which is not the full name of a class"),
+        (
+            "env.x",
+            {"_target_": "my_package.Part"},
+            r"allow it with trust=\[my_package\] on the command line",
+        ),
+        (
+            "env.x",
+            {"_target_": "coil_rl.guides.SplinGuide"},
+            "did you mean coil_rl.guides.SplineGuide",
+        ),
+        ("env.x", {"_args_": ["x"]}, "_args_ is not a key of a run's configuration"),
+        ("env.x", {"_recursive_": False}, "_recursive_ is not a key"),
+        ("env.x", {"_convert_": "none"}, "_convert_ is not a key"),
+        ("env.x", "${oc.env:HOME}", "is a reference; put the value in its place"),
+        ("env.x", "${label}", "is a reference"),
+        ("logger.exp_name", "${oc.env:HOME}", "is a reference|plain exp_name"),
+        ("logger.x", "${logger.exp_name}", "is a reference"),
+        ("logger.x", "a ${${label}}", "is a reference"),
+        ("logger.log_dir", "/tmp/elsewhere", "may only be the logger, with log_dir"),
+        ("logger.exp_name", "../elsewhere", "a plain exp_name"),
+        (
+            "env.x",
+            {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"},
+            "may only be the logger",
+        ),
+        ("learner.memory", "cache", "learner.memory names a cache, whose files can run code"),
+        ("learner.grid", {"steps__memory": ["cache"]}, "steps__memory names a cache"),
+        ("guide", {"../../x": {}}, "must not contain / or"),
+        ("label", "../../x", "label must not contain / or"),
+    ],
+)
+def test_trick_is_refused(key, value, message, saved, tmp_path):
+    with pytest.raises(UserError, match=message):
+        read(tmp_path, changed(saved, key, value))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: &a [1, 1]\nb: *a\n", r"repeats a part of itself by \*a"),
+        (
+            "a0: &a0 [x]\n"
+            + "".join(f"a{n + 1}: &a{n + 1} [{', '.join([f'*a{n}'] * 9)}]\n" for n in range(30)),
+            "repeats",
+        ),
+        ("a: &a\n  b: *a\n", "repeats a part of itself"),
+        ("a: " + "[" * 5000 + "]" * 5000, "has more than 32 levels"),
+        (
+            "a: " + "x" * 200_000,
+            "has 200003 bytes, but the configuration of a run has at most 200000",
+        ),
+        ("a: !!python/object/apply:os.system [ls]\n", "is not the configuration of a run"),
+        ("label: " + "9" * 5000, "is not the configuration of a run"),
+    ],
+    ids=["alias", "alias bomb", "cycle", "deep", "large", "tag", "digits"],
+)
+def test_file_that_no_run_writes_is_refused(text, message, tmp_path):
+    with pytest.raises(UserError, match=message) as error:
+        read(tmp_path, text)
+    assert str(tmp_path / "config.yaml") in str(error.value)
+
+
+GROUPS = (
+    "guide",
+    "degrade",
+    "learner",
+    "logger",
+    "method",
+    "track",
+    "action",
+    "preset",
+)  # of the cone world
+MISSING = ["+track.dir=levels", "+guide.learned.run=other"]
+MISSING += [
+    "+guide.controller.of=coil_rl.guides:SplineGuide",
+    "+guide.recorded.file=a.csv",
+    "+guide.entry.key=steering",
+]
+OF_ENV = {"gym": ["env.id=CartPole-v1"], "torchrl": ["env.of._target_=coil_rl.envs.ConeTrackEnv"]}
+
+
+def files(group):
+    return sorted(
+        file.stem for file in (importlib.resources.files("coil_rl.conf") / group).glob("*.yaml")
+    )
+
+
+@pytest.mark.slow
+def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(run_folder, "versions", dict)
+    columns = [[f"{group}={name}" for name in files(group)] for group in GROUPS]
+    choices = [[*filter(None, row), *MISSING] for row in zip_longest(*columns)]
+    choices += [[f"env={name}", *OF_ENV.get(name, [])] for name in files("env")]
+    for number, overrides in enumerate(choices):
+        composed(tmp_path / str(number), *overrides)
+        assert read_config(tmp_path / str(number), "run").label
+
+
+def test_configuration_of_a_proxy_can_be_read(saved, tmp_path):
+    proxy = proxy_config(OmegaConf.merge(OmegaConf.structured(TrainConfig), saved), "spline")
+    proxy.run_dir = "anywhere"
+    begin(proxy, tmp_path)
+    assert read_config(tmp_path, "run").label == "proxy of spline"
+
+
+def test_named_parts_exist_and_are_classes():
+    wrong = [name for name in trust.NAMED if not isinstance(hydra.utils.get_object(name), type)]
+    assert wrong == []
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch):
+    """Make a package that could be installed, and return its folder."""
+    folder = tmp_path / "site"
+    (folder / "their_package").mkdir(parents=True)
+    source = "import os\nfrom coil_rl.guides import ZeroGuide\n\nclass TheirGuide(ZeroGuide):\n    pass\n"
+    (folder / "their_package" / "__init__.py").write_text(source)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.delitem(sys.modules, "their_package", raising=False)  # of another test
+    yield folder
+    sys.modules.pop("their_package", None)
+
+
+def with_target(saved, target, **others):
+    return changed(saved | others, "guide.theirs", {"_target_": target})
+
+
+def test_trusted_package_may_be_used_and_nothing_that_it_imports(package, saved, tmp_path):
+    theirs = with_target(saved, "their_package.TheirGuide")
+    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+        read(tmp_path, theirs)
+    assert "their_package" not in sys.modules
+    trust.trust_packages(["their_package"])
+    assert read(tmp_path, theirs).guide.theirs._target_ == "their_package.TheirGuide"
+    for target in (
+        "their_package.os.system",
+        "their_package.ZeroGuide",
+        "their_package.TheirGuide.__init__.__globals__",
+    ):
+        with pytest.raises(UserError, match="which is defined elsewhere"):
+            read(tmp_path, with_target(saved, target))
+    with pytest.raises(UserError, match="which their_package does not have"):
+        read(tmp_path, with_target(saved, "their_package.Missing"))
+    with pytest.raises(UserError, match=r"'their_package2\.TheirGuide', which could run code"):
+        read(tmp_path, with_target(saved, "their_package2.TheirGuide"))
+    trust.trust_packages([])
+    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+        read(tmp_path, theirs)
+
+
+def test_folder_cannot_grant_itself_trust_and_a_run_does_not_save_it(package, saved, tmp_path):
+    with pytest.raises(UserError, match=r"allow it with trust=\[their_package\]"):
+        read(tmp_path, with_target(saved, "their_package.TheirGuide", trust=["their_package"]))
+    assert "trust" not in composed(tmp_path / "run", "trust=[their_package]")
+
+
+def test_installed_package_with_an_entry_point_is_trusted(package, saved, tmp_path):
+    info = package / "their_package-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their_package\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text(
+        "[coil_rl.trusted]\ntheir_package = their_package\nos = os\n"
+    )
+    assert read(tmp_path, with_target(saved, "their_package.TheirGuide")).guide.theirs
+    with pytest.raises(UserError, match="which is no part of a run"):
+        read(tmp_path, with_target(saved, "os.system"))
+
+
+def test_what_the_command_itself_names_is_trusted_in_folders(package, saved, tmp_path):
+    theirs = with_target(saved, "their_package.TheirGuide")
+    trust.trust_packages(
+        [], OmegaConf.create({"guide": {"theirs": {"_target_": "their_package.TheirGuide"}}})
+    )
+    assert read(tmp_path, theirs).guide.theirs
+    with pytest.raises(UserError, match=r"trust=\[their_package\]"):
+        read(tmp_path, with_target(saved, "their_package.Other"))
+
+
+@pytest.mark.parametrize("name", ["os", "builtins", "torch", "hydra", "coil_rl"])
+def test_package_that_runs_any_code_is_never_trusted(name):
+    with pytest.raises(
+        UserError, match=rf"trust=\[{name}\] cannot be: functions of {name} run any code"
+    ):
+        trust.trust_packages([name])
+
+
+def test_trust_is_a_list_of_packages():
+    with pytest.raises(
+        UserError, match=r"trust=\[a.b\] must be a list of names of installed packages"
+    ):
+        trust.trust_packages(["a.b"])
+
+
+def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    outside = {"run_dir": str(tmp_path / "outside"), "proxy.folder": str(tmp_path / "outside")}
+    config = OmegaConf.create(saved)
+    for key, value in outside.items():
+        OmegaConf.update(config, key, value)
+    OmegaConf.save(config, folder / "config.yaml")
+    resumed = []
+    monkeypatch.setattr(runs, "resume_run", lambda config, folder: resumed.append(config))
+    train.resume(folder)
+    (config,) = resumed
+    assert config.run_dir == config.logger.log_dir == str(folder)
+    assert config.proxy.folder == str(folder / "distilled")
+    (folder / "metrics.csv").symlink_to(tmp_path / "outside.csv")
+    with pytest.raises(UserError, match=r"metrics\.csv is a link"):
+        train.resume(folder)

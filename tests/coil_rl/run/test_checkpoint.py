@@ -1,0 +1,136 @@
+import os
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from coil_rl.errors import UserError
+from coil_rl.files import remove_unfinished
+from coil_rl.run import checkpoint
+
+
+def test_saved_state_is_loaded_unchanged(tmp_path):
+    state = {"weights": torch.arange(3.0), "updates": 7, "returns": [1.5, 2.5], "none": None}
+    checkpoint.save(state, tmp_path / "state.pt")
+    again = checkpoint.load(tmp_path / "state.pt")
+    assert torch.equal(again.pop("weights"), state.pop("weights"))
+    assert again == state
+    assert [file.name for file in tmp_path.iterdir()] == ["state.pt"]
+
+
+def test_failed_save_keeps_the_old_file(tmp_path):
+    checkpoint.save(1, tmp_path / "state.pt")
+    with pytest.raises(Exception, match="pickle"):
+        checkpoint.save(lambda: None, tmp_path / "state.pt")
+    assert checkpoint.load(tmp_path / "state.pt") == 1
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_missing_and_damaged_files_are_refused(tmp_path):
+    with pytest.raises(UserError, match=r"there is no file .*state\.pt"):
+        checkpoint.load(tmp_path / "state.pt")
+    checkpoint.save(torch.zeros(1000), tmp_path / "state.pt")
+    whole = (tmp_path / "state.pt").read_bytes()
+    (tmp_path / "state.pt").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(UserError, match=r"state\.pt is damaged"):
+        checkpoint.load(tmp_path / "state.pt")
+
+
+def test_loading_runs_no_code(tmp_path):
+    class Payload:
+        def __reduce__(self):
+            return (print, ("code ran",))
+
+    torch.save(Payload(), tmp_path / "evil.pt")
+    with pytest.raises(UserError, match="checksum is wrong"):
+        checkpoint.load(tmp_path / "evil.pt")
+    checkpoint.save(Payload(), tmp_path / "evil.pt")
+    with pytest.raises(UserError, match="is damaged"):
+        checkpoint.load(tmp_path / "evil.pt")
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """A folder with checkpoint 2 and, as the previous one, checkpoint 1; and the bytes of 2."""
+    folder = tmp_path_factory.mktemp("run")
+    for number in (1, 2):
+        checkpoint.save_newest({"updates": number, "weights": torch.zeros(50)}, folder)
+    return folder, (folder / "checkpoint.pt").read_bytes()
+
+
+@given(st.data())
+def test_previous_checkpoint_replaces_an_altered_or_truncated_one(two, data):
+    folder, whole = two
+    at = data.draw(st.integers(0, len(whole) - 1))
+    if data.draw(st.booleans()):
+        broken = whole[:at]
+    else:
+        broken = whole[:at] + bytes([whole[at] ^ data.draw(st.integers(1, 255))]) + whole[at + 1 :]
+    (folder / "checkpoint.pt").write_bytes(broken)
+    before = (folder / "checkpoint_previous.pt").read_bytes()
+    assert checkpoint.load_newest(folder)["updates"] == 1
+    assert (folder / "checkpoint.pt").read_bytes() == before
+    (folder / "checkpoint_previous.pt").write_bytes(before)
+
+
+def test_damaged_checkpoints_are_reported_or_refused(tmp_path, capsys):
+    assert checkpoint.load_newest(tmp_path) is None
+    for number in (1, 2):
+        checkpoint.save_newest(number, tmp_path)
+    (tmp_path / "checkpoint.pt").write_bytes(b"")
+    assert checkpoint.load_newest(tmp_path) == 1
+    assert (
+        "checkpoint.pt is damaged: its checksum is wrong; using checkpoint_previous.pt"
+        in capsys.readouterr().err
+    )
+    for name in ("checkpoint.pt", "checkpoint_previous.pt"):
+        (tmp_path / name).write_bytes(b"")
+    with pytest.raises(
+        UserError, match=r"both .*checkpoint\.pt and .*checkpoint_previous\.pt are damaged.* copy"
+    ):
+        checkpoint.load_newest(tmp_path)
+
+
+def test_kill_at_any_step_of_a_save_leaves_a_checkpoint(tmp_path, monkeypatch):
+    class Killed(BaseException):
+        pass
+
+    for step in range(8):
+        folder = tmp_path / str(step)
+        folder.mkdir()
+        checkpoint.save_newest(1, folder)
+        left = iter(range(step))
+
+        def dying(function, left=left):
+            def call(*arguments, **named):
+                if next(left, None) is None:
+                    raise Killed
+                return function(*arguments, **named)
+
+            return call
+
+        with monkeypatch.context() as patch:
+            # All writes to the disk; a killed process does not clean up either.
+            for owner, name in [
+                (Path, "write_bytes"),
+                (os, "fsync"),
+                (Path, "replace"),
+                (Path, "unlink"),
+            ]:
+                patch.setattr(owner, name, dying(getattr(owner, name)))
+            try:
+                checkpoint.save_newest(2, folder)
+                died = False
+            except Killed:
+                died = True
+        assert checkpoint.load_newest(folder) in ((1, 2) if died else (2,))
+        remove_unfinished(folder)
+        checkpoint.save_newest(3, folder)
+        assert checkpoint.load_newest(folder) == 3
+        assert {file.name for file in folder.iterdir()} <= {
+            "checkpoint.pt",
+            "checkpoint_previous.pt",
+        }
+    assert not died

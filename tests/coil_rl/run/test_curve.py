@@ -1,0 +1,94 @@
+import pytest
+import torch
+from torchrl.envs import Compose, RewardSum, TransformedEnv
+from worlds import driving_measures, perturbed
+
+from coil_rl.envs import ConeTrackEnv
+from coil_rl.errors import UserError
+from coil_rl.guides import SplineGuide
+from coil_rl.learners import PPO
+from coil_rl.run.curve import EvaluationCurve, measures
+from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.transforms import GuideActions
+
+CASES = 5
+WATCH = {
+    "episode": {"crashed": ["info", "crashed"]},
+    "step": {"smoothness": ["info", "smoothness"]},
+}
+
+
+def world(tracks, drivers=1, *transforms):
+    env = ConeTrackEnv(
+        tracks, drivers * CASES, starts=CASES, assignment="cyclic", rate=6, time_limit=4
+    )
+    return TransformedEnv(
+        env, Compose(RewardSum(), GuideActions({"spline": SplineGuide()}), *transforms)
+    )
+
+
+def curve(folder, tracks, policy, **options):
+    envs = dict.fromkeys(("evaluation", "selection"), lambda drivers: world(tracks, drivers))
+    return EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
+
+
+def test_driver_that_never_changes_gives_a_flat_line(tmp_path, rings):
+    line = curve(tmp_path, rings, PPO(world(rings)).policy)
+    for frames in (0, 100, 200):
+        line.keep(frames)
+    rows = line.drive([0, 100, 200])
+    assert list(rows[0]) == line.names
+    assert rows[0] == rows[1] == rows[2]
+    assert rows[0]["evaluation/return"] == rows[0]["selection/return"]
+
+
+def test_numbers_are_those_of_each_policy_driven_alone(tmp_path, rings):
+    policy = PPO(world(rings)).policy
+    line = curve(tmp_path, rings, policy)
+    expected = []
+    for frames in (0, 100):
+        policy.load_state_dict(perturbed(policy, seed=frames))
+        line.keep(frames)
+        expected.append(evaluate_policy(world(rings), policy, measures=driving_measures()).episodes)
+    assert expected[0] != expected[1]
+    for row, episodes in zip(line.drive([0, 100]), expected, strict=True):
+        for name, key in {
+            "return": "reward",
+            "crashed": "crashed",
+            "smoothness": "smoothness",
+        }.items():
+            mean = sum(episode[key] for episode in episodes) / CASES
+            assert row[f"evaluation/{name}"] == pytest.approx(mean, rel=1e-4, abs=1e-5)
+
+
+def test_driving_leaves_the_random_numbers_alone(tmp_path, rings):
+    line = curve(tmp_path, rings, PPO(world(rings)).policy)
+    line.keep(0)
+    before = torch.get_rng_state()
+    line.drive([0])
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_kept_policies_are_spread_over_the_run_and_each_is_driven_once(tmp_path, rings):
+    policy = PPO(world(rings)).policy
+    for updates, points, batches in [(49, 16, 1), (49, 16, 3), (3, 16, 1), (1, 1, 4), (100, 7, 7)]:
+        line = curve(tmp_path, rings, policy, points=points, batches=batches)
+        kept = line.kept(updates)
+        assert (kept[0], kept[-1], len(kept)) == (0, updates, min(points, updates) + 1)
+        driven = [line.batch(update, updates) for update in range(updates + 1)]
+        assert [update for batch in driven for update in batch] == kept
+        assert sum(map(bool, driven)) == min(batches, updates)
+
+
+def test_missing_policy_is_named(tmp_path, rings):
+    line = curve(tmp_path, rings, PPO(world(rings)).policy)
+    with pytest.raises(UserError, match=r"there is no file .*policies/000000000128\.pt"):
+        line.drive([128])
+
+
+def test_guide_measured_from_its_cases_does_not_crash(rings):
+    values = measures(world(rings), SplineGuide(), WATCH)
+    assert {name: value.shape for name, value in values.items()} == dict.fromkeys(
+        ("return", "crashed", "smoothness"), (CASES,)
+    )
+    assert not values["crashed"].any()

@@ -1,0 +1,326 @@
+import csv
+import re
+
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torchrl.envs import Compose, RewardSum, Transform, TransformedEnv
+from torchrl.record.loggers import TensorboardLogger
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.errors import UserError
+from coil_rl.guides import RandomGuide, SplineGuide, SplineMemoryGuide
+from coil_rl.learners import PPO
+from coil_rl.run import checkpoint
+from coil_rl.run.curve import EvaluationCurve
+from coil_rl.run.experiment import Experiment, Metrics, watched_keys
+from coil_rl.run.rollout import Rollout
+from coil_rl.transforms import GuideActions
+
+WATCH = {"episode": {"crashed": ["info", "crashed"]}, "step": {"cone": ["info", "reward", "cone"]}}
+
+
+def experiment(folder, seed=0, frames=16 * 8 * 4, guide=None, extra=()):
+    torch.manual_seed(seed)
+    env = ConeTrackEnv(shipped_tracks("train"), 16, seed=seed)
+    env = TransformedEnv(
+        env, Compose(GuideActions({"guide": guide or SplineGuide()}), *extra, RewardSum())
+    )
+    learner = PPO(env, ["observation", "guide_action"], epochs=2, minibatches=2, seed=seed)
+    rollout = Rollout(env, learner.policy, 8, [*learner.keys, *watched_keys(env, WATCH)])
+    folder.mkdir(exist_ok=True)
+    curve = EvaluationCurve(
+        folder,
+        learner.policy,
+        dict.fromkeys(("evaluation", "selection"), cases),
+        points=4,
+        batches=2,
+    )
+    return Experiment(
+        learner, rollout, frames, folder, watch=WATCH, checkpoint_every=2, curve=curve
+    )
+
+
+def cases(drivers):
+    env = ConeTrackEnv(
+        shipped_tracks("test"), 3 * drivers, assignment="cyclic", rate=6, time_limit=2
+    )
+    return TransformedEnv(env, Compose(GuideActions({"guide": SplineGuide()}), RewardSum()))
+
+
+def contents(folder):
+    return {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def as_written(rows):
+    return str([{**row, "frames": int(row["frames"])} for row in rows])
+
+
+def test_run_writes_its_files_and_a_row_per_update(tmp_path):
+    rows = experiment(tmp_path / "run").run()
+    names = {
+        "checkpoint.pt",
+        "checkpoint_previous.pt",
+        "metrics.csv",
+        "policy_best.pt",
+        "policy_last.pt",
+    }
+    kept = {f"policies/{128 * update:012d}.pt" for update in range(5)}
+    assert set(contents(tmp_path / "run")) == names | kept
+    with (tmp_path / "run" / "metrics.csv").open() as file:
+        written = list(csv.DictReader(file))
+    assert (
+        [float(row["frames"]) for row in written]
+        == [row["frames"] for row in rows]
+        == [0, 128, 256, 384, 512]
+    )
+    assert {"train/return", "train/crashed", "train/cone", "learner/loss_critic"} <= set(written[0])
+
+
+def test_same_seed_same_metrics(tmp_path):
+    for name, seed in [("first", 1), ("second", 1), ("other", 2)]:
+        experiment(tmp_path / name, seed).run()
+    logs = [(tmp_path / name / "metrics.csv").read_text() for name in ("first", "second", "other")]
+    assert logs[0] == logs[1] != logs[2]
+
+
+class Killed(BaseException):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("guide", "last"), [(RandomGuide, 1), (RandomGuide, 5), (SplineMemoryGuide, 4)]
+)
+def test_stopped_and_resumed_run_ends_with_the_same_files(tmp_path, guide, last, capsys):
+    frames = 16 * 8 * 5
+    rows = experiment(tmp_path / "whole", frames=frames, guide=guide()).run()
+
+    stopped = experiment(tmp_path / "stopped", frames=frames, guide=guide())
+    update, calls = stopped.learner.update, []
+
+    def dying(batch, progress):
+        calls.append(progress)
+        if len(calls) == last:
+            raise Killed
+        return update(batch, progress)
+
+    stopped.learner.update = dying
+    with pytest.raises(Killed):
+        stopped.run()
+
+    # Once there is a checkpoint, nothing may depend on the seed of the second process.
+    again = experiment(
+        tmp_path / "stopped", seed=9 if last > 2 else 0, frames=frames, guide=guide()
+    )
+    again.resume()
+    assert as_written(again.run()) == str(rows)
+    place = (
+        f"after update {(last - 1) // 2 * 2}"
+        if last > 2
+        else "from the beginning: there is no checkpoint yet"
+    )
+    assert f"{tmp_path / 'stopped'} continues {place}\n" in capsys.readouterr().err
+    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
+    assert whole.keys() == resumed.keys()
+    for name in whole.keys() - {"checkpoint.pt", "checkpoint_previous.pt"}:
+        assert whole[name] == resumed[name], name
+    finished = experiment(tmp_path / "stopped", seed=9, frames=frames, guide=guide())
+    finished.resume()
+    assert as_written(finished.run()) == str(rows)
+    assert contents(tmp_path / "stopped") == resumed
+
+
+def test_checkpoint_of_another_run_is_refused(tmp_path):
+    def resumed(**identity):
+        run = experiment(tmp_path, frames=16 * 8)
+        run.identity = identity
+        run.resume()
+
+    checkpoint.save_newest({"policy": 1}, tmp_path)
+    with pytest.raises(
+        UserError, match=r"checkpoint\.pt is damaged \(it lacks identity\); put the files"
+    ):
+        resumed()
+    checkpoint.save_newest(
+        experiment(tmp_path).state_dict() | {"identity": {"threads": 1}, "learner": {}}, tmp_path
+    )
+    with pytest.raises(
+        UserError, match=r"checkpoint\.pt belongs to a run with threads=1, not 2; put the files"
+    ):
+        resumed(threads=2)
+    with pytest.raises(UserError, match=r"checkpoint\.pt is damaged \(it lacks policy\)"):
+        resumed(threads=1)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: text.replace(b"128,", b",", 1),
+        lambda text: text.replace(b"\n", b"\n\xff", 1),
+        lambda text: text.partition(b"\n")[2] * 2,
+    ],
+    ids=["empty cell", "bytes", "no header"],
+)
+def test_damaged_log_is_refused(tmp_path, damage):
+    experiment(tmp_path, frames=16 * 8 * 2).run()
+    log = tmp_path / "metrics.csv"
+    log.write_bytes(damage(log.read_bytes()))
+    with pytest.raises(UserError, match=r"metrics\.csv is damaged .*; put the whole file back"):
+        experiment(tmp_path).resume()
+
+
+@pytest.mark.parametrize("method", ["drive", "keep"])
+def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, method, monkeypatch):
+    rows = experiment(tmp_path / "whole").run()
+    stopped = experiment(tmp_path / "stopped")
+    called, calls = getattr(stopped.curve, method), []
+
+    def dying(frames):
+        calls.append(frames)
+        if len(calls) == (2 if method == "drive" else 5):  # the last one of the run
+            raise Killed
+        return called(frames)
+
+    monkeypatch.setattr(stopped.curve, method, dying)
+    with pytest.raises(Killed):
+        stopped.run()
+    again = experiment(tmp_path / "stopped", seed=9)
+    again.resume()
+    assert as_written(again.run()) == as_written(rows)
+    whole, resumed = contents(tmp_path / "whole"), contents(tmp_path / "stopped")
+    assert [name for name in whole if whole[name] != resumed[name]] in (
+        [],
+        ["checkpoint_previous.pt"],
+    )
+
+
+def test_best_policy_is_chosen_in_the_cases_of_selection(tmp_path):
+    run = experiment(tmp_path / "run")
+    drive = run.curve.drive
+    run.curve.drive = lambda frames: [
+        row | {"selection/return": -abs(f - 256)}
+        for f, row in zip(frames, drive(frames), strict=True)
+    ]
+    run.run()
+    files = contents(tmp_path / "run")
+    assert files["policy_best.pt"] == files["policies/000000000256.pt"] != files["policy_last.pt"]
+
+
+class WriteNaN(Transform):
+    """Write NaN into an entry of one car at one step of the run."""
+
+    def __init__(self, key, step, car):
+        super().__init__(in_keys=[key], out_keys=[key])
+        self.step, self.car, self.steps = step, car, 0
+
+    def _call(self, next_tensordict):
+        self.steps += 1
+        if self.steps == self.step:
+            value = next_tensordict[self.in_keys[0]].clone()
+            value[self.car] = torch.nan
+            next_tensordict[self.in_keys[0]] = value
+        return next_tensordict
+
+    def _reset(self, tensordict, tensordict_reset):
+        return tensordict_reset
+
+
+# At step 20 the env itself raises an error, because of the NaN; step 24 is the last of a batch.
+@pytest.mark.parametrize(
+    ("key", "step"), [("observation", 20), ("observation", 24), ("reward", 24)]
+)
+def test_nan_from_the_env_stops_the_run_and_keeps_the_checkpoint(tmp_path, key, step):
+    good = experiment(tmp_path / "good", frames=16 * 8 * 2)
+    good.run()
+    run = experiment(tmp_path / "run", extra=[WriteNaN(key, step, 5)])
+    message = f"next/{key} is nan at step {step} of row 5; the last good checkpoint is kept"
+    with pytest.raises(
+        UserError, match=f"{message}.*{re.escape(f'coil-train resume={tmp_path}/run')}"
+    ):
+        run.run()
+    ours, theirs = (checkpoint.load(tmp_path / name / "checkpoint.pt") for name in ("run", "good"))
+    assert ours["updates"] == theirs["updates"] == 2
+    assert torch.equal(ours["rollout"]["env"]["pose"], theirs["rollout"]["env"]["pose"])
+    corrected = experiment(tmp_path / "run", seed=9)
+    corrected.resume()
+    corrected.run()
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("loss", "learner/loss_critic is nan in update 4"),
+        ("weight", "learner/critic/.* is nan after update 4"),
+    ],
+)
+def test_nan_in_a_loss_or_a_weight_stops_the_run_and_keeps_the_checkpoint(tmp_path, place, message):
+    run = experiment(tmp_path / "run")
+    update = run.learner.update
+
+    def write_nan(batch, progress):
+        metrics = update(batch, progress)
+        if run.updates == 3 and place == "loss":
+            return metrics | {"loss_critic": float("nan")}
+        if run.updates == 3:
+            with torch.no_grad():
+                next(iter(run.learner.critic.parameters())).fill_(torch.nan)
+        return metrics
+
+    run.learner.update = write_nan
+    with pytest.raises(UserError, match=f"{message}; the last good checkpoint is kept"):
+        run.run()
+    assert checkpoint.load(tmp_path / "run" / "checkpoint.pt")["updates"] == 2
+    assert not (tmp_path / "run" / "policy_last.pt").exists()
+
+
+ROWS = [
+    {"frames": 10 * update, "loss": 1 / update, "return": float("nan")} for update in range(1, 6)
+]
+
+
+def write_metrics(path, rows, logger=None):
+    metrics = Metrics(path, logger)
+    for row in rows:
+        metrics.append(row)
+    return metrics
+
+
+@pytest.mark.parametrize(
+    ("count", "torn"), [(0, b""), (1, b"60,0.1"), (3, b"60,0.1,nan\r\n70"), (5, b"60,0.1")]
+)
+def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
+    whole, stopped = tmp_path / "whole.csv", tmp_path / "stopped.csv"
+    write_metrics(whole, ROWS)
+    write_metrics(stopped, ROWS)
+    with stopped.open("ab") as file:
+        file.write(torn)
+    again = Metrics(stopped)
+    assert str(again.truncate(count)) == str(
+        [{k: float(v) for k, v in row.items()} for row in ROWS[:count]]
+    )
+    for row in ROWS[count:]:
+        again.append(row)
+    assert stopped.read_bytes() == whole.read_bytes()
+
+
+def test_missing_rows_are_refused(tmp_path):
+    write_metrics(tmp_path / "metrics.csv", ROWS[:2])
+    with pytest.raises(UserError, match="has 2 of the 3 rows that belong to the checkpoint"):
+        Metrics(tmp_path / "metrics.csv").truncate(3)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_tensorboard_shows_no_point_twice(tmp_path, count):
+    path = tmp_path / "metrics.csv"
+    write_metrics(path, ROWS, TensorboardLogger("board", str(tmp_path))).flush()
+    again = Metrics(path, TensorboardLogger("board", str(tmp_path)))
+    again.truncate(count)
+    for row in ROWS[count:]:
+        again.append(row)
+    again.flush()
+    points = EventAccumulator(str(tmp_path / "board")).Reload().Scalars("loss")
+    assert [point.step for point in points] == [10, 20, 30, 40, 50]

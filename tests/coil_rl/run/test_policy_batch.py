@@ -1,0 +1,85 @@
+import copy
+
+import pytest
+import torch
+from sklearn.linear_model import LinearRegression
+from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+from worlds import cones, perturbed
+
+from coil_rl.imitation import Imitation, SklearnRegressor
+from coil_rl.learners import DQN, PPO, SAC
+from coil_rl.run.policy_batch import (
+    PoliciesInTurn,
+    RecordedPolicy,
+    StackedPolicies,
+    is_tensors,
+    policy_batch,
+)
+from coil_rl.transforms import DiscreteActions
+
+KEYS = ["observation", "guide_action"]
+
+
+def observations(env):
+    advice = torch.rand(15, *env.observation_spec["guide_action"].shape[1:])
+    return TensorDict({"observation": torch.rand(15, 20), "guide_action": advice}, [15])
+
+
+@pytest.mark.parametrize("learner", ["ppo", "sac", "dqn", "forest"])
+def test_batch_of_policies_acts_like_each_of_them(learner):
+    env = cones(*([DiscreteActions()] if learner == "dqn" else []))
+    states = []
+    if learner == "forest":
+        imitation = Imitation(env, regressor=SklearnRegressor(LinearRegression()), validate=False)
+        policy = imitation.policy
+        for seed in range(3):
+            torch.manual_seed(seed)
+            imitation.regressor.fit(torch.rand(30, 20), torch.rand(30, 1))
+            states.append(copy.deepcopy(policy.state_dict()))
+    else:
+        policy = {"ppo": PPO, "sac": SAC, "dqn": DQN}[learner](env, KEYS).policy
+        states = [perturbed(policy, seed) for seed in range(3)]
+    rows = observations(env)
+    batch = policy_batch(policy, states)
+    assert isinstance(batch, PoliciesInTurn if learner == "forest" else StackedPolicies)
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        together = batch(rows.clone())["action"]
+        for index, state in enumerate(states):
+            policy.load_state_dict(state)
+            part = slice(5 * index, 5 * index + 5)
+            torch.testing.assert_close(together[part], policy(rows[part].clone())["action"])
+
+
+@pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC])
+@pytest.mark.parametrize("learner", [PPO, SAC, DQN])
+def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
+    env = cones(*([DiscreteActions()] if learner is DQN else []))
+    policy = learner(env, KEYS).policy
+    assert is_tensors(policy)
+    recorded, actions = RecordedPolicy(policy), []
+    for each in (policy, recorded):
+        torch.manual_seed(0)
+        with torch.no_grad(), set_exploration_type(kind):
+            actions.append([each(observations(env))["action"] for _ in range(3)])
+    for expected, action in zip(*actions, strict=True):
+        torch.testing.assert_close(action, expected)
+    assert len(recorded.recorded) == 1
+
+
+def test_recorded_policy_takes_any_number_of_rows_and_mode():
+    env = cones()
+    policy = PPO(env, KEYS).policy
+    recorded = RecordedPolicy(policy)
+    rows = observations(env)
+    with torch.no_grad():
+        for kind, part in [
+            (ExplorationType.RANDOM, rows),
+            (ExplorationType.DETERMINISTIC, rows[:4]),
+        ]:
+            with set_exploration_type(kind):
+                assert len(recorded(part.clone())["action"]) == len(part)
+        with set_exploration_type(ExplorationType.DETERMINISTIC):
+            torch.testing.assert_close(
+                recorded(rows.clone())["action"], policy(rows.clone())["action"]
+            )
