@@ -1,7 +1,8 @@
-"""The brake of an anchored policy: drives in fixed cases of the training decide how much of its guide it keeps."""
+"""The fixed cases of the training in which candidate policies are evaluated between updates."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -10,67 +11,60 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
-from coil_rl.learners.anchor import Anchor, Look
+from coil_rl.learners.learner import CaseResults
 from coil_rl.train.evaluation import Totals, episodes
 from coil_rl.train.measures import Measure
 from coil_rl.train.policy_batch import policy_batch
 
+RANDOM_SEED = 0  # of random actions: the same ones at each call
 
-@dataclass(eq=False)
-class Brake:
-    """Decides before training and at each look of a run how strongly the policy is anchored; a `Probe`."""
 
-    anchor: Anchor  # of the policy
-    policy: TensorDictModuleBase  # of the learner; copies of it act
-    build: Callable[[int], EnvBase]  # makes an env with all cases for a number of policies
-    failure: Measure | None = (
-        None  # measure that is true for an episode that failed, if there is one
-    )
-    names: Sequence[str] = (
-        "look/return",
-        "look/lower_return",
-        "look/failures",
-        "look/lower_failures",
-        "look/back",
-    )
+@dataclass(frozen=True)
+class SelectionCases:
+    """The cases of a run in which policies are selected, the `Cases` of its learner.
 
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether there is a look after an update."""
-        return update == 0 or self.anchor.due(update, updates)
+    Args:
+        policy: of the learner; copies of it act.
+        build: makes an env with all cases for each of a number of policies; takes that number and
+            the number of cases.
+        count: C, number of cases.
+        failure: measure that is true for an episode that failed; None: no episode fails.
+    """
 
-    def __call__(self, update: int) -> dict[str, float]:
-        """Look, decide, and return the numbers by name."""
-        back = False
-        if update == 0:
-            look = self._look(self.anchor.starts())
-            env = self.build(1)
-            with torch.random.fork_rng():
-                torch.manual_seed(0)
-                random = self._drive(env, env.rand_action)["return"]
-            self.anchor.begin(look, random, self.policy)
-        else:
-            look = self._look(self.anchor.tried())
-            back = self.anchor.decide(look, self.policy)
-        numbers = (look.score(0), look.score(1), *look.failures[:2], back)
-        return dict(zip(self.names, map(float, numbers), strict=True))
+    policy: TensorDictModuleBase
+    build: Callable[[int, int], EnvBase]
+    count: int
+    failure: Measure | None = None
 
-    def _look(self, weights: Sequence[Tensor]) -> Look:
-        """Drive all cases with each of some weights of the guides."""
-        (key,) = [
-            name for name, value in self.policy.named_buffers() if value is self.anchor.head.weight
-        ]
-        states = [{**self.policy.state_dict(), key: weight} for weight in weights]
+    def take(self, count: int) -> "SelectionCases":
+        """Return that many cases."""
+        return replace(self, count=count)
+
+    def evaluate(self, states: Sequence[dict[str, Any]]) -> CaseResults:
+        """Evaluate copies of the policy, each with another state, in all cases."""
         with torch.random.fork_rng():
-            results = self._drive(self.build(len(states)), policy_batch(self.policy, states))
-        parts = {name: values.view(len(states), -1) for name, values in results.items()}
-        failures = parts["failure"].sum(1).tolist() if "failure" in parts else [0] * len(states)
-        return Look(parts["return"], [int(count) for count in failures])
+            env = self.build(len(states), self.count)
+            results = self._totals(env, policy_batch(self.policy, states))
+        returns = results["return"].view(len(states), -1)
+        failures = [0] * len(states)
+        if self.failure is not None:
+            counts = results["failure"].view(len(states), -1).sum(1)
+            failures = [int(count) for count in counts.tolist()]
+        return CaseResults(returns, failures)
+
+    def evaluate_random(self) -> Tensor:
+        """Return the returns of random actions, [C], which are the same at each call."""
+        env = self.build(1, self.count)
+        with torch.random.fork_rng():
+            torch.manual_seed(RANDOM_SEED)
+            return self._totals(env, env.rand_action)["return"]
 
     @torch.no_grad()
-    def _drive(
+    def _totals(
         self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
     ) -> dict[str, Tensor]:
-        failure = {"failure": self.failure} if self.failure else {}
+        """Return return and failure of an episode of each row of an env, by name."""
+        failure = {} if self.failure is None else {"failure": self.failure}
         totals = Totals({"return": Measure("episode_reward", "last")} | failure)
         with tqdm(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
             for after, running in episodes(env, policy, tick=bar.update):

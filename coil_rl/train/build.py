@@ -13,6 +13,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 from coil_rl.compiled import Compiled
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
+from coil_rl.learners.learner import Learner
 from coil_rl.train.arguments import check_arguments, yaml_text
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
@@ -209,7 +210,9 @@ def build_learner(
     `guides` are for a learner that trains guides.
     """
     arguments: dict[str, Any] = {"guides": dict(guides or {})} if trains_guides(config) else {}
-    return build(config.learner, "learner", env=env, in_keys=observed_keys(config), **arguments)
+    keys = observed_keys(config)
+    learner: Learner = build(config.learner, "learner", Learner, env=env, in_keys=keys, **arguments)
+    return learner
 
 
 def observed_keys(config: DictConfig) -> list[NestedKey]:
@@ -219,7 +222,8 @@ def observed_keys(config: DictConfig) -> list[NestedKey]:
 
 def learner_kind(config: DictConfig) -> str:
     """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`."""
-    return str(getattr(_target(config.learner.get("_target_"), "learner"), "kind", "agent"))
+    target = _target(config.learner.get("_target_"), "learner")
+    return target.kind if isinstance(target, type) and issubclass(target, Learner) else "agent"
 
 
 def trains_guides(config: DictConfig) -> bool:

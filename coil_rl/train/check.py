@@ -216,12 +216,13 @@ def _check_training(config: DictConfig) -> None:
         config, env, guides_with_untrained_proxies(config) if guides else None
     )
     frames = config.budget.num_envs * config.budget.steps
-    minibatches = getattr(learner, "minibatches", 0)
-    if 2 * minibatches > frames:
-        problem = "leaves less than 2 frames to each minibatch, too few to standardise advantages"
-        size = f"a batch has budget.num_envs x budget.steps = {frames} frames"
-        raise UserError(f"learner.minibatches={minibatches} {problem}; {size}")
-    grouped = config.track and getattr(learner, "validate", False) and learner.group_key is not None
+    try:
+        learner.check_batch(frames)
+    except ValueError as error:
+        raise UserError(
+            f"learner.{error}; a batch has budget.num_envs x budget.steps = {frames} frames"
+        ) from error
+    grouped = config.track and learner.validates_groups
     if grouped and len(build.build(config.track.train, "track.train")) == 1:
         remedy = "set learner.group_key=null, or learner.validate=false"
         raise UserError(

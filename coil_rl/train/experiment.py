@@ -12,17 +12,17 @@ from contextlib import contextmanager
 from dataclasses import KW_ONLY, dataclass, field
 from operator import itemgetter
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import pandas as pd
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import whole_file
+from coil_rl.learners.learner import Callback, Learner
 from coil_rl.report.runs import CHOICE, RETURN, read_curve
 from coil_rl.train import checkpoint
 from coil_rl.train.curve import EvaluationCurve, Watch
@@ -30,36 +30,6 @@ from coil_rl.train.rollout import Rollout
 from coil_rl.train.run_folder import check_same
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
-
-
-class Learner(Protocol):
-    """Update of a policy from batches."""
-
-    kind: ClassVar[
-        str
-    ]  # "agent" learns from rewards, "imitation" from a guide's actions, "guides" trains guides too
-    policy: TensorDictModuleBase  # collects the batches
-
-    def update(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Learn from a batch [B, T] and return metrics."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next update depends on, except its batch."""
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state that `state_dict` returned."""
-
-
-class Probe(Protocol):
-    """Expensive measurement before the first update and after some updates."""
-
-    names: Sequence[str]  # of the numbers
-
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether to measure after an update with these metrics; 0 is before the first one."""
-
-    def __call__(self, update: int) -> dict[str, float]:
-        """Return the numbers by name."""
 
 
 @dataclass(eq=False)
@@ -87,7 +57,7 @@ class Experiment:
     # ("step").
     watch: Watch = field(default_factory=dict)
     checkpoint_every: int = 10  # updates between two checkpoints
-    probe: Probe | None = None
+    callbacks: Sequence[Callback] = ()
     curve: EvaluationCurve | None = None  # drives the kept policies
     # Values of the configuration, which a checkpoint keeps and a resumed run must have.
     identity: Mapping[str, Any] = field(default_factory=dict)
@@ -135,7 +105,7 @@ class Experiment:
             unit_scale=True,
             desc="train",
         ) as bar:
-            first = self._probe(updates, {}) if self.updates == 0 else {}
+            first = self._call_back(updates, {}) if self.updates == 0 else {}
             evaluated = self._newest_evaluation()
             while True:
                 if self._evaluate(updates):
@@ -143,7 +113,7 @@ class Experiment:
                 if self.updates == updates:
                     break
                 row = self.update(self.updates / updates)
-                row |= self._probe(updates, row)
+                row |= self._call_back(updates, row)
                 if not self.rows:
                     self._log({**dict.fromkeys(row, math.nan), "frames": 0, **first})
                 self._log(row)
@@ -212,12 +182,15 @@ class Experiment:
                     raise UserError(f"{name} is {value} in update {self.updates}")
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
-    def _probe(self, updates: int, row: Mapping[str, float]) -> dict[str, float]:
-        """Return the numbers of the probe, or NaN if they are not due."""
-        if self.probe is None:
-            return {}
-        due = self.probe.due(self.updates, updates, row)
-        return self.probe(self.updates) if due else dict.fromkeys(self.probe.names, math.nan)
+    def _call_back(self, updates: int, row: Mapping[str, float]) -> dict[str, float]:
+        """Return the numbers of the callbacks, NaN where one is not due."""
+        numbers: dict[str, float] = {}
+        for callback in self.callbacks:
+            if callback.due(self.updates, updates, row):
+                numbers |= callback.after_update(self.updates)
+            else:
+                numbers |= dict.fromkeys(callback.names, math.nan)
+        return numbers
 
     @contextmanager
     def _resume_hint(self) -> Iterator[None]:

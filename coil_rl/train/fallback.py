@@ -102,7 +102,7 @@ def build_fallback(
             problem = "its agent has no guide in its env; train it with method=coil"
         elif any(isinstance(part, (MixedAction, ResidualAction)) for part in env.modules()):
             problem = "its env adds the actions of agent and guide, so the guide cannot act alone"
-        elif getattr(learner, "critic", None) is None:
+        elif learner.critic is None:
             problem = "its learner has no value function; train it with learner=ppo"
     if problem:
         raise UserError(

@@ -14,13 +14,14 @@ from torchrl.envs import EnvBase
 
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
+from coil_rl.learners.learner import Callback, Learner
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.train import build, checkpoint, distillation
-from coil_rl.train.brake import Brake
+from coil_rl.train.brake import SelectionCases
 from coil_rl.train.curve import EvaluationCurve, measures
 from coil_rl.train.evaluate_run import driver_names, evaluate_run, report_outcome
-from coil_rl.train.experiment import Experiment, Probe, watched_keys
+from coil_rl.train.experiment import Experiment, watched_keys
 from coil_rl.train.fallback import build_fallback
 from coil_rl.train.load import PROXIES, load_guides, weights_file
 from coil_rl.train.measures import measures_of
@@ -94,7 +95,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         logger=build.build(config.logger, "logger") if config.logger else None,
         watch=config.watch,
         checkpoint_every=config.checkpoint_every,
-        probe=_probe(config, learner),
+        callbacks=_callbacks(config, learner),
         curve=_curve(config, folder, learner.policy),
         identity=flat(config),
     )
@@ -113,8 +114,7 @@ def _train(config: DictConfig, folder: Path, resumed: bool) -> torch.nn.Module:
         draw_learning_curves(
             {config.label: [rows]}, folder / "learning_curve.png", guides=guide_returns
         )
-    if hasattr(learner, "export"):
-        learner.export(folder)
+    learner.export(folder)
     learner.policy.load_state_dict(
         checkpoint.load(weights_file(folder, config.evaluation.policy), config.device)
     )
@@ -135,7 +135,7 @@ def _distil(config: DictConfig, folder: Path) -> None:
 
 
 class GuideReturns:
-    """Mean return of each guide of a learner in the cases of the evaluation, with its present parameters; a `Probe`."""
+    """Mean return of each guide of a learner in the cases of the evaluation; a `Callback`."""
 
     def __init__(self, config: DictConfig, guides: Mapping[str, TensorDictModuleBase]) -> None:
         self.config, self.guides = config, guides
@@ -146,8 +146,8 @@ class GuideReturns:
         """Return whether the guides have changed, or the training begins or ends."""
         return update in (0, updates) or bool(self.each_phase and row["learner/guides_changed"])
 
-    def __call__(self, update: int) -> dict[str, float]:
-        """Return the means by their names in the log."""
+    def after_update(self, update: int) -> dict[str, float]:
+        """Return the means with the present parameters, by their names in the log."""
         return dict(zip(self.names, _guide_returns(self.config, self.guides).values(), strict=True))
 
 
@@ -174,24 +174,26 @@ def _guide_returns(
     return dict(zip(driver_names(guides), returns.tolist(), strict=True))
 
 
-def _probe(config: DictConfig, learner: Any) -> Probe | None:
-    """Return what a run measures besides: its guides if it trains them, or an anchored policy."""
+def _callbacks(config: DictConfig, learner: Learner) -> list[Callback]:
+    """Return what a run calls between updates: the callbacks of its learner, and a measurement of trained guides."""
+    callbacks = [*learner.callbacks(_selection_cases(config, learner))]
     if build.trains_guides(config):
-        return GuideReturns(config, learner.guides)
-    if getattr(learner, "anchor", None) is None:
-        return None
-    if SELECTION not in config.evaluation.curve.cases:
-        raise UserError(
-            f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its drives; give it"
-        )
+        callbacks.append(GuideReturns(config, learner.guides))
+    return callbacks
+
+
+def _selection_cases(config: DictConfig, learner: Learner) -> SelectionCases:
     failure = measures_of(config.evaluation.measures).get("crashed")
-    count = learner.anchor.cases or (24 if failure is None else 96)
-    return Brake(
-        learner.anchor,
-        learner.policy,
-        partial(_build_cases, config, SELECTION, count=count),
-        failure,
-    )
+
+    def make(policies: int, count: int) -> EnvBase:
+        if SELECTION not in config.evaluation.curve.cases:
+            raise UserError(
+                f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its drives; "
+                "give it"
+            )
+        return _build_cases(config, SELECTION, policies, count)
+
+    return SelectionCases(learner.policy, make, 24 if failure is None else 96, failure)
 
 
 def _build_cases(config: DictConfig, cases: str, drivers: int, count: int | None = None) -> EnvBase:
