@@ -21,12 +21,13 @@ from coil_rl.errors import UserError
 from coil_rl.imitation.regressors import Regressor
 from coil_rl.imitation.validation import cross_validate, scores
 from coil_rl.learners.encoders import ConcatObservations
+from coil_rl.learners.learner import Learner
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.run import checkpoint
 from coil_rl.transforms.action_space import ActionSpace, nested_key
 
 
-class Imitation:
+class Imitation(Learner):
     """The imitation learner.
 
     An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`.
@@ -137,6 +138,11 @@ class Imitation:
         self.regressor.fit(x, y)
         with torch.no_grad():
             return metrics | scores([self.regressor(x)], [y], "training")
+
+    @property
+    def validates_groups(self) -> bool:  # type: ignore[override]
+        """Whether an update validates on tracks that it leaves out."""
+        return self.validate and self.group_key is not None
 
     def export(self, folder: Path) -> None:
         """Save the data set as `dataset.pt` in the folder of a run."""

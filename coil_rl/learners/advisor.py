@@ -10,20 +10,24 @@ with D = -log pi_aux(g | s) for discrete actions, and for numbers the largest di
 mode of pi_aux.
 """
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
+from coil_rl.learners.advantages import standardise
+from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
-from coil_rl.learners.ppo import PPO, standardise
+from coil_rl.learners.ppo import PPO
+from coil_rl.schedules import Linear, Schedule
 
 
 class Advisor(PPO):
@@ -33,8 +37,29 @@ class Advisor(PPO):
         env: the env, with advice.
         in_keys: entries that the policies and the critic observe.
         alpha: the larger, the better a step must be imitated to be learned by imitation.
-        guide: row of the advice.
-        options: as for `PPO`.
+        guide: index of the guide in the advice.
+        hidden: widths of the hidden layers of all networks, without `network`.
+        network: architecture of the networks, without a memory; None: `Mlp(hidden)`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`.
+        action_scale: initial standard deviation of the policy.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
+            everywhere.
+        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
+            are clipped.
+        learning_rate: of Adam, a number or a schedule.
+        gamma: discount.
+        gae_lambda: lambda of generalised advantage estimation.
+        clip: clipping range of the probability ratio.
+        epochs: passes over each batch.
+        minibatches: minibatches per pass.
+        entropy: coefficient of the entropy bonus, a number or a schedule.
+        critic: coefficient of the critic's loss.
+        max_grad_norm: gradients are scaled down to this norm.
+        compile: whether to compile the update, see `GradientStep`.
+        anchor: makes the policy start as its guide.
+        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`).
+        seed: of the order of minibatches.
     """
 
     with_memory = False
@@ -47,27 +72,71 @@ class Advisor(PPO):
         *,
         alpha: float = 8.0,
         guide: int = 0,
-        **options: Any,
+        hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
+        normalise: bool | Sequence[NestedKey] = False,
+        action_scale: float = 0.5,
+        action_gain: float = 0.01,
+        squash: bool = True,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip: float = 0.2,
+        epochs: int = 5,
+        minibatches: int = 16,
+        entropy: float | Schedule = 0.0,
+        critic: float = 0.5,
+        max_grad_norm: float = 0.5,
+        compile: bool | Literal["auto"] = "auto",
+        anchor: Anchor | None = None,
+        auxiliary: Sequence[Extension] = (),
+        seed: int = 0,
     ) -> None:
         check_range(0, alpha=alpha)
         self.alpha, self.imitation = alpha, KickstartLoss(guide=guide)
-        super().__init__(env, in_keys, **options)
+        super().__init__(
+            env,
+            in_keys,
+            hidden=hidden,
+            network=network,
+            normalise=normalise,
+            action_scale=action_scale,
+            action_gain=action_gain,
+            squash=squash,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip=clip,
+            epochs=epochs,
+            minibatches=minibatches,
+            entropy=entropy,
+            critic=critic,
+            max_grad_norm=max_grad_norm,
+            compile=compile,
+            anchor=anchor,
+            auxiliary=auxiliary,
+            seed=seed,
+        )
         self.keys += self.imitation.keys
         self.minibatch_keys += self.imitation.keys
 
-    def build_networks(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
-    ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
-        """Return policy and critic, and make the auxiliary policy."""
+    def build_policy(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        make_actor: Callable[..., ProbabilisticTensorDictSequential],
+    ) -> ProbabilisticTensorDictSequential:
+        """Return the policy, and make the auxiliary one."""
         self.imitator = networks.actor(env, in_keys, network, normaliser=self.normaliser)
-        return super().build_networks(env, in_keys, network, **options)
+        return super().build_policy(env, in_keys, network, make_actor)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters that the optimiser updates."""
         return [*super().parameter_groups(), [*self.imitator.parameters()]]
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses as `PPO`, with weighted `loss_objective`; `weight`: the mean of w; `loss_imitation`."""
+        """Return the losses of `PPO` with the weighted `loss_objective`, `loss_imitation`, and the mean `weight`."""
         losses = super().losses(minibatch)
         predicted = self.imitation.each(self.imitator, minibatch)
         weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()

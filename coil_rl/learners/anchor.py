@@ -11,36 +11,54 @@ actions w kappa is added to the logit of the advised action. Residual policies s
 keeps w = 1 never loses the guide's habits. A guide that is always wrong is of use too: with w = -1
 the first policy does the opposite, and |w| falls.
 
-Falling too far breaks the policy, and any update may, so there is a brake. At a few looks over the
-run the policy acts deterministically in fixed cases of the training, with today's weight and with
-one that is lower by a margin. If today's has become worse, the policy goes back to that of the best
-look. Else the weight falls, if the lower one fails in no further case: by a step, which is shorter
-than the margin, if it loses next to nothing; by the margin if it gains much.
+Falling too far breaks the policy, and any update may, so there is a brake. At a few check-ups over
+the run the policy is evaluated deterministically in fixed cases, with its present weight and with
+one that is lower by a margin. If the present one has become worse, the policy is rolled back to that
+of the best check-up. Else the weight falls, if the lower one fails in no further case: by a step,
+which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
+
+The parts are `AnchoredHead` in the policy, `AnchoredUpdate` in the updates, and `Brake` between
+them; `Anchor` has the numbers that a user chooses.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
-from tensordict import NestedKey
+from tensordict import NestedKey, TensorDictBase
 from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.heads import GlobalScaleHead
+from coil_rl.learners.learner import Callback, CaseResults, Cases
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 
 LIMIT = 0.97  # of advice before atanh, as a fraction of half the range of the action
 TIE = 1e-6  # decides between equal values
 FIRST = 0.9  # probability of the advised one of several actions at weight 1
+# A policy is rolled back if it loses more than both: this many tolerances, and this many standard
+# errors of the difference from the best check-up.
+ROLL_BACK_TOLERANCES, ROLL_BACK_ERRORS = 3, 2
+LARGE_GAIN_TOLERANCES = 3  # gain from which on the weight falls by the whole margin
+# Losses that do not train a policy, but values or, in SAC, the temperature; `loss` is that of DQN.
+NOT_OF_THE_POLICY = ("loss", "loss_critic", "loss_qvalue", "loss_alpha")
 
 
 class AnchoredHead(nn.Module):
     """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
 
-    `head` gives the mean and the standard deviation, or the logits. `pull` turns advice [*batch,
-    n_guides, A] into means or logits [*batch, n_guides, *event].
+    Args:
+        head: gives the mean and the standard deviation, or the logits.
+        pull: turns advice [*batch, n_guides, A] into means or logits [*batch, n_guides, *event].
+        guides: number of guides.
+        device: of the weights; None: PyTorch's default.
+
+    Attributes:
+        weight: of each guide, [n_guides]; at first 1 for the first guide and 0 for the others.
     """
 
     def __init__(
@@ -64,10 +82,14 @@ class AnchoredHead(nn.Module):
 
 
 class AnchoredValues(AnchoredHead):
-    """Values of actions with a bonus for the advised one: the weight times the range of the values of the state.
+    """Values of actions with a bonus for the advised one: the weight times the range of the values.
 
     So the advised action is taken unless its value is worse than the best one by more than this.
     With weight 1 it is taken always.
+
+    Args:
+        guides: number of guides.
+        device: of the weights; None: PyTorch's default.
     """
 
     def __init__(self, guides: int, device: torch.device | None = None) -> None:
@@ -81,7 +103,12 @@ class AnchoredValues(AnchoredHead):
 
 
 def pull_to_number(advice: Tensor, bounds: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Return the pull to advised numbers: themselves, or for a policy squashed to `bounds` what tanh maps near them."""
+    """Return the pull to advised numbers: themselves, or what tanh maps near them.
+
+    Args:
+        advice: [*batch, n_guides, *event].
+        bounds: lower and upper ones, [*event] each, of a policy that is squashed; None: it is not.
+    """
     if bounds is None:
         return advice
     low, high = bounds
@@ -106,168 +133,279 @@ def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
     return pull
 
 
-@dataclass(frozen=True)
-class Look:
-    """Drives of the training cases with some weights of the anchor."""
-
-    returns: Tensor  # [C] for each weight
-    failures: Sequence[int]  # number of failed cases for each weight
-
-    def score(self, index: int) -> float:
-        """Mean return with a weight."""
-        return float(self.returns[index].mean())
+def anchored_head(policy: nn.Module) -> tuple[str, AnchoredHead]:
+    """Return the anchored head of a policy, and its name among the modules of the policy."""
+    (found,) = [
+        (name, module)
+        for name, module in policy.named_modules()
+        if isinstance(module, AnchoredHead)
+    ]
+    return found
 
 
-@dataclass(eq=False, kw_only=True)
-class Anchor(Stateful):
-    """Start of a policy at the action of a guide, and the brake by which it lets go of it.
+@dataclass(frozen=True, kw_only=True)
+class Anchor:
+    """Settings of anchored COIL: the start of a policy at its guide, and how it lets go of it.
 
-    Before training the guides, their opposites (weight -1), the first policy without a guide and
-    random actions are compared in the same cases. The anchor holds if the best guide or opposite is
-    better than the last two by more than a standard error of the difference; otherwise the weight
-    is 0, and training is COIL. A value out of range is a `ValueError`.
+    A value out of range is a `ValueError`.
 
-    Attributes:
-        head: of the policy, see `AnchoredHead`.
-        unit: of rewards in updates of PPO and the like: the largest mean return, without its sign,
-            before training; 1 without an anchor. A critic starts near 0, and would follow returns
-            of hundreds for most of the run.
+    Args:
+        looks: number of check-ups over the run, besides the one before training.
+        cases: number of cases of a check-up; None: as many as the run has for this: 96 where
+            failures, often rare, are counted, else 24.
+        step: by which the weight falls at a check-up.
+        margin: by which the candidate weight of a check-up is lower; at least `step`.
+        tolerance: share of the guide's return that may be lost for a step; at least half a standard
+            error of that return may be. Three times as much below the best check-up, and two
+            standard errors of the difference, the policy is rolled back to that.
+        warmup: share of the run, from its start, in which only the critic learns.
+        noise: standard deviation of a policy that has one of its own, as that of PPO; with DQN
+            probability of a random action. A number or a schedule.
+        advice_key: entry with the advice, [*batch, n_guides, A].
     """
 
-    parts: ClassVar[tuple[str, ...]] = (
-        "holds",
-        "guide",
-        "sign",
-        "unit",
-        "guide_failures",
-        "allowed",
-        "best",
-        "kept",
-    )
-
-    looks: int = 32  # number of looks over the run, besides the one before training
-    cases: int | None = (
-        # C, number of cases of a look; None: 96 where failures, often rare, are counted, else 24
-        None
-    )
-    step: float = 0.05  # by which the weight falls at a look
-    margin: float = 0.3  # by which the weight that is tried at a look is lower; at least `step`
-    # Share of the guide's return that may be lost for a step; at least half a standard error of
-    # that return may be. Three times as much below the best look, and two standard errors of the
-    # difference, the policy goes back to that.
+    looks: int = 32
+    cases: int | None = None
+    step: float = 0.05
+    margin: float = 0.3
     tolerance: float = 0.01
-    warmup: float = 0.05  # share of the run, from its start, in which only the critic learns
-    # Standard deviation of a policy that has one of its own, as that of PPO; with DQN probability
-    # of a random action.
+    warmup: float = 0.05
     noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5)
-    advice_key: NestedKey = "guide_action"  # entry with the advice, [*batch, n_guides, A]
+    advice_key: NestedKey = "guide_action"
 
     def __post_init__(self) -> None:
         check_range(1, looks=self.looks)
         check_range(2, cases=2 if self.cases is None else self.cases)
         check_range(0, 1, step=self.step, tolerance=self.tolerance, warmup=self.warmup)
         check_range(self.step, 1, margin=self.margin)
-        self.noise_at = schedule(self.noise)
         check_range(0, above=True, noise=self.noise_at(0))
-        self.holds = True
-        self.allowed, self.best = math.nan, torch.empty(0)  # returns of the best look, [C]
-        self.guide, self.guide_failures, self.sign, self.unit = 0, 0, 1, 1.0
-        self.kept: dict[str, Tensor] = {}  # state of the policy at the best look
 
-    def attach(self, head: AnchoredHead) -> AnchoredHead:
-        """Choose the head of the policy, and return it."""
-        self.head = head
-        return head
+    def noise_at(self, progress: float) -> float:
+        """Return the noise at this progress of the run, in [0, 1]."""
+        return schedule(self.noise)(progress)
+
+
+class AnchoredUpdate(Stateful, Extension):
+    """What an anchor changes in the updates of a learner, and the state of the anchor.
+
+    At first only the critic learns, because it knows nothing about the returns of the guide.
+    Rewards are divided by their scale: a critic starts near 0, and would follow returns of hundreds
+    for most of the run. The noise of the policy follows a schedule.
+
+    Args:
+        anchor: the settings.
+        policy: has an `AnchoredHead`.
+
+    Attributes:
+        active: whether the policy is anchored; otherwise the weight is 0 and training is COIL.
+        guide: index of the guide to which it is anchored.
+        sign: 1, or -1 for the opposite of the guide.
+        reward_scale: of the rewards in updates of PPO and the like: the largest mean return,
+            without its sign, before training; 1 without an anchor.
+        guide_failures: number of cases in which the guide failed before training.
+        tolerance: return that may be lost for a step of the weight; NaN before training.
+        best_returns: of the best check-up, [C].
+        best_state: state of the policy at the best check-up.
+    """
+
+    parts: ClassVar[tuple[str, ...]] = (
+        "active",
+        "guide",
+        "sign",
+        "reward_scale",
+        "guide_failures",
+        "tolerance",
+        "best_returns",
+        "best_state",
+    )
+
+    def __init__(self, anchor: Anchor, policy: nn.Module) -> None:
+        self.anchor = anchor
+        _, self.head = anchored_head(policy)
+        self.active = True
+        self.guide, self.sign, self.reward_scale = 0, 1, 1.0
+        self.guide_failures, self.tolerance = 0, math.nan
+        self.best_returns = torch.empty(0)
+        self.best_state: dict[str, Tensor] = {}
+
+    def prepare(self, batch: TensorDictBase) -> None:
+        """Divide the rewards of a batch [B, T] by their scale."""
+        batch["next", "reward"] = batch["next", "reward"] / self.reward_scale
+
+    def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
+        """Return the weights of the losses; those of the policy are 0 during the warm-up."""
+        if not (self.active and progress < self.anchor.warmup):
+            return weights
+        return {
+            name: weight if name in NOT_OF_THE_POLICY else 0.0 for name, weight in weights.items()
+        }
+
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Set the standard deviation of an anchored policy that has one of its own.
+
+        Returns:
+            `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard
+            deviation.
+        """
+        return self.set_noise(progress)
+
+    @torch.no_grad()
+    def set_noise(self, progress: float) -> dict[str, float]:
+        """Set the standard deviation, and return the metrics of `finish`."""
+        metrics = {"anchor": self.sign * self.weight}
+        if isinstance(self.head.head, GlobalScaleHead):
+            scale = self.head.head.log_scale
+            if self.active:
+                scale.fill_(math.log(self.anchor.noise_at(progress)))
+            metrics["noise"] = float(scale.exp().mean())
+        return metrics
+
+    def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
+        """Return the brake."""
+        return [Brake(self, policy, cases)]
 
     @property
     def weight(self) -> float:
         """Weight of the guide, or of its opposite; 0 without an anchor."""
         return self.sign * float(self.head.weight.sum())
 
-    def weights(self, value: float) -> Tensor:
-        """Return the weights of all guides, [n_guides], with a value for the one that holds, or for its opposite."""
-        return self.starts()[self.guide] * (self.sign * value)
+    def set_weight(self, value: float) -> None:
+        """Set the weight of the guide, or of its opposite."""
+        self.head.weight.copy_(self.weights_of_guides(value))
 
-    def starts(self) -> list[Tensor]:
-        """Return the weights, [n_guides] each, of the look before training: each guide, none, each opposite."""
+    def weights_of_guides(self, value: float) -> Tensor:
+        """Return the weights of all guides, [n_guides], with a value for that of the anchor, or its opposite."""
+        return self.first_candidates()[self.guide] * (self.sign * value)
+
+    def first_candidates(self) -> list[Tensor]:
+        """Return the weights, [n_guides] each, to compare before training: each guide, none, each opposite."""
         guides = torch.eye(len(self.head.weight), device=self.head.weight.device)
         return [*guides, guides[0] * 0, *-guides]
 
-    def waits(self, progress: float) -> bool:
-        """Return whether the policy is not to learn yet."""
-        return self.holds and progress < self.warmup
+    def candidates(self) -> list[Tensor]:
+        """Return the two weights of a check-up, [n_guides] each: the present one, and the lower one."""
+        lower = max(self.weight - self.anchor.margin, 0.0)
+        return [self.weights_of_guides(self.weight), self.weights_of_guides(lower)]
 
-    @torch.no_grad()
-    def set_noise(self, progress: float) -> dict[str, float]:
-        """Set the standard deviation of an anchored policy that has one of its own.
-
-        The metrics are `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the
-        standard deviation.
-        """
-        scale: Tensor | None = getattr(self.head.head, "log_scale", None)
-        if scale is not None and self.holds:
-            scale.fill_(math.log(self.noise_at(progress)))
-        return {"anchor": self.sign * self.weight} | (
-            {} if scale is None else {"noise": float(scale.exp().mean())}
-        )
-
-    def due(self, update: int, updates: int) -> bool:
-        """Return whether the brake is to test the policy after an update; `updates` is the number of all updates."""
-        return self.holds and update in {
-            round(updates * look / self.looks) for look in range(1, self.looks + 1)
-        } - {0}
-
-    def tried(self) -> list[Tensor]:
-        """Return the two weights to test, [n_guides] each: the present one, and one that is lower by the margin."""
-        return [
-            self.weights(weight) for weight in (self.weight, max(self.weight - self.margin, 0.0))
-        ]
-
-    def begin(self, look: Look, random: Tensor, policy: nn.Module) -> None:
+    def begin(self, results: CaseResults, random: Tensor, policy: nn.Module) -> None:
         """Choose the best guide, or the opposite of one, as the anchor of the policy, or none.
 
-        `look` is with the weights of `starts`; `random` are returns of random actions, [C].
+        The anchor is active if the best guide or opposite is better than a new policy without a
+        guide, and than random actions, by more than a standard error of the difference.
+
+        Args:
+            results: with the weights of `first_candidates`.
+            random: returns of random actions in the same cases, [C].
+            policy: with the head.
         """
         guides = len(self.head.weight)
-        best = max((index for index in range(2 * guides + 1) if index != guides), key=look.score)
-        others = torch.stack([look.returns[guides], random])
-        differences = look.returns[best] - others
-        self.holds = bool((differences.mean(1) > standard_error(differences)).all())
+        anchors = [index for index in range(2 * guides + 1) if index != guides]
+        best = max(anchors, key=results.mean_return)
+        others = torch.stack([results.returns[guides], random])
+        differences = results.returns[best] - others
+        self.active = bool((differences.mean(1) > standard_error(differences)).all())
         self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
-        self.head.weight.copy_(self.weights(float(self.holds)))
+        self.set_weight(float(self.active))
         self.set_noise(0.0)
-        self.guide_failures = look.failures[best]
-        if self.holds:
-            self._keep(policy, look.returns[best])
-            self.unit = max(abs(look.score(best)), float(others.mean(1).abs().max()))
-        self.allowed = max(
-            self.tolerance * abs(look.score(best)), float(standard_error(look.returns[best])) / 2
-        )
+        self.guide_failures = results.failures[best]
+        guide_return = abs(results.mean_return(best))
+        if self.active:
+            self._keep(policy, results.returns[best])
+            self.reward_scale = max(guide_return, float(others.mean(1).abs().max()))
+        chance = float(standard_error(results.returns[best])) / 2
+        self.tolerance = max(self.anchor.tolerance * guide_return, chance)
 
-    def decide(self, look: Look, policy: nn.Module) -> bool:
-        """Lower the weight of the guide or keep it, after drives with the two weights of `tried`.
+    def decide(self, results: CaseResults, policy: nn.Module) -> bool:
+        """Lower the weight of the guide, or keep it, or roll the policy back to that of the best check-up.
 
-        If the policy has become worse, it goes back to that of the best look instead; return
-        whether it did.
+        Args:
+            results: with the weights of `candidates`.
+            policy: with the head.
+
+        Returns:
+            Whether the policy was rolled back.
         """
-        now, lower, best = look.score(0), look.score(1), float(self.best.mean())
-        chance = 2 * float(standard_error(self.best - look.returns[0]))
-        if look.failures[0] > self.guide_failures or now < best - max(3 * self.allowed, chance):
-            policy.load_state_dict(self.kept)
+        if self._has_become_worse(results):
+            policy.load_state_dict(self.best_state)
             return True
-        if now >= best:
-            self._keep(policy, look.returns[0])
-        steps = self.margin / self.step if self.step else 1.0
-        if look.failures[1] <= look.failures[0] and lower >= now - steps * self.allowed:
-            fall = self.margin if lower > max(now, best) + 3 * self.allowed else self.step
-            self.head.weight.copy_(self.weights(max(self.weight - fall, 0.0)))
+        present, lower = results.mean_return(0), results.mean_return(1)
+        best = float(self.best_returns.mean())
+        if present >= best:
+            self._keep(policy, results.returns[0])
+        if self._may_fall(results):
+            large_gain = lower > max(present, best) + LARGE_GAIN_TOLERANCES * self.tolerance
+            fall = self.anchor.margin if large_gain else self.anchor.step
+            self.set_weight(max(self.weight - fall, 0.0))
         return False
 
+    def _has_become_worse(self, results: CaseResults) -> bool:
+        """Return whether the policy with the present weight fails more often, or has lost too much."""
+        if results.failures[0] > self.guide_failures:
+            return True
+        error = float(standard_error(self.best_returns - results.returns[0]))
+        accepted = max(ROLL_BACK_TOLERANCES * self.tolerance, ROLL_BACK_ERRORS * error)
+        return results.mean_return(0) < float(self.best_returns.mean()) - accepted
+
+    def _may_fall(self, results: CaseResults) -> bool:
+        """Return whether the lower weight fails in no further case, and loses next to nothing for each step."""
+        steps = self.anchor.margin / self.anchor.step if self.anchor.step else 1.0
+        accepted = results.mean_return(0) - steps * self.tolerance
+        return results.failures[1] <= results.failures[0] and results.mean_return(1) >= accepted
+
     def _keep(self, policy: nn.Module, returns: Tensor) -> None:
-        self.best, self.kept = (
-            returns,
-            {name: value.clone() for name, value in policy.state_dict().items()},
-        )
+        self.best_returns = returns
+        self.best_state = {name: value.clone() for name, value in policy.state_dict().items()}
+
+
+class Brake:
+    """The check-ups of an anchored policy, a `Callback`: they decide how strongly it is anchored.
+
+    Args:
+        anchored: the anchor of the policy.
+        policy: of the learner.
+        cases: in which copies of the policy are evaluated.
+    """
+
+    names: Sequence[str] = (
+        "look/return",
+        "look/lower_return",
+        "look/failures",
+        "look/lower_failures",
+        "look/back",
+    )
+
+    def __init__(self, anchored: AnchoredUpdate, policy: nn.Module, cases: Cases) -> None:
+        self.anchored, self.policy = anchored, policy
+        count = anchored.anchor.cases
+        self.cases = cases if count is None else cases.take(count)
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether there is a check-up: before training, and evenly over the run while active."""
+        if update == 0:
+            return True
+        looks = self.anchored.anchor.looks
+        return self.anchored.active and update in {
+            round(updates * number / looks) for number in range(1, looks + 1)
+        }
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Evaluate the candidate weights, decide, and return the numbers of the first two by name."""
+        rolled_back = False
+        if update == 0:
+            results = self._evaluate(self.anchored.first_candidates())
+            self.anchored.begin(results, self.cases.evaluate_random(), self.policy)
+        else:
+            results = self._evaluate(self.anchored.candidates())
+            rolled_back = self.anchored.decide(results, self.policy)
+        returns = results.mean_return(0), results.mean_return(1)
+        numbers = (*returns, *results.failures[:2], rolled_back)
+        return dict(zip(self.names, map(float, numbers), strict=True))
+
+    def _evaluate(self, weights: Sequence[Tensor]) -> CaseResults:
+        """Evaluate the policy in all cases with each of some weights of the guides."""
+        name, _ = anchored_head(self.policy)
+        state = self.policy.state_dict()
+        return self.cases.evaluate([{**state, f"{name}.weight": weight} for weight in weights])
 
 
 def standard_error(values: Tensor) -> Tensor:

@@ -6,11 +6,11 @@ terminated. Q' is a target network that follows Q slowly. The policy is epsilon-
 """
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
+from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from tensordict.utils import NestedKey
 from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
@@ -19,7 +19,7 @@ from torchrl.objectives import DQNLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.anchor import AnchoredValues
+from coil_rl.learners.anchor import Anchor, AnchoredValues
 from coil_rl.learners.encoders import Mlp, ObservationNetwork, entry_specs, without_memory
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -41,7 +41,22 @@ class DQN(OffPolicy):
         epsilon: probability of a random action, a number or a schedule; 0 for deterministic
             actions.
         double: whether the network, not the target network, selects the next action.
-        tau, ratio, options: as for `OffPolicy`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`. Steps are stored as they are.
+        tau: step of the target networks towards the networks after each minibatch, as a fraction.
+        ratio: how often a step is sampled, on average over the run.
+        learning_rate: of Adam, a number or a schedule.
+        gamma: discount.
+        max_grad_norm: gradients are scaled down to this norm, over all networks together.
+        capacity: maximum number of stored steps; the newest replace the oldest.
+        batch_size: N, steps in a minibatch.
+        starts: number of stored steps before learning starts.
+        prior: share of each minibatch that is sampled from the steps of guides, which are then
+            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
+            steps are sampled alike.
+        compile: whether to compile the update, see `GradientStep`.
+        anchor: makes the policy start as its guide.
+        seed: of the samples.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -66,34 +81,47 @@ class DQN(OffPolicy):
         action_gain: float = 1.0,
         epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
+        normalise: bool | Sequence[NestedKey] = False,
         tau: float = 0.01,
         ratio: float = 16.0,
-        **options: Any,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        max_grad_norm: float = 10.0,
+        capacity: int = 100_000,
+        batch_size: int = 256,
+        starts: int = 5_000,
+        prior: float = 0.0,
+        compile: bool | Literal["auto"] = "auto",
+        anchor: Anchor | None = None,
+        seed: int = 0,
     ) -> None:
         self.epsilon = schedule(epsilon)
         check_range(0, action_gain=action_gain)
         for progress in (0, 1):
             check_range(0, 1, epsilon=self.epsilon(progress))
-        spec = env.action_spec
-        if spec.dtype.is_floating_point:
-            remedy = "put the transform DiscreteActions around it: action=choices"
-            raise ValueError(
-                f"DQN needs discrete actions, but this env has continuous ones; {remedy}"
-            )
-        if not isinstance(spec, (Categorical, OneHot)) or len(
-            networks.action_shape(env)
-        ) != isinstance(spec, OneHot):
-            raise ValueError(
-                "DQN needs one discrete action, but this env has several at once; use PPO"
-            )
-        in_keys, network = (
-            list(map(nested_key, in_keys)),
-            without_memory(network or Mlp(hidden, "relu"), "DQN"),
+        check_actions(env)
+        in_keys = [nested_key(key) for key in in_keys]
+        network = without_memory(network or Mlp(hidden, "relu"), "DQN")
+        super().__init__(
+            env,
+            in_keys,
+            normalise=normalise,
+            tau=tau,
+            ratio=ratio,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            max_grad_norm=max_grad_norm,
+            capacity=capacity,
+            batch_size=batch_size,
+            starts=starts,
+            prior=prior,
+            compile=compile,
+            anchor=anchor,
+            seed=seed,
         )
-        super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         single = env.action_spec_unbatched  # the network is evaluated on batches of any size
         numbers = ObservationNetwork(
-            env, in_keys, network, spec.space.n, action_gain, dtype=env.reward_spec.dtype
+            env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
         )
         keys = in_keys if self.normaliser is None else self.normaliser.reads(in_keys)
         values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
@@ -101,20 +129,31 @@ class DQN(OffPolicy):
         self.explorer = EGreedyModule(
             single, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device
         )
-        before = [] if self.normaliser is None else [self.normaliser]
-        valued, chosen = self.network.module
-        if self.anchor is not None:
-            (advice,) = entry_specs(env, [self.anchor.advice_key])
-            bonus = self.anchor.attach(AnchoredValues(advice.shape[-2], env.device))
-            before.append(valued)
-            valued = networks.FastTensorDictModule(
-                bonus, [self.anchor.advice_key, "action_value"], ["action_value"]
-            )
-        self.policy = TensorDictSequential(*before, valued, chosen, self.explorer)
+        self.policy = self.build_policy(env)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless
         # rewards are tiny.
-        options = {"double_dqn": double, "delay_value": True, "loss_function": "l2"}
-        self.set_loss(DQNLoss(self.network, action_space=single, **options))
+        self.set_loss(
+            DQNLoss(
+                self.network,
+                action_space=single,
+                double_dqn=double,
+                delay_value=True,
+                loss_function="l2",
+            )
+        )
+        self.extend([], self.policy)
+
+    def build_policy(self, env: EnvBase) -> TensorDictSequential:
+        """Return the policy: the network, perhaps a bonus for the advised action, the choice, and noise."""
+        modules: list[TensorDictModuleBase] = [] if self.normaliser is None else [self.normaliser]
+        values, choice = self.network.module
+        modules.append(values)
+        if self.anchor is not None:
+            (advice,) = entry_specs(env, [self.anchor.advice_key])
+            bonus = AnchoredValues(advice.shape[-2], env.device)
+            keys = [self.anchor.advice_key, "action_value"]
+            modules.append(networks.FastTensorDictModule(bonus, keys, ["action_value"]))
+        return TensorDictSequential(*modules, choice, self.explorer)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn; arguments as for `OffPolicy.update`.
@@ -124,18 +163,29 @@ class DQN(OffPolicy):
             minibatch, 0 before learning starts; and `epsilon`.
         """
         metrics = super().update(batch, progress)
-        epsilon = (
-            self.anchor.noise_at if self.anchor is not None and self.anchor.holds else self.epsilon
-        )
-        self.explorer.eps.fill_(epsilon(progress))
-        return metrics | {"epsilon": epsilon(progress)}
+        epsilon = self.epsilon(progress)
+        if self.anchored is not None and self.anchored.active:
+            epsilon = self.anchored.anchor.noise_at(progress)
+        self.explorer.eps.fill_(epsilon)
+        return metrics | {"epsilon": epsilon}
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return the mean value of the best action, 0 before learning starts."""
-        value = (
-            0.0
-            if minibatch is None
-            else float(self.network(minibatch)["chosen_action_value"].mean())
+        if minibatch is None:
+            return {"value": 0.0}
+        return {"value": float(self.network(minibatch)["chosen_action_value"].mean())}
+
+
+def check_actions(env: EnvBase) -> None:
+    """Raise a `ValueError` if an action of an env is not one of several options."""
+    spec = env.action_spec
+    if spec.dtype.is_floating_point:
+        raise ValueError(
+            "DQN needs discrete actions, but this env has continuous ones; put the transform "
+            "DiscreteActions around it: action=choices"
         )
-        return {"value": value}
+    is_one_hot = isinstance(spec, OneHot)
+    dims = len(networks.action_shape(env))
+    if not isinstance(spec, (Categorical, OneHot)) or dims != int(is_one_hot):
+        raise ValueError("DQN needs one discrete action, but this env has several at once; use PPO")

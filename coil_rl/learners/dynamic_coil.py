@@ -18,8 +18,9 @@ from torch.func import functional_call
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import LARGEST_SEED, check_choice, check_range
-from coil_rl.learners import networks
+from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.extension import Extension
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides
@@ -27,7 +28,13 @@ from coil_rl.transforms.guide_actions import Guides
 
 @dataclass(frozen=True)
 class Phase:
-    """A phase: whether the agent learns, which guides learn, and the number of earlier phases of the same kind."""
+    """A phase of the training.
+
+    Args:
+        agent: whether the agent learns.
+        guides: indices of the guides that learn.
+        earlier: number of earlier phases of the same kind.
+    """
 
     agent: bool
     guides: tuple[int, ...]
@@ -40,7 +47,11 @@ StopRule = Callable[[int, Sequence[float]], bool]
 
 @dataclass(frozen=True)
 class AfterFrames:
-    """Stop rule for phases of fixed length: a phase ends with the update that completes its frames."""
+    """Stop rule for phases of fixed length.
+
+    Args:
+        frames: of a phase; it ends with the update that completes them.
+    """
 
     frames: int
 
@@ -57,11 +68,16 @@ class AtConvergence:
     """Stop rule: a phase ends when consecutive evaluations have not improved on the best one before them.
 
     An evaluation is the mean reward per step in the batch of one update.
+
+    Args:
+        evaluations: number of consecutive ones without improvement that end the phase.
+        improvement: minimum increase of the mean reward.
+        frames: maximum length of the phase; None: unlimited.
     """
 
-    evaluations: int = 5  # without improvement
-    improvement: float = 0.0  # minimum increase of the mean reward
-    frames: int | None = None  # maximum length of the phase; None: unlimited
+    evaluations: int = 5
+    improvement: float = 0.0
+    frames: int | None = None
 
     def __post_init__(self) -> None:
         check_range(
@@ -81,19 +97,32 @@ class AtConvergence:
 
 @dataclass(eq=False)
 class PhaseSchedule:
-    """The order of the phases; `phase` is the current one, `number` its number, from 0."""
+    """The order of the phases.
 
-    guides: int  # n, number of guides
+    Args:
+        guides: n, number of guides.
+        order: "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once;
+            "agent": the agent only; "guide": one guide after the other, never the agent.
+        choice: of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly
+            at random.
+        agent_phase: ends phases in which the agent learns.
+        guide_phase: ends the other phases.
+        seed: of the stochastic choice.
+
+    Attributes:
+        phase: the present one.
+        number: of the present phase, from 0.
+        frames: in the present phase so far.
+        rewards: mean reward per step of each update in the present phase.
+    """
+
+    guides: int
     _: KW_ONLY
-    # "alternate": agent, guide, agent, guide, ...; as controls, "joint": all at once; "agent": the
-    # agent only; "guide": one guide after the other, never the agent.
     order: Literal["alternate", "joint", "agent", "guide"] = "alternate"
-    # Of the guide in the i-th guide phase: "sequential": i mod n; "stochastic": uniformly at
-    # random.
     choice: Literal["sequential", "stochastic"] = "sequential"
-    agent_phase: StopRule = AfterFrames(131_072)  # of phases in which the agent learns
-    guide_phase: StopRule = AfterFrames(65_536)  # of the other phases
-    seed: int = 0  # of the stochastic choice
+    agent_phase: StopRule = AfterFrames(131_072)
+    guide_phase: StopRule = AfterFrames(65_536)
+    seed: int = 0
 
     def __post_init__(self) -> None:
         check_choice(("alternate", "joint", "agent", "guide"), order=self.order)
@@ -106,7 +135,7 @@ class PhaseSchedule:
         self.phase = self._next()
 
     def advance(self, frames: int, reward: float) -> bool:
-        """Count an update, given the frames and the mean reward of its batch; returns whether it ends its phase."""
+        """Count an update, given the frames and the mean reward of its batch; return whether its phase ends."""
         self.frames += frames
         self.rewards.append(reward)
         stop = self.agent_phase if self.phase.agent else self.guide_phase
@@ -117,18 +146,17 @@ class PhaseSchedule:
         return True
 
     def _next(self) -> Phase:
-        if self.order in ("agent", "joint"):
-            return Phase(
-                True, tuple(range(self.guides)) if self.order == "joint" else (), self.number
-            )
+        if self.order == "agent":
+            return Phase(True, (), self.number)
+        if self.order == "joint":
+            return Phase(True, tuple(range(self.guides)), self.number)
         earlier = self.number if self.order == "guide" else self.number // 2
         if self.order == "alternate" and self.number % 2 == 0:
             return Phase(True, (), earlier)
         if self.choice == "sequential":
             return Phase(False, (earlier % self.guides,), earlier)
-        return Phase(
-            False, (int(torch.randint(self.guides, (), generator=self.generator)),), earlier
-        )
+        drawn = int(torch.randint(self.guides, (), generator=self.generator))
+        return Phase(False, (drawn,), earlier)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the position in the schedule."""
@@ -137,11 +165,8 @@ class PhaseSchedule:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
-        self.number, self.frames, self.rewards = (
-            state["number"],
-            state["frames"],
-            list(state["rewards"]),
-        )
+        self.number, self.frames = state["number"], state["frames"]
+        self.rewards = list(state["rewards"])
         self.phase = Phase(*state["phase"])
         self.generator.set_state(state["generator"])
 
@@ -153,13 +178,35 @@ class DynamicCoil(PPO):
     `ValueError`.
 
     Args:
-        env, ppo: as for `PPO`; actions must be continuous.
+        env: the env, for its specs; actions must be continuous.
         in_keys: entries that agent and critic observe; the agent also observes the advice.
         guides: guide networks by name; each writes `action`.
         phases: makes the phase schedule for a number of guides.
         guide_learning_rate: of the guides, a number or a schedule.
         shrink: factor on the learning rate from each phase to the next of its kind.
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
+        hidden: widths of the hidden layers of agent and critic, without `network`.
+        network: architecture of agent and critic, without a memory; None: `Mlp(hidden)`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`.
+        action_scale: initial standard deviation of the agent.
+        action_gain: initial scale of the last weights of the agent; with 0 its mean is 0
+            everywhere.
+        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
+            are clipped.
+        learning_rate: of agent and critic by Adam, a number or a schedule.
+        gamma: discount.
+        gae_lambda: lambda of generalised advantage estimation.
+        clip: clipping range of the probability ratio.
+        epochs: passes over each batch.
+        minibatches: minibatches per pass.
+        entropy: coefficient of the entropy bonus, a number or a schedule.
+        critic: coefficient of the critic's loss.
+        max_grad_norm: gradients are scaled down to this norm.
+        compile: "auto" or false; the update cannot be compiled.
+        anchor: makes the agent start as its guide.
+        auxiliary: further extensions, such as losses of the agent (`KickstartLoss`).
+        seed: of the order of minibatches.
     """
 
     kind = "guides"
@@ -176,7 +223,25 @@ class DynamicCoil(PPO):
         guide_learning_rate: float | Schedule = Linear(3e-4, 0.0),
         shrink: float = 0.9,
         critic_phases: Literal["both", "agent", "guide"] = "both",
-        **ppo: Any,
+        hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
+        normalise: bool | Sequence[NestedKey] = False,
+        action_scale: float = 0.5,
+        action_gain: float = 0.01,
+        squash: bool = True,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip: float = 0.2,
+        epochs: int = 5,
+        minibatches: int = 16,
+        entropy: float | Schedule = 0.0,
+        critic: float = 0.5,
+        max_grad_norm: float = 0.5,
+        compile: bool | Literal["auto"] = "auto",
+        anchor: Anchor | None = None,
+        auxiliary: Sequence[Extension] = (),
+        seed: int = 0,
     ) -> None:
         check_range(0, 1, above=True, shrink=shrink)
         check_choice(("both", "agent", "guide"), critic_phases=critic_phases)
@@ -199,20 +264,42 @@ class DynamicCoil(PPO):
         ]
         self.phases = phases(len(guides))
         self.shrink, self.critic_phases = shrink, critic_phases
-        super().__init__(env, in_keys, **ppo)
-
-    def build_networks(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **options: Any
-    ) -> tuple[ProbabilisticTensorDictSequential, TensorDictModuleBase]:
-        """Return the guides followed by the agent, and the critic."""
-        shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
-        agent_keys = [*in_keys, *self.advice.out_keys]
-        agent = networks.actor(
-            env, agent_keys, network, shapes=shapes, normaliser=self.normaliser, **options
+        super().__init__(
+            env,
+            in_keys,
+            hidden=hidden,
+            network=network,
+            normalise=normalise,
+            action_scale=action_scale,
+            action_gain=action_gain,
+            squash=squash,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip=clip,
+            epochs=epochs,
+            minibatches=minibatches,
+            entropy=entropy,
+            critic=critic,
+            max_grad_norm=max_grad_norm,
+            compile=compile,
+            anchor=anchor,
+            auxiliary=auxiliary,
+            seed=seed,
         )
+
+    def build_policy(
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        make_actor: Callable[..., ProbabilisticTensorDictSequential],
+    ) -> ProbabilisticTensorDictSequential:
+        """Return the guides followed by the agent."""
+        shapes = {"guide_action": torch.Size([len(self.guides), *env.action_spec_unbatched.shape])}
+        agent = make_actor(env, [*in_keys, *self.advice.out_keys], network, shapes=shapes)
         self.agent_parameters = list(agent.parameters())
-        policy = ProbabilisticTensorDictSequential(self.advice, *agent.module)
-        return policy, networks.critic(env, in_keys, network, self.normaliser)
+        return ProbabilisticTensorDictSequential(self.advice, *agent.module)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:
         """Return the parameters of the agent, of the critic, and of each guide."""
@@ -247,16 +334,23 @@ class DynamicCoil(PPO):
         number, phase, rates = self.phases.number, self.phases.phase, self.learning_rates(progress)
         metrics = super().update(batch, progress)
         ended = self.phases.advance(batch.numel(), float(batch["next", "reward"].mean()))
+        learning_guide = phase.guides[0] if len(phase.guides) == 1 else len(phase.guides) or -1
         metrics |= {
             "phase": number,
             "guides_changed": float(ended and bool(phase.guides)),
-            "guide": phase.guides[0] if len(phase.guides) == 1 else len(phase.guides) or -1,
+            "guide": learning_guide,
             "learning_rate": rates[0],
             "guide_learning_rate": max(rates[2:]),
         }
-        with torch.no_grad():
-            for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
-                observed = batch.select(*guide.in_keys)
-                before = functional_call(guide, initial, (observed.copy(),))["action"]
-                metrics[f"moved_{name}"] = float((guide(observed)["action"] - before).abs().mean())
-        return metrics
+        return metrics | self.moved(batch)
+
+    @torch.no_grad()
+    def moved(self, batch: TensorDictBase) -> dict[str, float]:
+        """Return the mean absolute difference of the action of each guide to that of the initial guide."""
+        distances = {}
+        for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
+            observed = batch.select(*guide.in_keys)
+            before = functional_call(guide, initial, (observed.copy(),))["action"]
+            change = guide(observed)["action"] - before
+            distances[f"moved_{name}"] = float(change.abs().mean())
+        return distances

@@ -13,7 +13,7 @@ an edit by a second policy.
 
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -22,11 +22,15 @@ from tensordict.utils import expand_as_right
 from torch import Tensor
 from torch.distributions import Categorical
 from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_exploration_type
-from torchrl.objectives import SACLoss
+from torchrl.objectives import LossModule, SACLoss
 
 from coil_rl.envs.limits import check_range
+from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
-from coil_rl.learners.sac import SAC, Critics
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.sac import SAC
+from coil_rl.schedules import Linear, Schedule
 from coil_rl.transforms.action_space import ActionSpace
 
 ADVICE = "guide_action"
@@ -46,7 +50,37 @@ class IBRL(SAC):
         edit: largest change of the guide's action by the third proposal, as a fraction of half the
             range of the action, as in EXPO; 0: there is none.
         guide: row of the advice.
-        options: as for `SAC`, without `target_critics` and `uncertainty`.
+        hidden: widths of the hidden layers of all networks, without `network`.
+        network: architecture of all networks; None: `Mlp(hidden)`.
+        action_scale: initial standard deviation of the policy, before squashing.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0.
+        temperature: initial alpha.
+        target_entropy: of the policy, for actions in the unit of the env; None: minus the number of
+            its dimensions.
+        critics: number of critics.
+        target_critics: must be None: all critics are compared.
+        critic_layer_norm: whether the critics normalise their layers, which bounds the values of
+            actions never tried.
+        uncertainty: must be false.
+        auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`. Steps are stored as they are.
+        tau: step of the target networks towards the networks after each minibatch, as a fraction.
+        ratio: how often a step is sampled, on average over the run.
+        learning_rate: of Adam, a number or a schedule.
+        gamma: discount.
+        max_grad_norm: gradients are scaled down to this norm, over all networks together. Take a
+            large one for returns in the hundreds, as of a pendulum: otherwise the gradients of the
+            critics dominate those of the policy.
+        capacity: maximum number of stored steps; the newest replace the oldest.
+        batch_size: N, steps in a minibatch.
+        starts: number of stored steps before learning starts.
+        prior: share of each minibatch that is sampled from the steps of guides, which are then
+            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
+            steps are sampled alike.
+        compile: whether to compile the update, see `GradientStep`.
+        anchor: makes the policy start as its guide.
+        seed: of the samples.
     """
 
     reported = (*SAC.reported, "guide_share")
@@ -59,25 +93,75 @@ class IBRL(SAC):
         sharpness: float | None = None,
         edit: float = 0.0,
         guide: int = 0,
-        **options: Any,
+        hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
+        action_scale: float = 0.5,
+        action_gain: float = 0.01,
+        temperature: float = 0.2,
+        target_entropy: float | None = None,
+        critics: int = 2,
+        target_critics: int | None = None,
+        critic_layer_norm: bool = False,
+        uncertainty: bool = False,
+        auxiliary: Sequence[Extension] = (),
+        normalise: bool | Sequence[NestedKey] = False,
+        tau: float = 0.02,
+        ratio: float = 8.0,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        max_grad_norm: float = 10.0,
+        capacity: int = 100_000,
+        batch_size: int = 256,
+        starts: int = 5_000,
+        prior: float = 0.0,
+        compile: bool | Literal["auto"] = "auto",
+        anchor: Anchor | None = None,
+        seed: int = 0,
     ) -> None:
         check_range(0, sharpness=sharpness or 0, edit=edit)
-        if options.get("target_critics") is not None or options.get("uncertainty"):
+        if target_critics is not None or uncertainty:
             raise ValueError("IBRL compares all critics; leave target_critics and uncertainty out")
         if ADVICE not in env.observation_spec:
             raise KeyError(
                 f"IBRL chooses between actions, but the env has no {ADVICE}; put GuideActions before it"
             )
         self.choice = partial(Proposals, guide=guide, sharpness=sharpness, edit=edit)
-        super().__init__(env, in_keys, **options)
-        self.policy = TensorDictSequential(
-            *([self.normaliser] if self.normaliser else []), self.loss.proposals
+        super().__init__(
+            env,
+            in_keys,
+            hidden=hidden,
+            network=network,
+            action_scale=action_scale,
+            action_gain=action_gain,
+            temperature=temperature,
+            target_entropy=target_entropy,
+            critics=critics,
+            critic_layer_norm=critic_layer_norm,
+            auxiliary=auxiliary,
+            normalise=normalise,
+            tau=tau,
+            ratio=ratio,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            max_grad_norm=max_grad_norm,
+            capacity=capacity,
+            batch_size=batch_size,
+            starts=starts,
+            prior=prior,
+            compile=compile,
+            anchor=anchor,
+            seed=seed,
         )
         self.also_store(ADVICE)
 
     def build_loss(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **arguments: Any
-    ) -> SACLoss:
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        target_critics: int | None,
+        arguments: dict[str, Any],
+    ) -> LossModule:
         """Return the loss, with the second policy if there is one."""
         space, editor = ActionSpace(env.action_spec, len(env.batch_size)), None
         if self.choice.keywords["edit"]:
@@ -85,8 +169,15 @@ class IBRL(SAC):
                 raise ValueError(
                     "edit is a fraction of the range of the action, but it has no bounds; take edit=0"
                 )
-            editor = self.build_actor(env, [*in_keys, ADVICE], network)
-        return ProposalLoss(partial(self.choice, space=space, editor=editor), **arguments)
+            editor = self.build_actor(env, [*in_keys, ADVICE], network, anchor=None)
+        loss = ProposalLoss(partial(self.choice, space=space, editor=editor), **arguments)
+        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
+        return loss
+
+    def build_policy(self) -> TensorDictSequential:
+        """Return the policy that collects the batches: it chooses between the proposals."""
+        before = [] if self.normaliser is None else [self.normaliser]
+        return TensorDictSequential(*before, self.loss.proposals)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and other values, with the share of the guide in the target."""
@@ -94,7 +185,17 @@ class IBRL(SAC):
 
 
 class Proposals(Critics):
-    """The choice between the actions of the guide, the policy `actor` and perhaps `editor`; it writes `action`."""
+    """The choice between the actions of the guide, the policy and perhaps an editor; it writes `action`.
+
+    Args:
+        actor: the policy.
+        loss: has the target critics, which rate the actions.
+        space: of the actions.
+        editor: the second policy, which edits the guide's action; None: there is none.
+        guide: index of the guide in the advice.
+        sharpness: of a random choice; None: the better one.
+        edit: largest change of the guide's action, as a fraction of half the range of the action.
+    """
 
     def __init__(
         self,
@@ -156,10 +257,8 @@ class ProposalLoss(SACLoss):
 
     def __init__(self, choice: partial[Proposals], **arguments: Any) -> None:
         super().__init__(**arguments)
-        self.make_proposals, self.editor = (
-            partial(choice, arguments["actor_network"]),
-            choice.keywords["editor"],
-        )
+        self.make_proposals = partial(choice, arguments["actor_network"])
+        self.editor = choice.keywords["editor"]
 
     @cached_property  # no submodule, because the loss holds the weights
     def proposals(self) -> Proposals:
@@ -181,16 +280,12 @@ class ProposalLoss(SACLoss):
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
         """Return the loss of the policy, with that of the second one added, and TorchRL's other values."""
         loss, values = super().actor_loss(tensordict)
-        if self.editor is not None:
-            distribution = self.editor.get_dist(tensordict)
-            change = distribution.rsample()
-            data = tensordict.select(*self.qvalue_network.in_keys, strict=False)
-            data.set("action", self.proposals.edited(tensordict, change))
-            rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)[
-                "state_action_value"
-            ]
-            loss = (
-                loss
-                + (self._alpha * distribution.log_prob(change) - rated.amin(0).squeeze(-1)).mean()
-            )
-        return loss, values
+        if self.editor is None:
+            return loss, values
+        distribution = self.editor.get_dist(tensordict)
+        change = distribution.rsample()
+        data = tensordict.select(*self.qvalue_network.in_keys, strict=False)
+        data.set("action", self.proposals.edited(tensordict, change))
+        rated = self._vmap_qnetworkN0(data, self._cached_detached_qvalue_params)
+        value = rated["state_action_value"].amin(0).squeeze(-1)
+        return loss + (self._alpha * distribution.log_prob(change) - value).mean(), values

@@ -1,21 +1,19 @@
 """Policy and value networks, built from the specs of an env."""
 
-import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import (
-    NormalParamExtractor,
     ProbabilisticTensorDictSequential,
     TensorDictModuleBase,
     TensorDictSequential,
 )
 from torch import Tensor, nn
 from torch.distributions import Categorical as CategoricalDistribution
-from torch.distributions import Independent
 from torchrl.data import (
     Bounded,
     Categorical,
@@ -35,7 +33,7 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from coil_rl.learners.anchor import Anchor, AnchoredHead, pull_to_choice, pull_to_number
+from coil_rl.learners.anchor import AnchoredHead, pull_to_choice, pull_to_number
 from coil_rl.learners.encoders import (
     STATE,
     ConcatObservations,
@@ -45,83 +43,12 @@ from coil_rl.learners.encoders import (
     Shapes,
     entry_specs,
 )
+from coil_rl.learners.heads import Choices, ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.transforms.action_space import choices_of
 
 UNCLIPPED, REMEMBERED, NOISE = "unclipped_action", "remembered", "exploration_noise"
 DEFAULT = Mlp()
-
-
-class GlobalScaleHead(nn.Module):
-    """Normal distribution with a mean from a network and a standard deviation that is the same in every state.
-
-    The network's outputs are the numbers of an action, of shape `event`; `scale` is the initial
-    standard deviation.
-    """
-
-    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
-        super().__init__()
-        self.network, self.event = network, event
-        self.log_scale = nn.Parameter(
-            torch.full(event, math.log(scale), device=network.layers[-1].weight.device)
-        )
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation, [*batch, *event] each."""
-        loc = shaped(self.network(*inputs), self.event)
-        return loc, self.log_scale.exp().to(loc.dtype).expand_as(loc)
-
-
-class GaussianHead(nn.Module):
-    """Normal distribution with mean and standard deviation from a network; an output of 0 gives `scale`."""
-
-    def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
-        super().__init__()
-        self.network, self.event = network, event
-        self.split = NormalParamExtractor(f"biased_softplus_{scale}", scale_lb=1e-3)
-
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and standard deviation, [*batch, *event] each."""
-        loc, scale = self.split(self.network(*inputs))
-        return shaped(loc, self.event), shaped(scale, self.event)
-
-
-class ChoicesHead(nn.Module):
-    """Logits of several choices at once from a network, padded with minus infinity to the longest choice.
-
-    The network gives logits for all choices, each of as many as the longest one has. An action has
-    the shape `event`, one index for each choice; so have the `options`, their numbers.
-    """
-
-    def __init__(self, network: ObservationNetwork, event: torch.Size, options: Tensor) -> None:
-        super().__init__()
-        self.network, self.event = network, event
-        longest = torch.arange(int(options.max()), device=options.device)
-        self.valid: Tensor = nn.Buffer(longest < options.unsqueeze(-1), persistent=False)
-
-    def forward(self, *inputs: Tensor) -> Tensor:
-        """Return the logits, [*batch, *event, n]."""
-        return shaped(self.network(*inputs), self.valid.shape).masked_fill(~self.valid, -torch.inf)
-
-
-class Choices(Independent):
-    """Distribution of several independent choices, of each by the logits of its options [*batch, *event, n].
-
-    An action, one index for each choice, has `event_dims` dimensions.
-    """
-
-    def __init__(self, logits: Tensor, event_dims: int) -> None:
-        super().__init__(CategoricalDistribution(logits=logits), event_dims)
-
-    @property
-    def deterministic_sample(self) -> Tensor:
-        """The most probable choices."""
-        return self.base_dist.mode
-
-
-def shaped(vectors: Tensor, event: torch.Size) -> Tensor:
-    """Return vectors [*batch, n] as [*batch, *event]."""
-    return vectors.reshape(*vectors.shape[:-1], *event)
 
 
 class FastTensorDictModule(TensorDictModuleBase):
@@ -212,9 +139,11 @@ def action_spec(env: EnvBase) -> TensorSpec:
         spec, MultiOneHot
     )
     if not (numbers or options):
-        known = "numbers (Bounded, Unbounded), one of several options (Categorical, OneHot) or several such"
-        given = f"the action of this env is {type(spec).__name__} of {spec.dtype}"
-        raise ValueError(f"{given}, but a policy chooses {known} (MultiCategorical); transform it")
+        raise ValueError(
+            f"the action of this env is {type(spec).__name__} of {spec.dtype}, but a policy "
+            "chooses numbers (Bounded, Unbounded), one of several options (Categorical, OneHot) or "
+            "several such (MultiCategorical); transform it"
+        )
     return spec
 
 
@@ -229,7 +158,7 @@ def actor(
     state_dependent_scale: bool = False,
     squash: bool = True,
     normaliser: Normaliser | None = None,
-    anchor: Anchor | None = None,
+    anchored_to: NestedKey | None = None,
 ) -> ProbabilisticTensorDictSequential:
     """Return a stochastic policy for the actions of an env.
 
@@ -237,18 +166,28 @@ def actor(
     is infinite, a normal whose samples are clipped, see `ClippedNormal`), a normal for unbounded
     ones, a categorical for discrete ones, and several of these for several choices. Its
     deterministic action is the mode. It writes the action, and its logarithmic probability as
-    `action_log_prob`.
+    `action_log_prob`. With a memory it also writes its next state, see `Gru`.
 
-    The initial standard deviation before squashing is `scale`; with `state_dependent_scale` it is
-    an output of the network, for continuous actions only. `gain` scales the initial weights of the
-    last layer. `shapes` are as for `ConcatObservations`. A network with a memory also writes its
-    next state, see `Gru`. With an `anchor` the policy starts as its guide.
+    Args:
+        env: the env, for its specs.
+        in_keys: entries that the policy observes.
+        network: architecture, perhaps with a memory, which the env then carries.
+        scale: initial standard deviation, before squashing; for continuous actions only.
+        gain: scale of the initial weights of the last layer.
+        shapes: shapes of observed entries that the env does not write, without the batch
+            dimensions.
+        state_dependent_scale: whether the standard deviation is an output of the network; otherwise
+            it is the same in every state.
+        squash: whether bounded actions are squashed by tanh; otherwise samples are clipped.
+        normaliser: normalises some of `in_keys`; it becomes the first module of the policy.
+        anchored_to: entry with advice, [*batch, n_guides, A], that pulls the mean or the logits,
+            see `AnchoredHead`; None: nothing does.
 
-    An action of another kind, or a network with a memory that the env does not carry, is a
-    `ValueError`; an entry that the env does not have, such as the advice for an anchor, a
-    `KeyError`.
+    Raises:
+        ValueError: if no policy can choose such actions, or the env does not carry the memory.
+        KeyError: if the env does not have one of the entries.
     """
-    spec, key, event = action_spec(env), env.action_key, action_shape(env)
+    spec = action_spec(env)
     keys = in_keys if normaliser is None else normaliser.reads(in_keys)
     before: list[TensorDictModuleBase] = [] if normaliser is None else [normaliser]
     if isinstance(network, Gru):
@@ -260,64 +199,122 @@ def actor(
         dtype = spec.dtype if spec.dtype.is_floating_point else None
         return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
 
-    if anchor is not None:
-        (advice,) = entry_specs(env, [anchor.advice_key])
-        keys = [anchor.advice_key, *keys]
+    part = _action_part(env, spec, network_of, scale, state_dependent_scale, squash)
+    head = part.head
+    if anchored_to is not None:
+        (advice,) = entry_specs(env, [anchored_to])
+        head = AnchoredHead(head, part.pull, advice.shape[-2], env.device)
+        keys = [anchored_to, *keys]
+    module = FastTensorDictModule(head, keys, part.parameters)
+    return ProbabilisticTensorDictSequential(*before, module, part.sample)
 
-    def anchored(head: nn.Module, pull: Callable[[Tensor], Tensor]) -> nn.Module:
-        return (
-            head
-            if anchor is None
-            else anchor.attach(AnchoredHead(head, pull, advice.shape[-2], env.device))
-        )
 
-    def policy(head: nn.Module, parameters: list[str], distribution: type, **options: Any) -> Any:
-        module = FastTensorDictModule(head, keys, parameters)
-        return ProbabilisticTensorDictSequential(
-            *before, module, Sample(parameters, key, distribution, **options)
-        )
+NetworkOf = Callable[[int], ObservationNetwork]  # makes a network with that many outputs
 
+
+@dataclass(frozen=True)
+class _ActionPart:
+    """The part of a policy that depends on the kind of action.
+
+    Attributes:
+        head: gives the parameters of a distribution from what is observed.
+        parameters: their names.
+        sample: samples from the distribution.
+        pull: turns advice into numbers that are added to the first parameter, see `AnchoredHead`.
+    """
+
+    head: nn.Module
+    parameters: list[str]
+    sample: Sample
+    pull: Callable[[Tensor], Tensor]
+
+
+def _action_part(
+    env: EnvBase,
+    spec: TensorSpec,
+    network_of: NetworkOf,
+    scale: float,
+    state_dependent_scale: bool,
+    squash: bool,
+) -> _ActionPart:
+    """Return the part for the actions of an env; arguments as for `actor`."""
+    event = action_shape(env)
     if isinstance(spec, OneHot) or (isinstance(spec, Categorical) and not event):
-        distribution = (
-            CategoricalDistribution if isinstance(spec, Categorical) else OneHotCategorical
-        )
-        valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
-        return policy(
-            anchored(network_of(spec.space.n), pull_to_choice(valid)), ["logits"], distribution
-        )
+        return _one_choice(env, spec, network_of)
     if not spec.dtype.is_floating_point:
-        options = torch.tensor(choices_of(spec), device=spec.device).expand(event)
-        choices = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
-        return policy(
-            anchored(choices, pull_to_choice(choices.valid)),
-            ["logits"],
-            Choices,
-            event_dims=len(event),
-        )
-    size = event.numel()
-    gaussian = GaussianHead if state_dependent_scale else GlobalScaleHead
-    head: nn.Module = gaussian(
-        network_of(2 * size if state_dependent_scale else size), event, scale
-    )
+        return _several_choices(env, spec, network_of, event)
+    head = _normal_head(network_of, event, scale, state_dependent_scale)
     if not isinstance(spec, Bounded):
-        head = anchored(head, pull_to_number)
-        return policy(head, ["loc", "scale"], IndependentNormal, event_dim=len(event))
+        return _unbounded(env, head, event)
     first = (0,) * len(env.batch_size)
     low, high = spec.space.low[first], spec.space.high[first]
-    squash = squash and bool((high - low).isfinite().all())
-    head = anchored(head, partial(pull_to_number, bounds=(low, high)) if squash else pull_to_number)
-    if squash:
-        return policy(
-            head,
-            ["loc", "scale"],
-            TanhNormal,
-            low=low,
-            high=high,
-            event_dims=len(event),
-            tanh_loc=False,
-        )
-    module = FastTensorDictModule(head, keys, ["loc", "scale"])
-    return ProbabilisticTensorDictSequential(*before, module, ClippedNormal(low, high, key))
+    if squash and bool((high - low).isfinite().all()):
+        return _squashed(env, head, low, high)
+    return _clipped(env, head, low, high)
+
+
+def _one_choice(env: EnvBase, spec: TensorSpec, network_of: NetworkOf) -> _ActionPart:
+    """Return the part for one of n options, as an index or one-hot."""
+    is_index = isinstance(spec, Categorical)
+    distribution = CategoricalDistribution if is_index else OneHotCategorical
+    valid = torch.ones(spec.space.n, dtype=torch.bool, device=spec.device)
+    return _ActionPart(
+        network_of(spec.space.n),
+        ["logits"],
+        Sample(["logits"], env.action_key, distribution),
+        pull_to_choice(valid),
+    )
+
+
+def _several_choices(
+    env: EnvBase, spec: TensorSpec, network_of: NetworkOf, event: torch.Size
+) -> _ActionPart:
+    """Return the part for several choices at once, as indices of shape `event`."""
+    options = torch.tensor(choices_of(spec), device=spec.device).expand(event)
+    head = ChoicesHead(network_of(options.numel() * int(options.max())), event, options)
+    return _ActionPart(
+        head,
+        ["logits"],
+        Sample(["logits"], env.action_key, Choices, event_dims=len(event)),
+        pull_to_choice(head.valid),
+    )
+
+
+def _normal_head(
+    network_of: NetworkOf, event: torch.Size, scale: float, state_dependent_scale: bool
+) -> nn.Module:
+    """Return a head that gives mean and standard deviation of numbers of shape `event`."""
+    size = event.numel()
+    if state_dependent_scale:
+        return GaussianHead(network_of(2 * size), event, scale)
+    return GlobalScaleHead(network_of(size), event, scale)
+
+
+def _unbounded(env: EnvBase, head: nn.Module, event: torch.Size) -> _ActionPart:
+    """Return the part for numbers of shape `event` without bounds."""
+    sample = Sample(["loc", "scale"], env.action_key, IndependentNormal, event_dim=len(event))
+    return _ActionPart(head, ["loc", "scale"], sample, pull_to_number)
+
+
+def _squashed(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
+    """Return the part for numbers that tanh squashes to their bounds."""
+    sample = Sample(
+        ["loc", "scale"],
+        env.action_key,
+        TanhNormal,
+        low=low,
+        high=high,
+        event_dims=low.ndim,
+        tanh_loc=False,
+    )
+    pull = partial(pull_to_number, bounds=(low, high))
+    return _ActionPart(head, ["loc", "scale"], sample, pull)
+
+
+def _clipped(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
+    """Return the part for numbers that are clipped to their bounds."""
+    sample = ClippedNormal(low, high, env.action_key)
+    return _ActionPart(head, ["loc", "scale"], sample, pull_to_number)
 
 
 def memory(
@@ -337,8 +334,10 @@ def memory(
         for key, spec in env.observation_spec.items(True, True)
     }
     if "is_init" not in carried or carried.get(STATE) != (1, network.state):
-        remedy = "put the network's env_transforms() around the env"
-        raise ValueError(f"the env does not carry the memory of the network; {remedy}")
+        raise ValueError(
+            "the env does not carry the memory of the network; put the network's env_transforms() "
+            "around the env"
+        )
     entries = ConcatObservations(env, in_keys, shapes)
     gru = GRUModule(
         entries.width,

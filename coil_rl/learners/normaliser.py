@@ -12,20 +12,27 @@ import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.data import Categorical, OneHot
 from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import entry_specs
+from coil_rl.learners.extension import Extension
 from coil_rl.transforms import GuideActions
 
 LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
+CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 
 
 class Normaliser(TensorDictModuleBase):
-    """Entries of an env minus their mean, divided by their standard deviation, over everything that `learn` has seen.
+    """Entries minus their mean, divided by their standard deviation, over everything that `learn` has seen.
 
     The results are written as `("normalised", KEY)`. Before the first `learn` they equal the
     entries. Advice, which shares the unit of the action, and entries of other than floating point
     numbers are a `ValueError`.
+
+    Args:
+        env: the env, for its specs.
+        keys: the entries.
     """
 
     def __init__(self, env: EnvBase, keys: Sequence[NestedKey]) -> None:
@@ -60,8 +67,32 @@ class Normaliser(TensorDictModuleBase):
             moments.add(batch[key])  # type: ignore[operator]
 
 
+class RunningStatistics(Extension):
+    """Lets a normaliser learn from each batch, after the update.
+
+    The policy has collected the batch with the earlier statistics, and must learn from it with the
+    same ones. The statistics are in the state of the policy, so there is no other state.
+
+    Args:
+        normaliser: of policy and critic.
+    """
+
+    def __init__(self, normaliser: Normaliser) -> None:
+        self.normaliser = normaliser
+
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Add the entries of the batch to the statistics; there are no metrics."""
+        self.normaliser.learn(batch)
+        return {}
+
+
 class Moments(nn.Module):
-    """Count, mean and variance of each element of all arrays of a shape seen so far (Chan et al. 1979)."""
+    """Count, mean and variance of each element of all arrays seen so far (Chan et al. 1979).
+
+    Args:
+        shape: of an array.
+        device: of the statistics; None: PyTorch's default.
+    """
 
     def __init__(self, shape: torch.Size, device: torch.device | None = None) -> None:
         super().__init__()
@@ -107,23 +138,25 @@ def normaliser(
     `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not
     advice, choices or images.
     """
-    if not isinstance(normalise, bool):
+    if isinstance(normalise, bool):
+        chosen = vectors_of_measurements(env, in_keys) if normalise else []
+    else:
         chosen = list(normalise)
         if unread := [str(key) for key in chosen if key not in in_keys]:
-            observed = ", ".join(map(str, in_keys))
             raise ValueError(
-                f"normalise: {', '.join(unread)} is not observed; observed are {observed}"
+                f"normalise: {', '.join(unread)} is not observed; "
+                f"observed are {', '.join(map(str, in_keys))}"
             )
-    else:
-        advice, batch_dims = advice_keys(env), len(env.batch_size)
-        chosen = [
-            key
-            for key, spec in zip(in_keys, entry_specs(env, in_keys), strict=True)
-            if normalise
-            and key not in advice
-            and spec.dtype.is_floating_point
-            and len(spec.shape) - batch_dims < 3
-            and not hasattr(spec, "nvec")
-            and getattr(spec, "domain", "continuous") == "continuous"
-        ]
     return Normaliser(env, chosen) if chosen else None
+
+
+def vectors_of_measurements(env: EnvBase, keys: Sequence[NestedKey]) -> list[NestedKey]:
+    """Return those of some entries of an env that are not advice, choices or images."""
+    advice, batch_dims = advice_keys(env), len(env.batch_size)
+    chosen = []
+    for key, spec in zip(keys, entry_specs(env, keys), strict=True):
+        is_choice = isinstance(spec, CHOICES) or not spec.dtype.is_floating_point
+        is_image = len(spec.shape) - batch_dims >= 3
+        if not (key in advice or is_choice or is_image):
+            chosen.append(key)
+    return chosen

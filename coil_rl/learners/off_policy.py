@@ -6,13 +6,18 @@ from typing import Any, ClassVar, Literal
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import expand_as_right
+from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
-from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.anchor import Anchor, AnchoredUpdate
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.gradient import GradientStep
+from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
+from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.normaliser import normaliser
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
@@ -20,19 +25,26 @@ from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
 from coil_rl.transforms.guide_transform import GuideTransform
 
 
-class OffPolicy(Stateful):
+class OffPolicy(Stateful, Learner):
     """Replay buffer, optimiser, target networks and update.
 
     A step is stored with the observations before and after it, advice included, because a guide
-    with memory or randomness cannot be evaluated again. Where a guide acted in place of the agent,
-    the action that was executed is stored, or 0 if the agent's action is a residual. Such steps are
-    left out if no action of the agent has the same effect: its actions are choices, or combined in
-    several ways. An action that is added to the guide's is stored as the agent's own, since the sum
-    is a part of the env.
+    with memory or randomness cannot be evaluated again. What is stored of a step in which a guide
+    acted in place of the agent depends on how actions reach the env:
 
-    A subclass builds its networks and calls `set_loss`. It names the losses to minimise the sum of
-    (`minimised`) and the values to report (`reported`). A value out of range is a `ValueError`, and
-    so is an env in which the effect or the reward of an action changes over the run.
+    | actions of the agent | stored |
+    | --- | --- |
+    | are executed as they are | the action that was executed |
+    | are a residual, added to the guide's | the action 0 |
+    | are choices, or combined in several ways | nothing: no action of the agent has this effect |
+
+    Where the agent acts its own action is stored, also a residual, because the sum is a part of the
+    env.
+
+    A subclass builds its networks, calls `set_loss` and then `extend`. It names the losses to
+    minimise the sum of (`minimised`) and the values to report (`reported`). A value out of range is
+    a `ValueError`, and so is an env in which the effect or the reward of an action changes over the
+    run.
 
     Args:
         env: the env, for its device and transforms.
@@ -56,9 +68,10 @@ class OffPolicy(Stateful):
 
     Attributes:
         keys: entries that a batch must have.
+        extensions: what is added to the algorithm.
+        anchored: the extension of an anchored policy, if it is one.
     """
 
-    kind: ClassVar[str] = "agent"  # as for `PPO`
     compilable: ClassVar[bool] = True
     parts: ClassVar[tuple[str, ...]] = (
         "loss",
@@ -66,7 +79,7 @@ class OffPolicy(Stateful):
         "generator",
         "pending_updates",
         "normaliser",
-        "anchor",
+        "extensions",
     )
     minimised: tuple[str, ...]
     reported: tuple[str, ...]
@@ -100,32 +113,15 @@ class OffPolicy(Stateful):
         if not max(starts, 1) <= capacity:
             raise ValueError(f"capacity={capacity} must be at least 1 and at least starts={starts}")
         check_range(0, LARGEST_SEED, seed=seed)
-        for transform in env.modules():
-            if isinstance(transform, GuideTransform) and callable(
-                getattr(transform, transform.mdp_parameter, None)
-            ):
-                problem = (
-                    f"{transform.mdp_parameter} of {type(transform).__name__} changes over the run"
-                )
-                effect = "so stored steps would no longer show the effect of an action"
-                remedy = "make it a number, or use a learner without replay, such as PPO"
-                raise ValueError(f"{problem}, {effect}; {remedy}")
-        if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
-            needed, has = "one entry action and one entry reward", ", ".join(map(str, keys))
-            remedy = "rename them by TorchRL's RenameTransform, or use PPO"
-            raise ValueError(
-                f"{type(self).__name__} needs {needed}, but this env has {has}; {remedy}"
-            )
+        check_replay(env, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
-        self.guide_may_act = "agent_acts" in env.observation_spec
+        self.guide_may_act = guide_may_act(env)
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
-            needed = (
-                "steps in which a guide acts in place of the agent, as with the transform Takeover"
-            )
             raise ValueError(
-                f"prior={prior} needs {needed}, by an action that the agent could choose; or take prior=0"
+                f"prior={prior} needs steps in which a guide acts in place of the agent, as with the "
+                "transform Takeover, by an action that the agent could choose; or take prior=0"
             )
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [
@@ -133,36 +129,34 @@ class OffPolicy(Stateful):
             "action",
             *(unravel_key(("next", key)) for key in after),
         ]
-        self.keys = [*self.stored_keys, "agent_acts"] if self.guide_may_act else [*self.stored_keys]
-        self.keys += [("next", EXECUTED)] if self.of_guide == "executed" else []
-        self.capacity, self.batch_size, self.ratio, self.starts = (
-            capacity,
-            batch_size,
-            ratio,
-            starts,
-        )
+        self.keys = [*self.stored_keys]
+        if self.guide_may_act:
+            self.keys.append(AGENT_ACTS)
+        if self.of_guide == "executed":
+            self.keys.append(("next", EXECUTED))
+        self.capacity, self.batch_size = capacity, batch_size
+        self.ratio, self.starts = ratio, starts
         self.pending_updates = 0.0
         self.device = env.device or torch.device("cpu")
         self.generator = torch.Generator(self.device).manual_seed(seed)
+        self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
+        self.prior = round(prior * batch_size)
+        self.extensions = Extensions([])
+        self.anchored: AnchoredUpdate | None = None
+
+    def _new_buffer(self) -> ReplayBuffer:
         # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw
         # other samples.
-        self.buffer, self.guide_buffer = (
-            ReplayBuffer(
-                storage=LazyTensorStorage(capacity, device=self.device), generator=self.generator
-            )
-            for _ in range(2)
-        )
-        self.prior = round(prior * batch_size)
+        storage = LazyTensorStorage(self.capacity, device=self.device)
+        return ReplayBuffer(storage=storage, generator=self.generator)
 
     def also_store(self, *keys: NestedKey) -> None:
         """Store further entries of the env, before and after each step."""
-        for known in (self.stored_keys, self.keys):
-            known += [
-                each
-                for key in keys
-                for each in (key, unravel_key(("next", key)))
-                if each not in known
-            ]
+        for key in keys:
+            for each in (key, unravel_key(("next", key))):
+                for known in (self.stored_keys, self.keys):
+                    if each not in known:
+                        known.append(each)
 
     def set_loss(self, loss: LossModule) -> None:
         """Set TorchRL's loss, and make its target networks and the optimiser."""
@@ -181,6 +175,15 @@ class OffPolicy(Stateful):
             compilable=self.compilable,
         )
 
+    def extend(self, extensions: Sequence[Extension], policy: nn.Module) -> None:
+        """Add extensions, and that of an anchored policy if the learner has an `anchor`."""
+        every = [*extensions]
+        if self.anchor is not None:
+            self.anchored = AnchoredUpdate(self.anchor, policy)
+            every.append(self.anchored)
+        self.extensions = Extensions(every)
+        self.also_store(*self.extensions.keys)
+
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
         """Store the steps of a batch and learn from stored steps.
 
@@ -190,8 +193,8 @@ class OffPolicy(Stateful):
 
         Returns:
             Means over the minibatches of the `reported` values, 0 before learning starts; the
-            number of `minibatches`; the number of stored steps (`kept`); the learning rate; and the
-            values of `describe`.
+            number of `minibatches`; the number of stored steps (`kept`); the learning rate; the
+            values of `describe`; and the metrics of the extensions.
         """
         self.store(batch)
         self.gradient.begin(progress)
@@ -199,14 +202,14 @@ class OffPolicy(Stateful):
         for minibatch in self.samples():
             reports.append(self.gradient(minibatch, weights))
         means = self.gradient.means(reports) if reports else {}
-        return {name: means.get(name, 0.0) for name in self.reported} | {
-            **self.describe(minibatch),
+        metrics = {name: means.get(name, 0.0) for name in self.reported}
+        metrics |= self.describe(minibatch) | {
             "minibatches": float(len(reports)),
             "compiled": float(self.gradient.compile is True),
             "kept": float(self.kept),
             "learning_rate": self.learning_rate(progress),
-            **(self.anchor.set_noise(progress) if self.anchor else {}),
         }
+        return metrics | self.extensions.finish(batch, progress)
 
     @property
     def kept(self) -> int:
@@ -215,26 +218,31 @@ class OffPolicy(Stateful):
 
     def store(self, batch: TensorDictBase) -> None:
         """Store the steps of a batch [*B, T]."""
-        steps, guide = batch.select(*self.stored_keys).reshape(-1), None
-        if self.guide_may_act:
-            agent = batch["agent_acts"].reshape(-1)
-            if self.of_guide == "nothing":
-                steps = steps[agent]
-            elif self.of_guide == "executed":
-                # Where the agent acts it is its own action.
-                steps["action"] = batch["next", EXECUTED].reshape(steps["action"].shape)
-            else:
-                steps["action"] = torch.where(
-                    expand_as_right(agent, steps["action"]), steps["action"], 0
-                )
-            if self.prior:
-                steps, guide = steps[agent], steps[~agent]
-        for buffer, new in ((self.buffer, steps), (self.guide_buffer, guide)):
-            if new is not None and len(new):
-                if self.normaliser is not None:
-                    self.normaliser.learn(new)
-                buffer.extend(new[-self.capacity :])
-                self.pending_updates += len(new) * self.ratio / self.batch_size
+        steps = batch.select(*self.stored_keys).reshape(-1)
+        if not self.guide_may_act:
+            self._store(steps, self.buffer)
+            return
+        agent_acts = batch[AGENT_ACTS].reshape(-1)
+        if self.of_guide == "nothing":
+            steps = steps[agent_acts]
+        elif self.of_guide == "executed":  # where the agent acts it is its own action
+            steps["action"] = batch["next", EXECUTED].reshape(steps["action"].shape)
+        else:
+            is_own = expand_as_right(agent_acts, steps["action"])
+            steps["action"] = torch.where(is_own, steps["action"], 0)
+        if self.prior:
+            self._store(steps[agent_acts], self.buffer)
+            self._store(steps[~agent_acts], self.guide_buffer)
+        else:
+            self._store(steps, self.buffer)
+
+    def _store(self, steps: TensorDictBase, buffer: ReplayBuffer) -> None:
+        if len(steps) == 0:
+            return
+        if self.normaliser is not None:
+            self.normaliser.learn(steps)
+        buffer.extend(steps[-self.capacity :])
+        self.pending_updates += len(steps) * self.ratio / self.batch_size
 
     def samples(self) -> Sequence[TensorDictBase]:
         """Return as many minibatches [N] as are due for the steps stored so far, with replacement."""
@@ -242,8 +250,11 @@ class OffPolicy(Stateful):
         if not due:
             return []
         self.pending_updates -= due
-        prior = self.prior if len(self.buffer) else self.batch_size
-        prior = prior if len(self.guide_buffer) else 0
+        prior = self.prior
+        if not len(self.guide_buffer):
+            prior = 0
+        elif not len(self.buffer):
+            prior = self.batch_size
         sizes = {self.guide_buffer: prior, self.buffer: self.batch_size - prior}
         # All at once: a call of the buffer takes as long as a step.
         parts = [
@@ -261,7 +272,11 @@ class OffPolicy(Stateful):
 
     def loss_weights(self, progress: float) -> dict[str, float]:
         """Return the weights of the losses in the sum that an update minimises."""
-        return dict.fromkeys(self.minimised, 1.0)
+        return self.extensions.weights(dict.fromkeys(self.minimised, 1.0), progress)
+
+    def callbacks(self, cases: Cases) -> Sequence[Callback]:
+        """Return the callbacks of the extensions."""
+        return self.extensions.callbacks(self.policy, cases)
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return further metrics of the last minibatch of an update, which is None before learning starts."""
@@ -269,13 +284,10 @@ class OffPolicy(Stateful):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything the next update depends on besides its batch."""
-        buffers = [
-            {
-                "steps": buffer[:].clone().to_dict() if len(buffer) else {},
-                "writer": buffer.writer.state_dict(),
-            }
-            for buffer in (self.buffer, self.guide_buffer)
-        ]
+        buffers = []
+        for buffer in (self.buffer, self.guide_buffer):
+            steps = buffer[:].clone().to_dict() if len(buffer) else {}
+            buffers.append({"steps": steps, "writer": buffer.writer.state_dict()})
         return super().state_dict() | {"buffers": buffers}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -283,22 +295,38 @@ class OffPolicy(Stateful):
         super().load_state_dict(state)
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
-            if stored["steps"]:
-                steps = TensorDict.from_dict(
-                    stored["steps"], batch_size=stored["steps"]["action"].shape[:1]
-                )
+            if entries := stored["steps"]:
+                steps = TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
+
+
+def check_replay(env: EnvBase, learner: str) -> None:
+    """Raise a `ValueError` if a learner with replay, of that name, cannot learn in an env."""
+    for transform in env.modules():
+        if not isinstance(transform, GuideTransform):
+            continue
+        name = transform.mdp_parameter
+        if callable(getattr(transform, name, None)):
+            raise ValueError(
+                f"{name} of {type(transform).__name__} changes over the run, so stored steps would "
+                "no longer show the effect of an action; make it a number, or use a learner without "
+                "replay, such as PPO"
+            )
+    if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
+        raise ValueError(
+            f"{learner} needs one entry action and one entry reward, but this env has "
+            f"{', '.join(map(str, keys))}; rename them by TorchRL's RenameTransform, or use PPO"
+        )
 
 
 def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:
     """Return which action of the agent had the same effect as that of a guide which acted in its place."""
     combined = [transform for transform in env.modules() if isinstance(transform, CombinedAction)]
-    if "agent_acts" not in env.observation_spec or (
-        len(combined) > 1 and any(each.adds for each in combined)
-    ):
+    adds = any(each.adds for each in combined)
+    if not guide_may_act(env) or (len(combined) > 1 and adds):
         return "nothing"
     executed, own = env.observation_spec.get(EXECUTED, None), env.action_spec
     if executed is None or (executed.shape, executed.dtype) != (own.shape, own.dtype):
         return "nothing"
-    return "zero" if any(each.adds for each in combined) else "executed"
+    return "zero" if adds else "executed"

@@ -13,25 +13,24 @@ minibatch (Ball et al. 2023).
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import (
-    ProbabilisticTensorDictSequential,
-    TensorDictModuleBase,
-    TensorDictSequential,
-)
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictSequential
 from tensordict.utils import NestedKey
-from torch import Tensor
 from torchrl.envs import EnvBase
-from torchrl.objectives import REDQLoss, SACLoss
+from torchrl.objectives import LossModule, REDQLoss, SACLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
+from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp, without_memory
+from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.schedules import Linear, Schedule
 from coil_rl.transforms.action_space import nested_key
 
 
@@ -58,10 +57,25 @@ class SAC(OffPolicy):
             actions never tried.
         uncertainty: whether the policy writes that of the critics, see `Critics`, for
             `AdaptiveMixedAction`.
-        auxiliary: additional losses of the policy.
-        tau, ratio, options: as for `OffPolicy`. For returns in the hundreds, as of a pendulum, use
-            a large `max_grad_norm`: otherwise the gradients of the critics dominate those of the
-            policy.
+        auxiliary: extensions, such as losses of the policy (`KickstartLoss`).
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`. Steps are stored as they are.
+        tau: step of the target networks towards the networks after each minibatch, as a fraction.
+        ratio: how often a step is sampled, on average over the run.
+        learning_rate: of Adam, a number or a schedule.
+        gamma: discount.
+        max_grad_norm: gradients are scaled down to this norm, over all networks together. Take a
+            large one for returns in the hundreds, as of a pendulum: otherwise the gradients of the
+            critics dominate those of the policy.
+        capacity: maximum number of stored steps; the newest replace the oldest.
+        batch_size: N, steps in a minibatch.
+        starts: number of stored steps before learning starts.
+        prior: share of each minibatch that is sampled from the steps of guides, which are then
+            stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
+            steps are sampled alike.
+        compile: whether to compile the update, see `GradientStep`.
+        anchor: makes the policy start as its guide.
+        seed: of the samples.
     """
 
     minimised = ("loss_actor", "loss_qvalue", "loss_alpha")
@@ -82,10 +96,20 @@ class SAC(OffPolicy):
         target_critics: int | None = None,
         critic_layer_norm: bool = False,
         uncertainty: bool = False,
-        auxiliary: Sequence[KickstartLoss] = (),
+        auxiliary: Sequence[Extension] = (),
+        normalise: bool | Sequence[NestedKey] = False,
         tau: float = 0.02,
         ratio: float = 8.0,
-        **options: Any,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        max_grad_norm: float = 10.0,
+        capacity: int = 100_000,
+        batch_size: int = 256,
+        starts: int = 5_000,
+        prior: float = 0.0,
+        compile: bool | Literal["auto"] = "auto",
+        anchor: Anchor | None = None,
+        seed: int = 0,
     ) -> None:
         check_range(2, 1_000, critics=critics)
         if target_critics is not None and not 1 <= target_critics < critics:
@@ -94,61 +118,58 @@ class SAC(OffPolicy):
             )
         check_range(0, action_gain=action_gain)
         check_range(0, above=True, action_scale=action_scale, temperature=temperature)
-        spec = env.action_spec
-        if not spec.dtype.is_floating_point:
-            remedy = "use action=continuous, or a learner for discrete actions, such as DQN"
+        if not env.action_spec.dtype.is_floating_point:
             raise ValueError(
-                f"SAC needs continuous actions, but this env has discrete ones; {remedy}"
+                "SAC needs continuous actions, but this env has discrete ones; use "
+                "action=continuous, or a learner for discrete actions, such as DQN"
             )
-        in_keys, network = (
-            list(map(nested_key, in_keys)),
-            without_memory(network or Mlp(hidden), "SAC"),
+        in_keys = [nested_key(key) for key in in_keys]
+        network = without_memory(network or Mlp(hidden), "SAC")
+        super().__init__(
+            env,
+            in_keys,
+            normalise=normalise,
+            tau=tau,
+            ratio=ratio,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            max_grad_norm=max_grad_norm,
+            capacity=capacity,
+            batch_size=batch_size,
+            starts=starts,
+            prior=prior,
+            compile=compile,
+            anchor=anchor,
+            seed=seed,
         )
-        super().__init__(env, in_keys, tau=tau, ratio=ratio, **options)
         self.action_scale, self.action_gain = action_scale, action_gain
-        # Minibatches are normalised once, for all networks.
-        self.actor = self.build_actor(env, in_keys, network)
-        before = [] if self.normaliser is None else [self.normaliser]
-        self.policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
-        architectures = [
-            replace(network, layer_norm=True) if critic_layer_norm else network
-        ] * critics
+        self.actor = self.build_actor(env, in_keys, network, anchor)
+        if target_entropy is None:
+            target_entropy = -networks.action_shape(env).numel()
+        critic = replace(network, layer_norm=True) if critic_layer_norm else network
         arguments = {
             "actor_network": self.actor,
             "qvalue_network": [
-                networks.action_critic(env, in_keys, each, self.normaliser)
-                for each in architectures
+                networks.action_critic(env, in_keys, critic, self.normaliser)
+                for _ in range(critics)
             ],
             "num_qvalue_nets": critics,
             "alpha_init": temperature,
-            "target_entropy": float(
-                -networks.action_shape(env).numel() if target_entropy is None else target_entropy
-            ),
+            "target_entropy": float(target_entropy),
             "loss_function": "l2",
         }
-        if target_critics is None:
-            loss = self.build_loss(env, in_keys, network, **arguments)
-        else:
-            # Its own bounds of alpha are for rewards of about 1.
-            loss = REDQLoss(
-                **arguments, sub_sample_len=target_critics, min_alpha=1e-8, max_alpha=1e8
-            )
-        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
-        self.set_loss(loss)
-        self.critics = Critics(loss)
-        self.writes_uncertainty = uncertainty
-        if uncertainty:
-            self.policy = TensorDictSequential(self.policy, self.critics)
-        self.auxiliary = list(auxiliary)
-        for each in self.auxiliary:
-            each.critics = self.critics
-            self.also_store(*each.keys)
-            self.reported = (*self.reported, f"loss_{each.name}")
+        self.set_loss(self.build_loss(env, in_keys, network, target_critics, arguments))
+        self.critics, self.writes_uncertainty = Critics(self.loss), uncertainty
+        self.policy = self.build_policy()
+        self._extend(auxiliary)
 
     def build_actor(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, anchor: Anchor | None
     ) -> ProbabilisticTensorDictSequential:
-        """Return a policy that reads entries that have been normalised already."""
+        """Return a policy that reads entries that have been normalised already.
+
+        Minibatches are normalised once, for all networks.
+        """
         policy = networks.actor(
             env,
             in_keys,
@@ -157,76 +178,55 @@ class SAC(OffPolicy):
             self.action_gain,
             state_dependent_scale=True,
             normaliser=self.normaliser,
-            anchor=self.anchor,
+            anchored_to=None if anchor is None else anchor.advice_key,
         )
-        return (
-            policy
-            if self.normaliser is None
-            else ProbabilisticTensorDictSequential(*policy.module[1:])
-        )
+        if self.normaliser is None:
+            return policy
+        return ProbabilisticTensorDictSequential(*policy.module[1:])
 
     def build_loss(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, **arguments: Any
-    ) -> SACLoss:
-        """Return the loss for networks that observe `in_keys`; `arguments` are those of TorchRL's."""
-        return SACLoss(**arguments)
+        self,
+        env: EnvBase,
+        in_keys: Sequence[NestedKey],
+        network: Mlp,
+        target_critics: int | None,
+        arguments: dict[str, Any],
+    ) -> LossModule:
+        """Return TorchRL's loss for networks that observe `in_keys`; `arguments` are those of TorchRL."""
+        if target_critics is None:
+            loss = SACLoss(**arguments)
+        else:
+            # Its own bounds of alpha are for rewards of about 1.
+            bounds = {"min_alpha": 1e-8, "max_alpha": 1e8}
+            loss = REDQLoss(**arguments, sub_sample_len=target_critics, **bounds)
+        loss.target_entropy  # noqa: B018  becomes part of the state at the first access
+        return loss
+
+    def build_policy(self) -> TensorDictSequential:
+        """Return the policy that collects the batches."""
+        before = [] if self.normaliser is None else [self.normaliser]
+        policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
+        return TensorDictSequential(policy, self.critics) if self.writes_uncertainty else policy
+
+    def _extend(self, auxiliary: Sequence[Extension]) -> None:
+        for each in auxiliary:
+            if isinstance(each, KickstartLoss):
+                each.critics = self.critics
+        self.extend(auxiliary, self.actor)
+        self.reported = (*self.reported, *self.extensions.weights({}, 0.0))
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and other values, scalars."""
         losses = super().losses(minibatch)
-        for each in self.auxiliary:
-            losses[f"loss_{each.name}"] = each(self.actor, minibatch)
+        for name, loss in self.extensions.losses(self.actor, minibatch).items():
+            losses[name] = loss
         return losses
-
-    def loss_weights(self, progress: float) -> dict[str, float]:
-        """Return the weights of the losses in the sum that an update minimises."""
-        learns = float(self.anchor is None or not self.anchor.waits(progress))
-        weights = super().loss_weights(progress) | {"loss_actor": learns}
-        return weights | {
-            f"loss_{each.name}": learns * each.coefficient_at(progress) for each in self.auxiliary
-        }
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return the mean uncertainty about the actions of the last minibatch, 0 before learning starts."""
         if not self.writes_uncertainty:
             return {}
-        return {
-            "uncertainty": 0.0
-            if minibatch is None
-            else float(self.critics.values(minibatch).std(0).mean())
-        }
-
-
-class Critics(TensorDictModuleBase):
-    """The critics of a loss of TorchRL, all at once; they read entries that have been normalised already.
-
-    As a module it writes their uncertainty: the standard deviation of the values of an action, in
-    the unit of the return, as `("next", "uncertainty")` [*B, 1]. The `weights` are perhaps those of
-    the target networks; None: those that learn.
-    """
-
-    def __init__(self, loss: SACLoss | REDQLoss, weights: TensorDictBase | None = None) -> None:
-        self._network = (
-            loss.qvalue_network,
-        )  # without weights; a tuple, so that it is no submodule
-        self.in_keys: list[NestedKey] = list(loss.qvalue_network.in_keys)
-        self.out_keys: list[NestedKey] = [("next", "uncertainty")]
-        super().__init__()
-        self.weights = loss.qvalue_network_params if weights is None else weights
-
-    def values(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the values of the action, [critics, *B]."""
-        (network,) = self._network
-        data = tensordict.select(*network.in_keys)
-
-        def one(weights: TensorDictBase) -> Tensor:
-            with weights.to_module(network):
-                value: Tensor = network(data.copy())["state_action_value"]
-            return value
-
-        return torch.vmap(one)(self.weights).squeeze(-1)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the uncertainty for the next step of the env."""
-        return tensordict.set(("next", "uncertainty"), self.values(tensordict).std(0).unsqueeze(-1))
+        if minibatch is None:
+            return {"uncertainty": 0.0}
+        return {"uncertainty": float(self.critics.values(minibatch).std(0).mean())}

@@ -7,7 +7,7 @@ need its product with a vector only, a second derivative of the divergence. A li
 sure that the objective improved and that the bound holds.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -20,20 +20,49 @@ from torchrl.envs import EnvBase
 from torchrl.modules import TanhNormal
 
 from coil_rl.envs.limits import check_range
-from coil_rl.learners.networks import Choices
-from coil_rl.learners.ppo import PPO, standardise
+from coil_rl.learners.advantages import standardise
+from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.encoders import Mlp
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.guided_steps import of_agent
+from coil_rl.learners.heads import Choices
+from coil_rl.learners.ppo import PPO
+from coil_rl.schedules import Linear, Schedule
+
+# Returns the total loss, the divergence from the policy before the step, and each loss by name.
+Surrogate = Callable[[], tuple[Tensor, Tensor, dict[str, Tensor]]]
 
 
 class TRPO(PPO):
     """The TRPO learner. The optimiser, its passes and its minibatches are for the critic only.
 
     Args:
-        env, in_keys, options: as for `PPO`; auxiliary losses are part of the objective.
+        env: the env, for its specs.
+        in_keys: entries that policy and critic observe.
         max_kl: bound on a step, mean KL(before || after) over the batch.
         damping: added to the diagonal of the Fisher matrix, which may be singular.
         iterations: of the conjugate gradients.
         backtracks: how often the line search may shorten a step.
         shrink: factor by which it shortens a step.
+        hidden: widths of the hidden layers of both networks, without `network`.
+        network: architecture of both networks, without a memory; None: `Mlp(hidden)`.
+        normalise: whether to normalise what is observed, or the entries to normalise, see
+            `Normaliser`.
+        action_scale: initial standard deviation of the policy.
+        action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
+            everywhere.
+        squash: whether bounded actions are squashed by tanh; otherwise samples beyond the bounds
+            are clipped.
+        learning_rate: of the critic by Adam, a number or a schedule.
+        gamma: discount.
+        gae_lambda: lambda of generalised advantage estimation.
+        epochs: passes of the critic over each batch.
+        minibatches: of the critic per pass.
+        max_grad_norm: gradients of the critic are scaled down to this norm.
+        anchor: makes the policy start as its guide.
+        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`), which are part of the
+            objective.
+        seed: of the order of minibatches.
     """
 
     with_memory = False
@@ -48,15 +77,48 @@ class TRPO(PPO):
         iterations: int = 10,
         backtracks: int = 10,
         shrink: float = 0.8,
-        **options: Any,
+        hidden: Sequence[int] = (64, 64),
+        network: Mlp | None = None,
+        normalise: bool | Sequence[NestedKey] = False,
+        action_scale: float = 0.5,
+        action_gain: float = 0.01,
+        squash: bool = True,
+        learning_rate: float | Schedule = Linear(1e-3, 0.0),
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        epochs: int = 5,
+        minibatches: int = 16,
+        max_grad_norm: float = 0.5,
+        anchor: Anchor | None = None,
+        auxiliary: Sequence[Extension] = (),
+        seed: int = 0,
     ) -> None:
         check_range(0, above=True, max_kl=max_kl)
         check_range(0, 1, above=True, shrink=shrink)
         check_range(0, damping=damping, backtracks=backtracks)
         check_range(1, iterations=iterations)
         super().__init__(
-            env, in_keys, clip=1.0, entropy=0.0, critic=1.0, compile=False, **options
-        )  # no clipped loss
+            env,
+            in_keys,
+            hidden=hidden,
+            network=network,
+            normalise=normalise,
+            action_scale=action_scale,
+            action_gain=action_gain,
+            squash=squash,
+            learning_rate=learning_rate,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            epochs=epochs,
+            minibatches=minibatches,
+            max_grad_norm=max_grad_norm,
+            anchor=anchor,
+            auxiliary=auxiliary,
+            seed=seed,
+            entropy=0.0,
+            critic=1.0,
+            compile=False,
+        )
         self.max_kl, self.damping, self.iterations = max_kl, damping, iterations
         self.backtracks, self.shrink = backtracks, shrink
 
@@ -74,52 +136,67 @@ class TRPO(PPO):
         """
         rows = self.prepare(batch, progress)
         report = self.improve(rows, progress)
+        metrics = {name: float(value) for name, value in report.items()}
         errors = []
-        for minibatch in self.draw_minibatches(rows):
+        for minibatch in self.sampler.draw(rows):
             value = self.critic(minibatch.select(*self.critic.in_keys))["state_value"]
             error = F.mse_loss(value, minibatch["value_target"])
             self.gradient.minimise(error)
             errors.append(error.detach())
-        means = {
-            "loss_critic": float(torch.stack(errors).mean()),
-            "learning_rate": self.learning_rate(progress),
-        }
-        return (
-            {name: float(value) for name, value in report.items()}
-            | means
-            | self.finish(batch, progress)
-        )
+        metrics["loss_critic"] = float(torch.stack(errors).mean())
+        metrics["learning_rate"] = self.learning_rate(progress)
+        return metrics | self.extensions.finish(batch, progress)
 
     def improve(self, rows: TensorDictBase, progress: float = 0.0) -> dict[str, Any]:
         """Take a step of the policy; returns its metrics.
 
-        Of the rows [N] with `minibatch_keys` those in which a guide acted count for auxiliary
-        losses only.
+        Of the rows [N] with `minibatch_keys` those in which a guide acted count for the losses of
+        extensions only.
         """
-        agent_rows = rows[rows["agent_acts"].squeeze(-1)] if self.guide_may_act else rows
-        if (
-            self.policy_waits(progress) or len(agent_rows) < 2
-        ):  # one advantage cannot be standardised
-            names = ("objective", *(auxiliary.name for auxiliary in self.auxiliary))
-            return {f"loss_{name}": 0.0 for name in names} | {"kl": 0.0, "step": 0.0}
-        weights = list(self.policy.parameters())
+        weights = self.loss_weights(progress)
+        # One advantage cannot be standardised.
+        if weights["loss_objective"] == 0 or len(of_agent(rows)) < 2:
+            nothing = {name: 0.0 for name in weights if name != "loss_critic"}
+            return nothing | {"kl": 0.0, "step": 0.0}
+        evaluate = self.surrogate(rows, weights)
+        loss, divergence, losses = evaluate()
+        step = self.natural_step(loss, divergence)
+        improved = self.line_search(evaluate, loss, step)
+        if improved is None:
+            return losses | {"kl": 0.0, "step": 0.0}
+        return improved
+
+    def surrogate(self, rows: TensorDictBase, weights: Mapping[str, float]) -> Surrogate:
+        """Return a function that evaluates the policy, which may change, beside the present one.
+
+        Args:
+            rows: [N] with `minibatch_keys`.
+            weights: of the losses by name.
+        """
+        agent_rows = of_agent(rows)
         observed = agent_rows.select(*self.policy.in_keys)
         advantage = standardise(agent_rows["advantage"]).squeeze(-1)
         with torch.no_grad():
             before = unsquashed(self.policy.get_dist(observed.copy()))
 
         def evaluate() -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-            """Return the total loss, the divergence, and each loss."""
             after = self.policy.get_dist(observed.copy())
             ratio = (after.log_prob(agent_rows["action"]) - agent_rows["action_log_prob"]).exp()
             total = -(ratio * advantage).mean()
             losses = {"loss_objective": total}
-            for auxiliary in self.auxiliary:
-                losses[f"loss_{auxiliary.name}"] = loss = auxiliary(self.policy, rows)
-                total = total + auxiliary.coefficient_at(progress) * loss
+            for name, loss in self.extensions.losses(self.policy, rows).items():
+                losses[name] = loss
+                total = total + weights[name] * loss
             return total, kl_divergence(before, unsquashed(after)).mean(), losses
 
-        loss, divergence, losses = evaluate()
+        return evaluate
+
+    def natural_step(self, loss: Tensor, divergence: Tensor) -> Tensor:
+        """Return the change of the policy's weights, a vector, along the natural gradient of a loss.
+
+        To second order the `divergence` of the policy from itself becomes the bound.
+        """
+        weights = list(self.policy.parameters())
         gradient = derivative(loss, weights)
         slope = derivative(divergence, weights, differentiable=True)
 
@@ -128,17 +205,25 @@ class TRPO(PPO):
 
         direction = conjugate_gradients(fisher, -gradient, self.iterations)
         curvature = direction @ fisher(direction)
-        step = direction * (2 * self.max_kl / curvature.clamp_min(1e-30)).sqrt()
+        return direction * (2 * self.max_kl / curvature.clamp_min(1e-30)).sqrt()
+
+    @torch.no_grad()
+    def line_search(self, evaluate: Surrogate, loss: Tensor, step: Tensor) -> dict[str, Any] | None:
+        """Take a step, or the longest part of it with a smaller total loss and a divergence in bounds.
+
+        Returns:
+            The losses after the step, `kl` and `step`; None if no part will do.
+        """
+        weights = list(self.policy.parameters())
         start, fraction = parameters_to_vector(weights).detach().clone(), 1.0
-        with torch.no_grad():
-            for _ in range(self.backtracks + 1):
-                vector_to_parameters(start + fraction * step, weights)
-                new_loss, divergence, new_losses = evaluate()
-                if (new_loss < loss) & (divergence <= self.max_kl):
-                    return new_losses | {"kl": divergence, "step": fraction}
-                fraction *= self.shrink
-            vector_to_parameters(start, weights)
-        return losses | {"kl": 0.0, "step": 0.0}
+        for _ in range(self.backtracks + 1):
+            vector_to_parameters(start + fraction * step, weights)
+            new_loss, divergence, new_losses = evaluate()
+            if (new_loss < loss) & (divergence <= self.max_kl):
+                return new_losses | {"kl": divergence, "step": fraction}
+            fraction *= self.shrink
+        vector_to_parameters(start, weights)
+        return None
 
 
 def unsquashed(distribution: Any) -> Distribution:
@@ -154,10 +239,10 @@ def unsquashed(distribution: Any) -> Distribution:
 def conjugate_gradients(
     product: Callable[[Tensor], Tensor], target: Tensor, iterations: int
 ) -> Tensor:
-    """Solve A x = b for a positive definite A, given its `product` with a vector, without waiting for the device.
+    """Solve A x = b for a positive definite A, given its `product` with a vector.
 
     For b = `target` [n], n iterations suffice in exact arithmetic. Iterations after convergence
-    change nothing.
+    change nothing, so that nothing has to wait for the device.
     """
     solution, residual, direction = torch.zeros_like(target), target.clone(), target.clone()
     square = first_square = residual @ residual

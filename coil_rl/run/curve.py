@@ -62,7 +62,9 @@ class EvaluationCurve:
     points: int = 16
     batches: int = 1
 
-    names: Sequence[str] = field(default=(), init=False)  # it acts after the row of an update was logged
+    names: Sequence[str] = field(
+        default=(), init=False
+    )  # it acts after the row of an update was logged
 
     def __post_init__(self) -> None:
         measured = ["return", *(name for group in self.watch.values() for name in group)]
@@ -135,9 +137,7 @@ class EvaluationCurve:
 
     def _keep_best(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Copy the best of all evaluated policies to `policy_best.pt`."""
-        rows = [
-            {**row, **results.get(number, {})} for number, row in enumerate(self.metrics.rows)
-        ]
+        rows = [{**row, **results.get(number, {})} for number, row in enumerate(self.metrics.rows)]
         judged = [row for row in rows if not math.isnan(row[CHOICE])]
         best = int(max(judged, key=itemgetter(CHOICE))["frames"])
         with whole_file(self.folder / "policy_best.pt") as unfinished:

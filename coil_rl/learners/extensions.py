@@ -1,0 +1,99 @@
+"""The extensions of a learner as one, and those that the arguments of a learner ask for."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import ProbabilisticTensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from coil_rl.learners.anchor import Anchor, AnchoredUpdate
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.learner import Callback, Cases
+from coil_rl.learners.normaliser import Normaliser, RunningStatistics
+from coil_rl.learners.several_agents import SummedRewards
+
+
+class Extensions(Extension):
+    """Several extensions as one; they act one after the other.
+
+    Args:
+        extensions: in the order in which they act.
+    """
+
+    def __init__(self, extensions: Iterable[Extension]) -> None:
+        self.each = list(extensions)
+
+    @property
+    def keys(self) -> Sequence[NestedKey]:
+        """Entries that any of them reads."""
+        return [key for each in self.each for key in each.keys]
+
+    def prepare(self, batch: TensorDictBase) -> None:
+        """Change a batch [B, T] in place."""
+        for extension in self.each:
+            extension.prepare(batch)
+
+    def losses(
+        self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase
+    ) -> dict[str, Tensor]:
+        """Return the losses of all by name, scalars, for a minibatch [N]."""
+        losses: dict[str, Tensor] = {}
+        for extension in self.each:
+            losses |= extension.losses(policy, minibatch)
+        return losses
+
+    def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
+        """Return the weights of all losses."""
+        for extension in self.each:
+            weights = extension.weights(weights, progress)
+        return weights
+
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Let all act after an update, and return their metrics by name."""
+        metrics: dict[str, float] = {}
+        for extension in self.each:
+            metrics |= extension.finish(batch, progress)
+        return metrics
+
+    def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
+        """Return the callbacks of all."""
+        return [callback for each in self.each for callback in each.callbacks(policy, cases)]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return the states of all, by their numbers."""
+        return {str(number): each.state_dict() for number, each in enumerate(self.each)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore the states of all."""
+        for number, each in enumerate(self.each):
+            each.load_state_dict(state[str(number)])
+
+
+def extensions_of(
+    env: EnvBase,
+    policy: nn.Module,
+    *,
+    normaliser: Normaliser | None,
+    auxiliary: Sequence[Extension],
+    anchor: Anchor | None,
+) -> Extensions:
+    """Return the extensions of an on-policy learner, in their order.
+
+    Args:
+        env: the env; the rewards of several agents are summed.
+        policy: of the learner.
+        normaliser: of the policy; None: it has none.
+        auxiliary: extensions that a user adds.
+        anchor: of the policy; None: it has none.
+    """
+    extensions: list[Extension] = []
+    if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):
+        extensions.append(SummedRewards(reward_key))
+    if normaliser is not None:
+        extensions.append(RunningStatistics(normaliser))
+    extensions += auxiliary
+    if anchor is not None:  # the last one, because it delays the losses of the others too
+        extensions.append(AnchoredUpdate(anchor, policy))
+    return Extensions(extensions)

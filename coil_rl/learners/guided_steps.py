@@ -1,0 +1,52 @@
+"""Learning where a guide acts in some of the steps: the policy learns from its own steps only."""
+
+from collections.abc import Callable
+
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a step
+
+
+def guide_may_act(env: EnvBase) -> bool:
+    """Return whether a guide acts in some of the steps of an env, which then writes `agent_acts`."""
+    return AGENT_ACTS in env.observation_spec
+
+
+def of_agent(steps: TensorDictBase) -> TensorDictBase:
+    """Return those of some steps [N] in which the agent acted; all without the entry `agent_acts`."""
+    return steps[steps[AGENT_ACTS].squeeze(-1)] if AGENT_ACTS in steps.keys() else steps
+
+
+class LossesOfAgentSteps:
+    """The losses of a minibatch: those of the policy from the agent's steps, that of the critic from all steps.
+
+    Args:
+        losses: returns the losses of steps [N] by name, with `loss_objective`, `loss_critic` and
+            perhaps `loss_entropy`.
+        critic_loss: returns the loss of the critic of steps [N].
+    """
+
+    def __init__(
+        self,
+        losses: Callable[[TensorDictBase], TensorDictBase],
+        critic_loss: Callable[[TensorDictBase], Tensor],
+    ) -> None:
+        self.losses, self.critic_loss = losses, critic_loss
+
+    def __call__(self, minibatch: TensorDictBase) -> TensorDictBase:
+        """Return the losses of a minibatch [N] by name."""
+        agent_steps = of_agent(minibatch)
+        if len(agent_steps) < 2:  # one advantage cannot be standardised
+            return self._without_policy(minibatch)
+        losses = self.losses(agent_steps)
+        losses["loss_critic"] = self.critic_loss(minibatch)
+        return losses
+
+    def _without_policy(self, minibatch: TensorDictBase) -> TensorDictBase:
+        losses = self.losses(minibatch)
+        for name in ("loss_objective", "loss_entropy"):
+            if name in losses.keys():
+                losses[name] = losses[name] * 0
+        return losses

@@ -1,0 +1,133 @@
+"""What every learner has: the base class `Learner`, and what a run calls between its updates."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, Protocol
+
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+
+class Learner(ABC):
+    """Base class of learners: a policy, and the update that improves it from a batch of rollouts.
+
+    A subclass has a `policy` and `keys`, and defines `update`, `state_dict` and `load_state_dict`.
+    Everything else has a default that does nothing.
+
+    Attributes:
+        kind: what the learner trains: "agent" (a policy, from rewards), "imitation" (a policy, from
+            a guide's actions) or "guides" (its guides, besides an agent).
+        policy: collects the batches; writes the action.
+        keys: entries that a batch must have.
+        critic: writes `state_value`, the expected return; None: the learner has no such network.
+        guides: networks by name that the learner trains besides the policy.
+        validates_groups: whether an update validates on groups of samples that it leaves out, such
+            as all samples of a track, so that a batch needs more than one group.
+    """
+
+    kind: ClassVar[str] = "agent"
+    policy: TensorDictModuleBase
+    keys: list[NestedKey]
+    critic: TensorDictModuleBase | None = None
+    guides: Mapping[str, TensorDictModuleBase] = MappingProxyType({})
+    validates_groups: bool = False
+
+    @abstractmethod
+    def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
+        """Learn from a batch of rollouts.
+
+        Args:
+            batch: steps of all rows of an env, [B, T], with `keys`.
+            progress: of the run, in [0, 1], for the schedules.
+
+        Returns:
+            The metrics of this update by name.
+        """
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that the next update depends on, besides its batch."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore a state that `state_dict` returned."""
+
+    def callbacks(self, cases: "Cases") -> Sequence["Callback"]:
+        """Return what a run calls between the updates.
+
+        Args:
+            cases: evaluates the policy of this learner in the same cases each time.
+        """
+        return []
+
+    def check_batch(self, frames: int) -> None:  # noqa: B027  optional
+        """Raise a `ValueError` if a batch of that many frames, B * T, is too small to learn from."""
+
+    def export(self, folder: Path) -> None:  # noqa: B027  optional
+        """Write what others need besides the policy into the folder of a finished run."""
+
+
+class Callback(Protocol):
+    """Something that a run calls before the first update and between updates.
+
+    It may take long, as an evaluation does, and it may change the policy.
+
+    Attributes:
+        names: of the numbers that `after_update` returns.
+    """
+
+    names: Sequence[str]
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether to call `after_update`.
+
+        Args:
+            update: number of updates so far; 0: before the first one.
+            updates: number of all updates of the run.
+            row: metrics of the update; empty before the first one.
+        """
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Act after an update, 0 is before the first one, and return numbers for the log by name."""
+
+
+@dataclass(frozen=True)
+class CaseResults:
+    """Results of S policies in the same C cases.
+
+    Attributes:
+        returns: [S, C], return of each episode.
+        failures: for each policy, the number of cases in which it failed.
+    """
+
+    returns: Tensor
+    failures: Sequence[int]
+
+    def mean_return(self, index: int) -> float:
+        """Return the mean return of a policy."""
+        return float(self.returns[index].mean())
+
+
+class Cases(Protocol):
+    """The fixed cases of a run in which policies are selected: an episode of the training env in each.
+
+    An evaluation changes neither the policy of the learner nor the random numbers of the run.
+
+    """
+
+    @property
+    def count(self) -> int:
+        """C, number of cases."""
+
+    def take(self, count: int) -> "Cases":
+        """Return that many cases."""
+
+    def evaluate(self, states: Sequence[dict[str, Any]]) -> CaseResults:
+        """Evaluate copies of the learner's policy, each with another state, deterministically in all cases."""
+
+    def evaluate_random(self) -> Tensor:
+        """Return the returns of random actions, [C], which are the same at each call."""

@@ -1,0 +1,99 @@
+"""Minibatches: how a batch of rollouts is divided for the steps of the optimiser."""
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.modules import set_recurrent_mode
+
+from coil_rl.errors import UserError
+from coil_rl.learners.networks import REMEMBERED
+from coil_rl.learners.state import Stateful
+
+
+class Minibatches(Stateful):
+    """Random minibatches of single steps.
+
+    Args:
+        epochs: passes over a batch, each in another random order.
+        count: minibatches in each pass.
+        seed: of the random orders.
+    """
+
+    parts: ClassVar[tuple[str, ...]] = ("generator",)
+
+    def __init__(self, epochs: int, count: int, seed: int) -> None:
+        self.epochs, self.count = epochs, count
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def rows(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return what minibatches are drawn from: the steps of a batch [B, T], [B * T]."""
+        return batch.reshape(-1)
+
+    def draw(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yield the minibatches [N] of all passes over `rows`.
+
+        Raises:
+            ValueError: if there are too few rows.
+        """
+        size = len(rows) // self.count
+        if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
+            raise ValueError(
+                f"minibatches={self.count} leaves less than 2 of {rows.numel()} frames to each"
+            )
+        for _ in range(self.epochs):
+            order = torch.randperm(len(rows), generator=self.generator)[: size * self.count]
+            yield from rows[order.to(rows.device)].split(size)
+
+
+class RowMinibatches(Minibatches):
+    """Random minibatches of whole rows of a batch, for a policy with a memory.
+
+    The GRU is run again from the stored first state of each row, so that gradients flow through
+    time. After that the steps are a minibatch as any other.
+
+    Args:
+        epochs: passes over a batch, each in another random order.
+        count: minibatches in each pass.
+        seed: of the random orders.
+        memory: the part of the policy up to its GRU; it writes `remembered`.
+    """
+
+    def __init__(self, epochs: int, count: int, seed: int, memory: TensorDictModuleBase) -> None:
+        super().__init__(epochs, count, seed)
+        self.memory = memory
+
+    def rows(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return what minibatches are drawn from: the rows of a batch, [B, T]."""
+        return batch.reshape(-1, batch.shape[-1])
+
+    def draw(self, rows: TensorDictBase) -> Iterator[TensorDictBase]:
+        """Yield the minibatches [N] of all passes over `rows`.
+
+        Raises:
+            UserError: if there are fewer rows than minibatches.
+            ValueError: if a minibatch would have less than two steps.
+        """
+        if len(rows) < self.count:
+            raise UserError(
+                f"minibatches={self.count} are more than the {len(rows)} envs, but with a memory "
+                "each needs all steps of an env; take fewer minibatches or more envs"
+            )
+        yield from map(self.remember, super().draw(rows))
+
+    def remember(self, rows: TensorDictBase) -> TensorDictBase:
+        """Return the steps of whole rows [N, T] with `remembered`, [N * T]."""
+        with set_recurrent_mode(True):
+            remembered = self.memory(rows.select(*self.memory.in_keys))[REMEMBERED]
+        return rows.copy().set(REMEMBERED, remembered).reshape(-1)
+
+
+def minibatches_of(
+    memory: TensorDictModuleBase | None, epochs: int, count: int, seed: int
+) -> Minibatches:
+    """Return the minibatches for a policy, with a memory or without (None); see `Minibatches`."""
+    if memory is None:
+        return Minibatches(epochs, count, seed)
+    return RowMinibatches(epochs, count, seed, memory)
