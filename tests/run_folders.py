@@ -13,9 +13,9 @@ from omegaconf import OmegaConf
 from programs import ROOT
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
+from coil_rl.config.build import build_learner, env_maker
 from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
-from coil_rl.config.build import build_env, build_learner
 
 Row = dict[str, Any]
 MEASURES = yaml.safe_load((ROOT / "conf" / "measures" / "driving.yaml").read_text())
@@ -101,7 +101,7 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
     with initialize_config_module(config_module="coil_rl.conf", version_base="1.3"):
         config = compose("train", [*overrides, f"run_dir={folder}"])
     if config.method.observes is not None:
-        policy = build_learner(config, build_env(config)).policy
+        policy = build_learner(config, env_maker(config)()).policy
         checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
     saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     saved.logger = None

@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModule
 from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import Compose, EnvBase, GymEnv, PendulumEnv, SerialEnv, TransformedEnv
 
+from coil_rl.config import schema  # noqa: F401 registers the configuration schema
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
-from coil_rl.config import schema  # noqa: F401 registers the configuration schema
 from coil_rl.report.measures import Measure, measures_of
 from coil_rl.transforms import GuideActions
 

@@ -83,6 +83,8 @@ def overrides() -> list[tuple[str, str]]:
 
 def command_line() -> list[str]:
     """Return the command that makes this run alone, also where it is a job of a sweep."""
+    if not HydraConfig.initialized():
+        return []
     return ["coil-train", *HydraConfig.get().overrides.task]
 
 

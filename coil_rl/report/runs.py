@@ -102,6 +102,8 @@ def _read_run(folder: Path) -> Run:
         measures = measures_of((config.get("evaluation") or {}).get("measures") or {})
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split())
+        if isinstance(error, KeyError):
+            problem = f"Missing key {error.args[0]}"
         remedy = "restore the file that coil-train wrote, or remove the run from the folder"
         raise UserError(
             f"{path} has no valid label, seed and method.needs_guide ({problem}); {remedy}"

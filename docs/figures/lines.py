@@ -26,10 +26,11 @@ from coil_rl.listening.sections import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import markdown_table, style
 from coil_rl.report.style import lighten, picture
 from coil_rl.config import load
-from coil_rl.config.build import build, build_env
-from coil_rl.run.judge import build_evaluation, drive_guides
+from coil_rl.config.build import assemble, build_evaluation, env_maker, guide_results
+from coil_rl.config.nodes import build
 from coil_rl.run.evaluation import EvaluationResult
-from coil_rl.run.folder import read_config
+from coil_rl.config.saved import read_config
+from coil_rl.run.parts import TEST
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track
@@ -88,7 +89,7 @@ def drive(
     evaluation = replace(
         build_evaluation(configs[0]), cases=[track.name for track in tracks], record=record
     )
-    drives = drive_guides(configs[0], configs[0].evaluation.env, evaluation)
+    drives = dict(guide_results(configs[0], evaluation))
     for run, config in zip(runs, configs, strict=True):
         env = build_env(config, {**config.evaluation.env, "num_envs": len(tracks)})
         name = config.label if config.label not in drives else f"{config.label}, seed {config.seed}"

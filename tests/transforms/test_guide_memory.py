@@ -20,8 +20,8 @@ from torchrl.modules import GRUModule, LSTMModule
 
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
-from coil_rl.testing import check_env
 from coil_rl.run.rollout import Rollout
+from coil_rl.testing import check_env
 from coil_rl.transforms import GuideActions, Guides, ResidualAction
 
 

@@ -3,9 +3,9 @@ from typing import Any, Literal, Protocol
 
 import pytest
 
+from coil_rl.config.arguments import check_arguments
 from coil_rl.envs import Track
 from coil_rl.errors import UserError
-from coil_rl.config.arguments import check_arguments
 
 
 class NotRuntimeCheckable(Protocol):

@@ -5,19 +5,19 @@ import torch
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl.errors import UserError
-from coil_rl.testing import check_env, check_guide
 from coil_rl.config.build import (
-    build,
     build_bare_env,
-    build_env,
-    build_guided_env,
     build_guides,
     build_learner,
     cases_node,
+    env_maker,
     trains_guides,
 )
 from coil_rl.config.distillation import guides_with_untrained_proxies
+from coil_rl.config.nodes import build
+from coil_rl.errors import UserError
+from coil_rl.run.parts import TRAIN
+from coil_rl.testing import check_env, check_guide
 
 CONF = Path(__file__).parents[3] / "conf"
 SMALL = [
@@ -41,7 +41,7 @@ def choices(group):
 @pytest.mark.parametrize("preset", choices("preset"))
 @pytest.mark.parametrize("method", choices("method"))
 def test_env_of_every_method_passes_check_env(preset, method):
-    env = build_env(composed(f"preset={preset}", f"method={method}"))
+    env = env_maker(composed(f"preset={preset}", f"method={method}"))()
     check_env(env, steps=3)
     assert env.rate == {"default": 12, "paper": 24, "authors": 60}[preset]
 
@@ -103,7 +103,7 @@ def test_long_message_of_a_part_is_cut():
 
 def test_guide_drives_with_degraded_advice():
     config = composed("guide=constant", "guide.constant.value=0.4", "degrade=[undertuned,biased]")
-    env, policy = build_guided_env(config, {"num_envs": 4})
+    env, policy = env_maker(config).guided(4, TRAIN)
     step = env.step(policy(env.reset()))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.4 * 0.5 + 0.2))
 
@@ -112,14 +112,15 @@ def test_advice_is_degraded_after_the_transforms_of_the_method():
     config = composed(
         "method=residual", "guide=constant", "guide.constant.value=0.4", "degrade=[zeroed]"
     )
-    step = (env := build_env(config)).step(env.reset().set("action", torch.full((4, 1), 0.5)))
+    env = env_maker(config)()
+    step = env.step(env.reset().set("action", torch.full((4, 1), 0.5)))
     torch.testing.assert_close(step["next", "steering"], torch.full((4, 1), 0.25))
 
 
 @pytest.mark.parametrize("learner", choices("learner"))
 def test_every_learner_is_built(learner):
     config = composed(f"learner={learner}")
-    env = build_env(config)
+    env = env_maker(config)()
     built = build_learner(
         config, env, guides_with_untrained_proxies(config) if trains_guides(config) else None
     )
@@ -147,5 +148,5 @@ def test_cases_of_several_drivers_are_the_same_ones(env, key):
         evaluation = compose("train", [f"env={env}", "run_dir=unused"]).evaluation
     # In the file of a run all references are resolved.
     stored = OmegaConf.create({"evaluation": OmegaConf.to_container(evaluation, resolve=True)})
-    node = cases_node(stored, "selection", drivers=2, count=3)
+    node = cases_node(stored, 6, "selection", 3)
     assert (node[key], node["num_envs"]) == (3, 6)

@@ -5,12 +5,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
-from coil_rl.errors import UserError
-from coil_rl.programs import evaluate
-from coil_rl.programs.distill import distill
-from coil_rl.programs.train import train
 from coil_rl.config import distillation, load
 from coil_rl.config.check import check
+from coil_rl.errors import UserError
+from coil_rl.programs.distill import distill
+from coil_rl.programs.train import train
 
 TINY = [
     "track=generated",
@@ -103,9 +102,7 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         torch.load(next(proxies.glob("spline_*")) / "policy_last.pt", weights_only=True),
     )
     assert all(torch.equal(value, state[key]) for key, value in network.state_dict().items())
-    config = composed(f"run={tmp_path / 'run'}", f"run_dir={tmp_path}", name="evaluate")
-    _, policy = evaluate.restore(tmp_path / "run", config)
-    assert policy[0].names == ["spline", "zero"]
+    assert load.open_run(tmp_path / "run").policy()[0].names == ["spline", "zero"]
 
 
 def test_degraded_advice_is_refused_for_guides_that_learn():

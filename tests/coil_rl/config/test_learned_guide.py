@@ -6,12 +6,12 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 from run_folders import make_untrained_run
 
-from coil_rl.errors import UserError
+from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.learned_guide import LONGEST_CHAIN, LearnedGuide
-from coil_rl.programs.evaluate import restore
-from coil_rl.testing import check_guide
-from coil_rl.config.build import build_env, build_guides
+from coil_rl.config.load import open_run
+from coil_rl.errors import UserError
 from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.testing import check_guide
 
 TINY = [
     "track=generated",
@@ -43,20 +43,19 @@ def run(request, tmp_path_factory):
 
 
 def test_guide_drives_as_the_policy_in_its_own_env(run):
-    config, agent = restore(
-        run, composed(*TINY[:3], f"run={run}", "run_dir=unused", name="evaluate")
-    )
-    overrides = {"num_envs": 3, "assignment": "cyclic"}
-    policy = evaluate_policy(build_env(config, overrides), agent)
+    opened = open_run(run)
+    env = opened.make_env(3, "evaluation", count=3)
+    policy = evaluate_policy(env, opened.policy(env))
     guided = composed(
         *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
-    learned = evaluate_policy(build_env(guided, overrides), build_guides(guided)["learned"])
+    guided_env = env_maker(guided)(3, "evaluation", count=3)
+    learned = evaluate_policy(guided_env, build_guides(guided)["learned"])
     assert [row["reward"] for row in learned.episodes] == [row["reward"] for row in policy.episodes]
 
 
 def test_guide_is_deterministic_and_advises_another_agent(run):
-    env = build_env(composed(*TINY, "method=ppo", "run_dir=unused"))
+    env = env_maker(composed(*TINY, "method=ppo", "run_dir=unused"))()
     data, guide = env.rollout(5, break_when_any_done=False)[:, -1], LearnedGuide(str(run))
     check_guide(guide, data, tolerance=1e-6)
     assert not any(p.requires_grad for p in guide.parameters())
@@ -64,7 +63,7 @@ def test_guide_is_deterministic_and_advises_another_agent(run):
     config = composed(
         *TINY, "method=coil", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
     )
-    step = build_env(config).rollout(5, break_when_any_done=False)[:, -1]
+    step = env_maker(config)().rollout(5, break_when_any_done=False)[:, -1]
     assert torch.equal(step["guide_action"][:, 0], guide(step.clone())["action"])
 
 
@@ -89,7 +88,7 @@ def test_run_whose_advice_needs_earlier_steps_is_refused(tmp_path):
 def guided_by(run, guide):
     """Replace the guide of a run by the policy of another one."""
     config = OmegaConf.load(run / "config.yaml")
-    guides = {"learned": {"_target_": "coil_rl.config.learned_guide.LearnedGuide", "run": str(guide)}}
+    guides = {"learned": {"_target_": "coil_rl.LearnedGuide", "run": str(guide)}}
     config.guide = config.method.transforms.advice.guides = guides
     OmegaConf.save(config, run / "config.yaml")
 

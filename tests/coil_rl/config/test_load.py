@@ -5,12 +5,11 @@ from drives import drive
 from programs import ROOT
 from run_folders import make_untrained_run
 
+from coil_rl.config.load import open_run
 from coil_rl.envs import McapReplayEnv
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
-from coil_rl.config import load
 from coil_rl.run import checkpoint
-from coil_rl.run.folder import read_config
 
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]
 
@@ -30,7 +29,7 @@ def replay(tmp_path):
 
 def acts(run, replay):
     """Return all steps of the policy of a run in a replay."""
-    env, policy = load.load_policy_in_env(run, read_config(run, "run"), replay)
+    env, policy = open_run(run).in_env(replay)
     with torch.no_grad():
         return env.eval().rollout(6, policy)[0]
 

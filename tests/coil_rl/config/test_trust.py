@@ -7,14 +7,14 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
+from coil_rl.config import build, given, trust
+from coil_rl.config.distillation import proxy_config
+from coil_rl.config.saved import read_config, settings
+from coil_rl.config.schema import TrainConfig
 from coil_rl.errors import UserError
 from coil_rl.programs import train
-from coil_rl.run import run as runs
-from coil_rl.config import trust
 from coil_rl.run import folder as run_folder
-from coil_rl.config.schema import TrainConfig
-from coil_rl.config.distillation import proxy_config
-from coil_rl.run.folder import begin, read_config
+from coil_rl.run.folder import begin
 
 CODE = """
     os.system os.popen os.execv posix.system subprocess.run subprocess.Popen subprocess.check_output builtins.eval
@@ -26,7 +26,7 @@ CODE = """
     pathlib.Path.write_text functools.partial operator.methodcaller antigravity.this pandas.read_pickle
     omegaconf.OmegaConf.save tensordict.load sklearn.utils.fixes.os.system torchrl.envs.GymEnv cloudpickle.loads
     coil_rl.programs.app.os.system coil_rl.programs.app.shutil.rmtree coil_rl.files.write_text coil_rl.envs.save_track
-    coil_rl.envs.save_drive coil_rl.envs.RecordingWriter coil_rl.run.run.run coil_rl.config.trust.trust_packages
+    coil_rl.envs.save_drive coil_rl.envs.RecordingWriter coil_rl.config.start.run_configured coil_rl.config.trust.trust_packages
     coil_rl.guides.SplineGuide.__init__ coil_rl.guides.spline.math.sqrt сoil_rl.guides.SplineGuide
     torchrl.record.loggers.WandbLogger
 """.split()  # noqa: SIM905
@@ -48,7 +48,7 @@ def composed(folder, *overrides):
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("train", [*overrides, f"run_dir={folder}"])
     folder.mkdir()
-    begin(config, folder)
+    begin(folder, settings(config))
     return OmegaConf.to_container(OmegaConf.load(folder / "config.yaml"))
 
 
@@ -294,12 +294,13 @@ def test_every_choice_of_the_configuration_can_be_saved_and_read(tmp_path, monke
 def test_configuration_of_a_proxy_can_be_read(saved, tmp_path):
     proxy = proxy_config(OmegaConf.merge(OmegaConf.structured(TrainConfig), saved), "spline")
     proxy.run_dir = "anywhere"
-    begin(proxy, tmp_path)
+    begin(tmp_path, settings(proxy))
     assert read_config(tmp_path, "run").label == "proxy of spline"
 
 
 def test_named_parts_exist_and_are_classes():
-    wrong = [name for name in trust.NAMED if not isinstance(hydra.utils.get_object(name), type)]
+    parts = trust.NAMED - {given.TARGET}
+    wrong = [name for name in parts if not isinstance(hydra.utils.get_object(name), type)]
     assert wrong == []
 
 
@@ -394,8 +395,15 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     for key, value in outside.items():
         OmegaConf.update(config, key, value)
     OmegaConf.save(config, folder / "config.yaml")
-    resumed = []
-    monkeypatch.setattr(runs, "resume_run", lambda config, folder: resumed.append(config))
+    resumed, assemble = [], build.assemble
+
+    def remembered(config, folder):
+        resumed.append(config)
+        run = assemble(config, folder)
+        run.finish_begun = lambda: 0.0
+        return run
+
+    monkeypatch.setattr(build, "assemble", remembered)
     train.resume(folder)
     (config,) = resumed
     assert config.run_dir == config.logger.log_dir == str(folder)

@@ -7,8 +7,8 @@ from worlds import driving_measures
 
 from coil_rl.envs import ConeTrackEnv, random_tracks, shipped_tracks
 from coil_rl.guides import RacingLineGuide, SplineGuide
-from coil_rl.testing import check_guide
 from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.testing import check_guide
 
 # Midpoints (2, 0.5) and (3, 0.5); with a spacing of 1 m these are the targets.
 TWO_TARGETS = ([(2.0, 2.0)], [(2.0, -1.0), (4.0, -1.0)])

@@ -18,8 +18,8 @@ from sklearn.svm import SVR
 
 from coil_rl.errors import UserError
 from coil_rl.imitation import NetworkRegressor, SklearnRegressor
-from coil_rl.schedules import Linear
 from coil_rl.run import checkpoint
+from coil_rl.schedules import Linear
 
 
 def scaled_data():

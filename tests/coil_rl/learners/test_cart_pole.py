@@ -6,9 +6,9 @@ from cart_poles import CartPoles
 from torchrl.envs import RewardSum, TransformedEnv
 
 from coil_rl.learners import A2C, DQN, PPO, TRPO, Reinforce
-from coil_rl.schedules import Linear
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
 
 
 @pytest.mark.slow

@@ -14,9 +14,11 @@ from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbo
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_rl.config.build import build_env, build_guided_env, build_guides
+from coil_rl.config.check import check
+from coil_rl.config.learned_guide import LearnedGuide
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.errors import UserError
-from coil_rl.config.learned_guide import LearnedGuide
 from coil_rl.learners import (
     A2C,
     DQN,
@@ -33,13 +35,11 @@ from coil_rl.learners.encoders import ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule
 from coil_rl.programs.evaluate import restore
 from coil_rl.programs.train import resume, train
-from coil_rl.schedules import Linear
-from coil_rl.testing import check_env
-from coil_rl.config.build import build_env, build_guided_env, build_guides
-from coil_rl.config.check import check
 from coil_rl.run.evaluation import evaluate_policy
 from coil_rl.run.policy_batch import PoliciesInTurn, policy_batch
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
+from coil_rl.testing import check_env
 from coil_rl.transforms import DiscreteActions, Takeover
 
 DELAY = 5

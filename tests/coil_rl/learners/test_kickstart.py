@@ -8,8 +8,8 @@ from torchrl.data import MultiCategorical
 
 from coil_rl.learners import PPO, SAC, FilteredKickstartLoss, KickstartLoss
 from coil_rl.learners.kickstart import EDGE
-from coil_rl.schedules import Linear
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
 
 
 def make(env, in_keys=("observation",), steps=16):

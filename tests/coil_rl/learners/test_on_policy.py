@@ -17,8 +17,8 @@ from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
 from coil_rl.learners.networks import critic
 from coil_rl.learners.ppo import Advantages
-from coil_rl.schedules import Linear
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
 from coil_rl.transforms import JumpStart, Takeover
 
 LEARNERS = [PPO, A2C, TRPO, Reinforce]

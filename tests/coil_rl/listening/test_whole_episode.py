@@ -11,8 +11,8 @@ from worlds import Script
 
 from coil_rl.listening import WholeEpisode
 from coil_rl.listening.survey import Ablation, ablations, drive_ablated, survey, table_by_section
-from coil_rl.run.judge import Evaluation
 from coil_rl.report.measures import Measure
+from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
 
 LENGTHS = [250, 3, 7, 120]

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 
-from coil_rl.errors import UserError
-from coil_rl.config.build import build_env, build_learner
+from coil_rl.config.build import build_learner, env_maker
 from coil_rl.config.check import check
+from coil_rl.errors import UserError
 from coil_rl.run.rollout import Rollout
 
 METHODS = sorted(
@@ -117,7 +117,7 @@ FAST = [
 def test_compatible_method_and_learner_train(method, learner, tmp_path):
     config = composed(tmp_path, f"method={method}", f"learner={learner}", *GIVEN[learner])
     check(config)
-    env = build_env(config)
+    env = env_maker(config)()
     built = build_learner(config, env)
     rollout = Rollout(env, built.policy, config.budget.steps, built.keys)
     for _ in range(2):

@@ -9,11 +9,11 @@ import pytest
 import torch
 from hydra import compose, initialize_config_module
 
+from coil_rl.config.check import check
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
 from coil_rl.run import checkpoint, fallback
-from coil_rl.config.check import check
 
 METHODS = sorted(
     file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")

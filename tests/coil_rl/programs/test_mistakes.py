@@ -17,11 +17,12 @@ from omegaconf.errors import OmegaConfBaseException
 from programs import called, command, environment
 
 import coil_rl.run.run  # noqa: F401  before `started` replaces functions that it imports
-from coil_rl.errors import UserError, sentence
+from coil_rl.config.build import build_learner, env_maker
+from coil_rl.config.check import check
+from coil_rl.config.sentences import sentence
+from coil_rl.errors import UserError
 from coil_rl.programs import app, train
 from coil_rl.run import checkpoint, judge
-from coil_rl.config.build import build_env, build_learner
-from coil_rl.config.check import check
 
 TINY = [
     "budget.num_envs=8",
@@ -38,8 +39,8 @@ def started(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     names = []
     monkeypatch.setattr(train, "train", lambda config: names.append("train"))
-    monkeypatch.setattr(evaluate_run, "evaluate_run", lambda *_: None)
-    monkeypatch.setattr(evaluate_run, "report_outcome", lambda folder: 0.0)
+    monkeypatch.setattr(judge, "judge", lambda *_: None)
+    monkeypatch.setattr(judge, "report_outcome", lambda folder: 0.0)
     return names
 
 
@@ -338,7 +339,7 @@ def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         config = compose("train", [*TINY, "logger=none", f"run_dir={folder}"])
-    policy = build_learner(config, build_env(config)).policy
+    policy = build_learner(config, env_maker(config)()).policy
     checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
     OmegaConf.save(
         OmegaConf.create(OmegaConf.to_container(config, resolve=True)), folder / "config.yaml"

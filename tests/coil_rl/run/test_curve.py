@@ -9,6 +9,7 @@ from coil_rl.guides import SplineGuide
 from coil_rl.learners import PPO
 from coil_rl.run.curve import EvaluationCurve, measures
 from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.run.metrics import Metrics
 from coil_rl.transforms import GuideActions
 
 CASES = 5
@@ -27,17 +28,19 @@ def world(tracks, drivers=1, *transforms):
     )
 
 
-def curve(folder, tracks, policy, **options):
-    envs = dict.fromkeys(("evaluation", "selection"), lambda drivers: world(tracks, drivers))
-    return EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
+def curve(folder, tracks, policy, stages=(1,), **options):
+    envs = dict.fromkeys(("evaluation", "selection"), lambda policies: world(tracks, policies))
+    line = EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
+    line.attach(Metrics(folder / "metrics.csv"), stages, frames=100)
+    return line
 
 
 def test_driver_that_never_changes_gives_a_flat_line(tmp_path, rings):
     line = curve(tmp_path, rings, PPO(world(rings)).policy)
     for frames in (0, 100, 200):
         line.keep(frames)
-    rows = line.drive([0, 100, 200])
-    assert list(rows[0]) == line.names
+    rows = line.evaluate([0, 100, 200])
+    assert list(rows[0]) == line.columns
     assert rows[0] == rows[1] == rows[2]
     assert rows[0]["evaluation/return"] == rows[0]["selection/return"]
 
@@ -51,7 +54,7 @@ def test_numbers_are_those_of_each_policy_driven_alone(tmp_path, rings):
         line.keep(frames)
         expected.append(evaluate_policy(world(rings), policy, measures=driving_measures()).episodes)
     assert expected[0] != expected[1]
-    for row, episodes in zip(line.drive([0, 100]), expected, strict=True):
+    for row, episodes in zip(line.evaluate([0, 100]), expected, strict=True):
         for name, key in {
             "return": "reward",
             "crashed": "crashed",
@@ -65,25 +68,42 @@ def test_driving_leaves_the_random_numbers_alone(tmp_path, rings):
     line = curve(tmp_path, rings, PPO(world(rings)).policy)
     line.keep(0)
     before = torch.get_rng_state()
-    line.drive([0])
+    line.evaluate([0])
     assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_kept_policies_are_spread_over_the_run_and_each_is_driven_once(tmp_path, rings):
     policy = PPO(world(rings)).policy
     for updates, points, batches in [(49, 16, 1), (49, 16, 3), (3, 16, 1), (1, 1, 4), (100, 7, 7)]:
-        line = curve(tmp_path, rings, policy, points=points, batches=batches)
-        kept = line.kept(updates)
+        line = curve(tmp_path, rings, policy, [updates], points=points, batches=batches)
+        kept = line.kept()
         assert (kept[0], kept[-1], len(kept)) == (0, updates, min(points, updates) + 1)
-        driven = [line.batch(update, updates) for update in range(updates + 1)]
+        driven = [line.batch(update) for update in range(updates + 1)]
         assert [update for batch in driven for update in batch] == kept
         assert sum(map(bool, driven)) == min(batches, updates)
+
+
+def test_run_that_was_made_longer_keeps_policies_as_before_and_evenly_until_its_new_end(
+    tmp_path, rings
+):
+    policy = PPO(world(rings)).policy
+    line = curve(tmp_path, rings, policy, [8, 16, 40], points=4, batches=2)
+    assert line.kept() == [0, 2, 4, 6, 8, 10, 12, 14, 16, 22, 28, 34, 40]
+    evaluated = {update: line.batch(update) for update in range(41) if line.batch(update)}
+    assert evaluated == {
+        4: [0, 2, 4],
+        8: [6, 8],
+        12: [10, 12],
+        16: [14, 16],
+        28: [22, 28],
+        40: [34, 40],
+    }
 
 
 def test_missing_policy_is_named(tmp_path, rings):
     line = curve(tmp_path, rings, PPO(world(rings)).policy)
     with pytest.raises(UserError, match=r"there is no file .*policies/000000000128\.pt"):
-        line.drive([128])
+        line.evaluate([128])
 
 
 def test_guide_measured_from_its_cases_does_not_crash(rings):

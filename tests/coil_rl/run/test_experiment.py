@@ -13,7 +13,8 @@ from coil_rl.guides import RandomGuide, SplineGuide, SplineMemoryGuide
 from coil_rl.learners import PPO
 from coil_rl.run import checkpoint
 from coil_rl.run.curve import EvaluationCurve
-from coil_rl.run.experiment import Experiment, Metrics, watched_keys
+from coil_rl.run.experiment import Experiment, watched_keys
+from coil_rl.run.metrics import Metrics
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -173,7 +174,7 @@ def test_damaged_log_is_refused(tmp_path, damage):
         experiment(tmp_path).resume()
 
 
-@pytest.mark.parametrize("method", ["drive", "keep"])
+@pytest.mark.parametrize("method", ["evaluate", "keep"])
 def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, method, monkeypatch):
     rows = experiment(tmp_path / "whole").run()
     stopped = experiment(tmp_path / "stopped")
@@ -181,7 +182,7 @@ def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, me
 
     def dying(frames):
         calls.append(frames)
-        if len(calls) == (2 if method == "drive" else 5):  # the last one of the run
+        if len(calls) == (2 if method == "evaluate" else 5):  # the last one of the run
             raise Killed
         return called(frames)
 
@@ -200,10 +201,10 @@ def test_run_stopped_during_its_evaluation_ends_with_the_same_files(tmp_path, me
 
 def test_best_policy_is_chosen_in_the_cases_of_selection(tmp_path):
     run = experiment(tmp_path / "run")
-    drive = run.curve.drive
-    run.curve.drive = lambda frames: [
+    evaluate = run.curve.evaluate
+    run.curve.evaluate = lambda frames: [
         row | {"selection/return": -abs(f - 256)}
-        for f, row in zip(frames, drive(frames), strict=True)
+        for f, row in zip(frames, evaluate(frames), strict=True)
     ]
     run.run()
     files = contents(tmp_path / "run")
@@ -299,9 +300,8 @@ def test_truncated_metrics_end_like_uninterrupted_ones(tmp_path, count, torn):
     with stopped.open("ab") as file:
         file.write(torn)
     again = Metrics(stopped)
-    assert str(again.truncate(count)) == str(
-        [{k: float(v) for k, v in row.items()} for row in ROWS[:count]]
-    )
+    again.truncate(count)
+    assert str(again.rows) == str([{k: float(v) for k, v in row.items()} for row in ROWS[:count]])
     for row in ROWS[count:]:
         again.append(row)
     assert stopped.read_bytes() == whole.read_bytes()

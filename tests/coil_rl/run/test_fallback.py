@@ -4,9 +4,9 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from coil_rl.report.statistics import mean_interval
-from coil_rl.run.judge import not_worse
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.fallback import Fallback
+from coil_rl.run.judge import not_worse
 
 
 def constant(number):

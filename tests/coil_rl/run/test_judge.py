@@ -4,15 +4,18 @@ import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
-from coil_rl.errors import UserError
-from coil_rl.config.build import build_env, build_guides, build_learner
-from coil_rl.run.judge import (
+from coil_rl.config.build import (
     build_evaluation,
+    build_guides,
+    build_learner,
     build_pictures,
-    drive_guides,
-    evaluate_run,
+    env_maker,
+    guide_results,
     recorded,
+    trial,
 )
+from coil_rl.errors import UserError
+from coil_rl.run.judge import evaluate_guides, judge
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
 
@@ -23,25 +26,26 @@ def composed():
         yield lambda *overrides: compose("train", [*TINY, *overrides])
 
 
-def drive(config, guides=None):
-    return drive_guides(config, config.evaluation.env, build_evaluation(config), guides)
+def evaluated(config):
+    return guide_results(config, build_evaluation(config))
 
 
 def test_guides_of_a_sweep_are_driven_once(composed):
-    first, again = (drive(composed(f"method={method}")) for method in ("coil", "ppo"))
+    first, again = (evaluated(composed(f"method={method}")) for method in ("coil", "ppo"))
     assert list(first) == ["guide spline", "guide random"]
     assert all(again[driver] is result for driver, result in first.items())
 
 
 @pytest.mark.parametrize("change", ["seed=1", "degrade=delayed", "env.smoothing=0.2"])
 def test_guides_are_driven_again_after_a_change_of_guide_or_env(composed, change):
-    first, others = drive(composed()), drive(composed(change))
+    first, others = evaluated(composed()), evaluated(composed(change))
     assert all(others[driver] is not result for driver, result in first.items())
 
 
 def test_given_guides_are_not_cached(composed):
     config = composed()
-    cached, given = drive(config), drive(config, build_guides(config))
+    cached = evaluated(config)
+    given = evaluate_guides(env_maker(config), build_evaluation(config), build_guides(config))
     assert given["guide spline"] is not cached["guide spline"]
     assert given["guide spline"].mean_reward == cached["guide spline"].mean_reward
 
@@ -51,15 +55,18 @@ def test_guides_beside_an_agent_drive_as_they_do_alone(composed, change, tmp_pat
     config = composed(
         "guide=[spline,centre_fast]", "evaluation.gif=false", "evaluation.repeats=1", change
     )
-    policy = build_learner(config, build_env(config)).policy
-    evaluate_run(config, policy, tmp_path, seed=0)
+    make_env = env_maker(config)
+    policy = build_learner(config, make_env()).policy
+    judge(trial(config, make_env), policy, tmp_path, seed=0)
     with (tmp_path / "episodes.csv").open(newline="") as file:
         beside = [
             float(row["reward"])
             for row in csv.DictReader(file)
             if row["driver"].startswith("guide")
         ]
-    alone = [episode["reward"] for result in drive(config).values() for episode in result.episodes]
+    alone = [
+        episode["reward"] for result in evaluated(config).values() for episode in result.episodes
+    ]
     assert beside == alone
     assert len(set(beside)) == 6
 
@@ -70,7 +77,7 @@ def test_evaluation_has_the_cases_and_measures_of_the_env_and_the_entries_of_its
     assert evaluation.cases == ["test_1", "test_2", "test_3"]
     assert list(evaluation.measures) == list(config.evaluation.measures)
     assert evaluation.record == {"pose": ("info", "pose")}
-    (result,) = drive_guides(composed("guide=spline"), config.evaluation.env, evaluation).values()
+    (result,) = guide_results(composed("guide=spline"), evaluation).values()
     assert [episode["case"] for episode in result.episodes] == evaluation.cases
     assert len(result.histories["pose"]) == 3
 
@@ -94,4 +101,4 @@ def test_evaluation_without_cases_is_refused(composed, cases):
 
 
 def test_guides_without_a_guide_are_not_driven(composed):
-    assert drive(composed("guide=none", "method=ppo")) == {}
+    assert evaluated(composed("guide=none", "method=ppo")) == {}

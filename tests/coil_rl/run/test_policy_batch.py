@@ -11,8 +11,8 @@ from coil_rl.imitation import Imitation, SklearnRegressor
 from coil_rl.learners import DQN, PPO, SAC
 from coil_rl.run.policy_batch import (
     PoliciesInTurn,
-    RecordedPolicy,
     StackedPolicies,
+    TracedPolicy,
     is_tensors,
     policy_batch,
 )
@@ -57,20 +57,20 @@ def test_recorded_policy_acts_and_draws_like_the_policy(learner, kind):
     env = cones(*([DiscreteActions()] if learner is DQN else []))
     policy = learner(env, KEYS).policy
     assert is_tensors(policy)
-    recorded, actions = RecordedPolicy(policy), []
+    recorded, actions = TracedPolicy(policy), []
     for each in (policy, recorded):
         torch.manual_seed(0)
         with torch.no_grad(), set_exploration_type(kind):
             actions.append([each(observations(env))["action"] for _ in range(3)])
     for expected, action in zip(*actions, strict=True):
         torch.testing.assert_close(action, expected)
-    assert len(recorded.recorded) == 1
+    assert len(recorded.traced) == 1
 
 
 def test_recorded_policy_takes_any_number_of_rows_and_mode():
     env = cones()
     policy = PPO(env, KEYS).policy
-    recorded = RecordedPolicy(policy)
+    recorded = TracedPolicy(policy)
     rows = observations(env)
     with torch.no_grad():
         for kind, part in [

@@ -12,6 +12,7 @@ from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 import coil_rl.config.schema  # noqa: F401  registers the typed roots
+from coil_rl.config.build import build
 from coil_rl.envs import (
     ConeTrackEnv,
     McapReplayEnv,
@@ -26,7 +27,6 @@ from coil_rl.envs import (
 from coil_rl.errors import UserError
 from coil_rl.guides import SplineGuide
 from coil_rl.testing import check_env, check_transform
-from coil_rl.config.build import build
 from coil_rl.transforms import GuideActions
 
 RATE, SCALE = 6.0, 7.0

@@ -10,6 +10,7 @@ from worlds import driving_measures
 
 import coil_rl.config.schema  # noqa: F401  registers the typed roots
 from coil_rl import testing
+from coil_rl.config.build import env_maker
 from coil_rl.envs import (
     ConeTrackEnv,
     Perception,
@@ -21,8 +22,8 @@ from coil_rl.envs import (
 )
 from coil_rl.envs import simulated_cone_classifier as classifier
 from coil_rl.guides import ConstantGuide, SplineGuide
-from coil_rl.config.build import build_env
 from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.run.parts import TEST
 from coil_rl.transforms import GuideActions
 
 EXACT = SimulatedLidar(noise=0, noise_growth=0, no_return=0, outliers=0)
@@ -179,7 +180,7 @@ def test_configuration_agrees_with_the_defaults():
             "evaluate",
             ["env=simulated_robot", "track=robot", "budget.num_envs=2", "run_dir=unused"],
         )
-    env = build_env(config, {**config.evaluation.env, "num_envs": 3}).base_env
+    env = env_maker(config)(3, TEST).base_env
     assert isinstance(env, SimulatedRobotEnv)
     plain = SimulatedRobotEnv(num_envs=3, assignment="cyclic")
     for one, other in ((env, plain), (env.perception, plain.perception), (env.lidar, plain.lidar)):

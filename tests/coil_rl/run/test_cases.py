@@ -7,9 +7,9 @@ import torch
 from hydra import compose, initialize_config_module
 from torchrl.envs import EnvBase
 
-from coil_rl.run.brake import Brake
 from coil_rl.config.build import build_env, build_learner, cases_node
 from coil_rl.report.measures import Measure
+from coil_rl.run.brake import Brake
 from coil_rl.run.run import _probe
 
 pytest.importorskip("gymnasium.envs.classic_control")
