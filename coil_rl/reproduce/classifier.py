@@ -248,7 +248,7 @@ def _draw_directions(axes: Axes, directions: Array, upper_right: Array) -> None:
         directions: [F, 2], the direction of each feature.
         upper_right: [2], the largest coordinates of the clusters.
     """
-    start = upper_right - [ARROW_LENGTH, ARROW_LENGTH / 2]
+    start = (upper_right[0] - ARROW_LENGTH, upper_right[1] - ARROW_LENGTH / 2)
     arrow = {"arrowstyle": "->", "color": style.QUIET, "lw": 1.2}
     for name, direction in zip(FEATURES, directions, strict=True):
         tip = start + ARROW_LENGTH / 2 * direction
