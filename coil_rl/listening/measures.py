@@ -66,7 +66,7 @@ def agreement(act: Act, states: TensorDictBase) -> Tensor:
 def intervention(
     act: Act, states: TensorDictBase, donors: int = 16, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Return the mean change of the action when one guide's advice is replaced by its advice in another state.
+    """Return the mean change of the action when one guide's advice comes from another state.
 
     Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a
     likely advice without information on this state; the advice of other guides stays. Donors come
@@ -131,7 +131,7 @@ def split_policy(
         policy: the policy of an agent.
 
     Returns:
-        The first module of the policy if it writes `guide_action`, else None; and the other modules.
+        The first module of the policy if it writes `guide_action`, else None; and the rest of it.
 
     Raises:
         ValueError: if the policy does not read advice.
