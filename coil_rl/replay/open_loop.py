@@ -133,10 +133,10 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
 def recorded_steering(
     recording: Recording, speed: float, car_length: float, max_steering: float
 ) -> Steering:
-    """Return the recorded commands as steering, NaN before the first command (equations 99 and 100).
+    """Return the recorded commands as steering (equations 99 and 100).
 
     See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the
-    steering is straight.
+    steering is straight. It is NaN before the first command.
 
     Args:
         recording: a recording with commands.
