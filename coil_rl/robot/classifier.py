@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,17 +158,21 @@ def train_classifier(
     accuracy = predicted["test_score"]
     folds_and_rows = zip(accuracy, predicted["indices"]["test"], strict=True)
     correct = round(sum(score * len(rows) for score, rows in folds_and_rows))
-    scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
+    (_, scaler), (_, machine) = pipeline.fit(features, thick).steps
     known = OneClassSVM(nu=UNUSUAL, gamma=machine.gamma).fit(scaler.transform(features))
+    return Training(_joined(scaler, machine, known), accuracy, correct, len(features))
+
+
+def _joined(scaler: StandardScaler, machine: SVC, known: OneClassSVM) -> ConeClassifier:
+    """Join the machine that tells thin from thick cones and the one that knows cones."""
     machines = (machine, known)
     support = np.concatenate([each.support_vectors_ for each in machines])
     weights = block_diag(*(each.dual_coef_ for each in machines))
     intercept = np.concatenate([each.intercept_ for each in machines])
     # The value of gamma="scale" has no public name.
-    classifier = ConeClassifier(
+    return ConeClassifier(
         scaler.mean_, scaler.scale_, support, weights, intercept, float(machine._gamma)
     )
-    return Training(classifier, accuracy, correct, len(features))
 
 
 def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
@@ -271,7 +275,7 @@ def label_clusters(
         max_distance: largest distance of a cluster, m.
     """
     labelled = [_label_drive(drive, max_distance) for drive in drives]
-    columns: dict[str, Array] = {}
+    columns: dict[str, Any] = {}
     for column in ("features", "thick", "scan", "cone", "distance", "visibility"):
         columns[column] = np.concatenate([getattr(of_drive, column) for of_drive in labelled])
     counts = [len(of_drive.cone) for of_drive in labelled]
