@@ -1,4 +1,8 @@
-"""User errors, and messages of one sentence for them."""
+"""Errors of the user, and messages of one sentence for them.
+
+`sentence` also makes messages for the errors of Hydra and OmegaConf that a mistake on the command
+line or in a YAML file causes.
+"""
 
 import difflib
 import errno
@@ -19,27 +23,39 @@ from omegaconf.errors import (
 NO_SPACE = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 # Another kind of file than expected, or one that may not be used.
 IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROFS, errno.ELOOP)
+# Launchers of Hydra, and the extra of the package that installs each.
 LAUNCHERS = {
     "joblib": "joblib",
     "submitit_slurm": "slurm",
     "submitit_local": "slurm",
     "ray": "ray",
-}  # and their extras
+}
 
 
 class UserError(Exception):
-    """A mistake in the input of the user. The message states what is wrong, what is expected and what to do."""
+    """A mistake in the input of the user.
+
+    The message states what is wrong, what is expected and what to do.
+    """
 
 
 def is_no_bug(error: BaseException) -> bool:
-    """Return whether an error has a cause outside of the program: the input, the configuration or the disk."""
+    """Return whether an error has a cause outside of the program.
+
+    That is the input, the configuration or the disk.
+    """
     outside = isinstance(error, (UserError, OmegaConfBaseException))
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 
 @contextmanager
 def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
-    """Turn the errors of a damaged file into a `UserError` that ends with a remedy."""
+    """Turn the errors of a damaged file into a `UserError`.
+
+    Args:
+        path: of the file that is read in the block.
+        remedy: what to do, the end of the message.
+    """
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
@@ -51,7 +67,12 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """Return `; did you mean X?` with the most similar known name, or an empty string."""
+    """Return `; did you mean X?` with the most similar known name, or an empty string.
+
+    Args:
+        given: the unknown name.
+        known: the names that exist.
+    """
     similar = difflib.get_close_matches(given, list(known), n=1)
     return f"; did you mean {similar[0]}?" if similar else ""
 
@@ -62,76 +83,100 @@ def sentence(error: BaseException) -> str:
 
 
 def _message(error: BaseException) -> str:
-    cause = error.__cause__
+    """Return the message of an error, which may have several lines."""
     if isinstance(error, UserError):
         return str(error)
-    if isinstance(error, MissingConfigException):
+    if isinstance(error, MissingConfigException):  # an OSError, too
         return _unknown_file(error)
     if isinstance(error, OSError):
-        name, remedy = (
-            error.filename or "the output",
-            "choose another folder with hydra.run.dir=FOLDER",
-        )
-        if error.errno == errno.ENAMETOOLONG:
-            name, remedy = f"{Path(name).name[:60]}...", "choose a shorter name"
-        elif error.errno in IN_THE_WAY:
-            remedy = "put the right file or folder there, with the right to use it"
-        return f"{name} cannot be used ({error.strerror}); {remedy}"
-    if isinstance(
-        error, (AssertionError, TypeError)
-    ):  # of Hydra, for a choice of a group that is no text
+        return _unusable_file(error)
+    # Hydra raises these for a choice of a group that is no text.
+    if isinstance(error, (AssertionError, TypeError)):
         return (
             "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
         )
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} cannot be parsed; write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
-    for key_error in (error, cause):
+        return (
+            f"{error.override!r} cannot be parsed; "
+            "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
+        )
+    for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
             return _unknown_key(key_error)
-    if isinstance(error, MissingMandatoryValue) and error.full_key:
-        return f"{error.full_key} must be given: write {error.full_key}=VALUE"
-    if isinstance(error, OmegaConfBaseException) and (key := error.full_key):
-        if isinstance(error, InterpolationKeyError):
-            missing, group = str(error).split("'")[1], key.partition(".")[0]
-            return f"{key} refers to {missing}, which does not exist; choose another {group}, or give {key}=VALUE"
-        return f"{key}: {_first_paragraph(error)}"
-    if isinstance(cause, OmegaConfBaseException):
-        return f"{_first_paragraph(error)}: {_first_paragraph(cause)}"
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return _wrong_value(error, error.full_key)
+    if isinstance(error.__cause__, OmegaConfBaseException):
+        return f"{_first_paragraph(error)}: {_first_paragraph(error.__cause__)}"
     return _first_paragraph(error)
 
 
+def _unusable_file(error: OSError) -> str:
+    """Return the message for a file that cannot be read or written."""
+    name = error.filename or "the output"
+    if error.errno == errno.ENAMETOOLONG:
+        return f"{Path(name).name[:60]}... cannot be used ({error.strerror}); choose a shorter name"
+    if error.errno in IN_THE_WAY:
+        return (
+            f"{name} cannot be used ({error.strerror}); "
+            "put the right file or folder there, with the right to use it"
+        )
+    return (
+        f"{name} cannot be used ({error.strerror}); choose another folder with hydra.run.dir=FOLDER"
+    )
+
+
 def _unknown_file(error: MissingConfigException) -> str:
+    """Return the message for a choice of a group that has no YAML file."""
     group, _, name = (error.missing_cfg_file or "").rpartition("/")
     if not group:
         return _first_paragraph(error)
     if group == "hydra/launcher" and name in LAUNCHERS:
-        return f"hydra/launcher={name} is not installed: python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
+        return (
+            f"hydra/launcher={name} is not installed: "
+            f"python -m pip install 'coil-rl[{LAUNCHERS[name]}]'"
+        )
     options = sorted(error.options or [])
-    choices = (
-        f"; {group} can be {', '.join(options)}{did_you_mean(name, options)}" if options else ""
+    if not options:
+        return f"there is no {group}={name}"
+    return (
+        f"there is no {group}={name}; "
+        f"{group} can be {', '.join(options)}{did_you_mean(name, options)}"
     )
-    return f"there is no {group}={name}{choices}"
 
 
 def _unknown_key(error: OmegaConfBaseException) -> str:
+    """Return the message for a key that the configuration does not have."""
     key, parent = str(error.full_key or error.key), error.parent_node
     names = parent if isinstance(parent, DictConfig) else []
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
-    add = (
-        f"; +{key}=VALUE adds it"
-        if parent is not None and OmegaConf.get_type(parent) is dict
-        else ""
+    add = ""
+    if parent is not None and OmegaConf.get_type(parent) is dict:
+        add = f"; +{key}=VALUE adds it"
+    return (
+        f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}"
+        f"{did_you_mean(str(error.key), known)}"
     )
-    return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{did_you_mean(str(error.key), known)}"
+
+
+def _wrong_value(error: OmegaConfBaseException, key: str) -> str:
+    """Return the message for the value of a key that is missing or cannot be used."""
+    if isinstance(error, MissingMandatoryValue):
+        return f"{key} must be given: write {key}=VALUE"
+    if isinstance(error, InterpolationKeyError):
+        missing, group = str(error).split("'")[1], key.partition(".")[0]
+        return (
+            f"{key} refers to {missing}, which does not exist; "
+            f"choose another {group}, or give {key}=VALUE"
+        )
+    return f"{key}: {_first_paragraph(error)}"
 
 
 def _first_paragraph(error: BaseException) -> str:
-    # Indented lines hold OmegaConf's internals.
-    lines = str(error).partition("\n\n")[0].splitlines()
-    kept = [
-        line.strip()
-        for line in lines
-        if line.strip() and not line.startswith((" ", "\t", "See http"))
-    ]
+    """Return the first paragraph of an error's text, without what only developers can use."""
+    kept = []
+    for line in str(error).partition("\n\n")[0].splitlines():
+        # Indented lines hold OmegaConf's internals.
+        if line.strip() and not line.startswith((" ", "\t", "See http")):
+            kept.append(line.strip())
     return " ".join(kept) or type(error).__name__
