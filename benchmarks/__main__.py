@@ -34,9 +34,9 @@ from benchmarks.training import (
     measure_shares,
     measure_training,
 )
+from coil_rl.config.check import check_parts
 from coil_rl.errors import UserError, sentence
 from coil_rl.programs.app import program
-from coil_rl.config.check import check_parts
 from coil_rl.run.folder import versions
 
 PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {

@@ -27,8 +27,8 @@ from tqdm import tqdm
 from benchmarks.timing import Stopwatch
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
-from coil_rl.schedules import Linear
 from coil_rl.run.rollout import Rollout
+from coil_rl.schedules import Linear
 
 Act = Callable[[Tensor], Tensor]  # observations [B, D] to deterministic actions
 # Values of an algorithm on any env, with `every` frames to a minibatch; and what differs on some,

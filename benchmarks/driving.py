@@ -19,6 +19,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import coil_rl.config.schema  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
+from coil_rl.config.build import build_bare_env, build_guides, compile_steps
 from coil_rl.envs import (
     Perception,
     read_recording,
@@ -26,7 +27,6 @@ from coil_rl.envs import (
     simulated_cone_classifier,
     simulated_drive,
 )
-from coil_rl.config.build import build_bare_env, build_guides, compile_steps
 from coil_rl.transforms import GuideActions
 
 

@@ -19,9 +19,6 @@ from omegaconf import OmegaConf
 from benchmarks.driving import Driving, driving_env, train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
-from coil_rl.learners.off_policy import OffPolicy
-from coil_rl.report.curves import learning
-from coil_rl.report.runs import read_runs
 from coil_rl.config.build import (
     build,
     build_bare_env,
@@ -30,6 +27,9 @@ from coil_rl.config.build import (
     build_learner,
     compile_steps,
 )
+from coil_rl.learners.off_policy import OffPolicy
+from coil_rl.report.curves import learning
+from coil_rl.report.runs import read_runs
 from coil_rl.run.experiment import Experiment, watched_keys
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions

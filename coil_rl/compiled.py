@@ -72,7 +72,12 @@ class Compiled:
 
 
 def library(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor]) -> Any:
-    """Return the loaded library of a function for arguments of these shapes; compiles it unless it is on disk."""
+    """Return the loaded library of a function; compile it unless it is on disk.
+
+    Args:
+        function: of tensors, see `Compiled`.
+        arguments: of the shapes for which the library is needed; they keep their values.
+    """
     graph = record(function, arguments)
     device = arguments[0].device
     path = folder() / f"{fingerprint(graph, arguments)}.so"
@@ -101,7 +106,11 @@ def compile_steps(env: nn.Module) -> None:
 
 
 def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor]) -> GraphModule:
-    """Run a function and return the graph of its operations; the arguments keep their values.
+    """Run a function and return the graph of its operations.
+
+    Args:
+        function: of tensors, see `Compiled`.
+        arguments: with which the function is run; they keep their values.
 
     Raises:
         UserError: if the shape of a tensor depends on values.
@@ -109,14 +118,14 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
     from torch.fx.experimental import proxy_tensor  # takes half a second to import
 
     before = [argument.detach().clone() for argument in arguments]
+    set_meta = proxy_tensor.set_meta
+
     # Shapes of the nodes take two thirds of the time of recording, and the compiler finds them
     # again.
-    set_meta = proxy_tensor.set_meta
-    without_shapes = patch.object(
-        proxy_tensor,
-        "set_meta",
-        lambda proxy, value: proxy if isinstance(value, Tensor) else set_meta(proxy, value),
-    )
+    def set_meta_without_shapes(proxy: Any, value: Any) -> Any:
+        return proxy if isinstance(value, Tensor) else set_meta(proxy, value)
+
+    without_shapes = patch.object(proxy_tensor, "set_meta", set_meta_without_shapes)
     with compiling(), without_shapes, torch.random.fork_rng(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         # Checks of values, as in TorchRL's distributions, are Python's decisions.
@@ -131,22 +140,25 @@ def record(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tensor
         node.meta.clear()
     graph.graph.eliminate_dead_code()
     graph.recompile()
+    _check_graph(graph, arguments)
+    return graph
+
+
+def _check_graph(graph: GraphModule, arguments: Sequence[Tensor]) -> None:
+    """Raise a `UserError` if a graph would not compute what its function computes."""
     memory = {argument.untyped_storage().data_ptr() for argument in arguments}
-    shared = [
-        name
-        for name, constant in graph.named_buffers()
-        if constant.untyped_storage().data_ptr() in memory
-    ]
-    if shared:
-        raise UserError(
-            "this cannot be compiled, because it reads a tensor that shares its memory with another one"
-        )
+    for constant in graph.buffers():
+        # The graph would read a copy that no change of the argument reaches.
+        if constant.untyped_storage().data_ptr() in memory:
+            raise UserError(
+                "this cannot be compiled, because it reads a tensor that shares its memory "
+                "with another one"
+            )
     for node in graph.graph.nodes:
         if DYNAMIC in getattr(node.target, "tags", ()):
             raise UserError(
                 f"this cannot be compiled, because {node.target} gives shapes that depend on values"
             )
-    return graph
 
 
 @contextmanager
@@ -160,16 +172,17 @@ def compiling() -> Iterator[None]:
 
 
 def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
-    """Return a name for the compiled code of a graph on this machine."""
+    """Return a name for the compiled code of a graph on this machine.
+
+    Args:
+        graph: the recorded function.
+        arguments: of the shapes for which it is compiled.
+    """
     parts: list[Any] = [graph.code, torch.__version__, torch.get_num_threads(), OPTIONS]
-    parts += [
-        platform.node(),
-        torch.backends.cpu.get_cpu_capability(),
-    ]  # the code is for this processor
-    parts += [
-        (argument.shape, argument.stride(), argument.dtype, argument.device)
-        for argument in arguments
-    ]
+    # The code is for this processor.
+    parts += [platform.node(), torch.backends.cpu.get_cpu_capability()]
+    for argument in arguments:
+        parts.append((argument.shape, argument.stride(), argument.dtype, argument.device))
     digest = hashlib.sha256(repr(parts).encode())
     for name, constant in sorted(graph.named_buffers()):
         digest.update(f"{name} {constant.dtype} {constant.shape}".encode())
@@ -178,15 +191,24 @@ def fingerprint(graph: GraphModule, arguments: Sequence[Tensor]) -> str:
 
 
 def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -> None:
-    """Compile a graph to a library at `path`."""
+    """Compile a graph to a library.
+
+    Args:
+        graph: the recorded function.
+        arguments: of the shapes for which it is compiled.
+        path: of the library.
+
+    Raises:
+        UserError: if there is no C++ compiler or no place for the library.
+    """
     import torch._inductor  # takes two seconds to import
 
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        remedy = "set XDG_CACHE_HOME to another folder, or take compile=false"
         raise UserError(
-            f"{path.parent} cannot be made for compiled code ({error.strerror}); {remedy}"
+            f"{path.parent} cannot be made for compiled code ({error.strerror}); "
+            "set XDG_CACHE_HOME to another folder, or take compile=false"
         ) from error
     tqdm.write("compiling, once for these sizes and this machine (20 to 60 s) ...", file=sys.stderr)
     examples = tuple(argument.detach() for argument in arguments)

@@ -13,12 +13,20 @@ IN_THE_WAY = (errno.EISDIR, errno.ENOTDIR, errno.EACCES, errno.EPERM, errno.EROF
 
 
 class UserError(Exception):
-    """A mistake in the input of the user. The message states what is wrong, what is expected and what to do."""
+    """A mistake in the input of the user.
+
+    The message states what is wrong, what is expected and what to do.
+    """
 
 
 @contextmanager
 def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
-    """Turn the errors of a damaged file into a `UserError` that ends with a remedy."""
+    """Turn the errors of a damaged file into a `UserError`.
+
+    Args:
+        path: of the file that is read in the block.
+        remedy: what to do, the end of the message.
+    """
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
@@ -30,6 +38,11 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
 
 
 def did_you_mean(given: str, known: Iterable[str]) -> str:
-    """Return `; did you mean X?` with the most similar known name, or an empty string."""
+    """Return `; did you mean X?` with the most similar known name, or an empty string.
+
+    Args:
+        given: the unknown name.
+        known: the names that exist.
+    """
     similar = difflib.get_close_matches(given, list(known), n=1)
     return f"; did you mean {similar[0]}?" if similar else ""

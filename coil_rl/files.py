@@ -15,7 +15,13 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path with the same suffix that becomes `path` at the end of the block.
 
     Parents are made and an older file is replaced. If the block raises, the temporary file is
-    removed. A folder in its place, or a file in that of a parent, is a `UserError`.
+    removed.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        UserError: if there is a folder in its place, or a file in that of a parent.
     """
     path = Path(path)
     try:
@@ -41,7 +47,12 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 
 def write_text(path: str | os.PathLike[str], text: str) -> None:
-    """Write a text file with exactly one line break at its end, as `whole_file`."""
+    """Write a text file with exactly one line break at its end, as `whole_file`.
+
+    Args:
+        path: of the file.
+        text: its content.
+    """
     with whole_file(path) as unfinished:
         unfinished.write_text(text.rstrip("\n") + "\n", encoding="utf-8")
 

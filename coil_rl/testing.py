@@ -1,4 +1,7 @@
-"""Contract checks of envs, guides and transforms, for tests of your own parts."""
+"""Contract checks of envs, guides and transforms, for the tests of new parts.
+
+They hold for the parts of this project, and can be used for those of any other one.
+"""
 
 from collections.abc import Callable
 
@@ -15,15 +18,34 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 def check_env(env: EnvBase, steps: int = 10) -> None:
     """Check an env in training mode.
 
-    Data fits the specs (else `check_env_specs` raises an `AssertionError`), numbers are finite, the
-    same seed gives the same rollout, a step leaves the data before it alone, and a partial reset
-    leaves the other rows alone (else a `ValueError` names the entry).
+    Data fits the specs, numbers are finite, the same seed gives the same rollout, a step leaves the
+    data before it alone, and a partial reset leaves the other rows alone.
+
+    Args:
+        env: the env, with or without transforms.
+        steps: length of the rollouts.
+
+    Raises:
+        AssertionError: if data does not fit the specs, by `check_env_specs`.
+        ValueError: for the first other property that does not hold; it names the entry.
     """
     set_progress(env.train(), 0.0)
     check_env_specs(env)
-    state = (
-        env.state_dict() if isinstance(env, TransformedEnv) else None
-    )  # of the transforms, which have no seed
+    _check_rollouts(env, steps)
+    data = env.rand_action(env.reset())
+    copy = data.clone()
+    env.step(data)
+    for key, value in copy.items(True, True):
+        if not torch.equal(value, data[key]):
+            raise ValueError(f"a step changed {key} of the data before it; write new tensors")
+    if env.batch_size and env.batch_size[0] > 1:
+        _check_partial_reset(env.base_env if isinstance(env, TransformedEnv) else env)
+
+
+def _check_rollouts(env: EnvBase, steps: int) -> None:
+    """Compare two rollouts with the same seed."""
+    # Of the transforms, which have no seed.
+    state = env.state_dict() if isinstance(env, TransformedEnv) else None
     rollouts = []
     for _ in range(2):
         if state is not None:
@@ -37,20 +59,20 @@ def check_env(env: EnvBase, steps: int = 10) -> None:
             raise ValueError(f"{key} holds a number that is not finite")
         if value.shape != again[key].shape or not torch.equal(value, again[key]):
             raise ValueError(
-                f"the same seed gives other values of {key}; draw random numbers from a seeded generator"
+                f"the same seed gives other values of {key}; "
+                "draw random numbers from a seeded generator"
             )
-    data = env.rand_action(env.reset())
-    copy = data.clone()
-    env.step(data)
-    for key, value in copy.items(True, True):
-        if not torch.equal(value, data[key]):
-            raise ValueError(f"a step changed {key} of the data before it; write new tensors")
-    if env.batch_size and env.batch_size[0] > 1:
-        _check_partial_reset(env.base_env if state is not None else env)
 
 
 def _check_partial_reset(env: EnvBase) -> None:
-    """Compare a step after the reset of row 0 with the same step without it; an env that draws in steps may differ."""
+    """Compare a step after the reset of row 0 with the same step without it.
+
+    An env that draws random numbers in its steps may differ anyway: so the step is compared only if
+    another seed makes no difference.
+    """
+
+    def leave_alone(present: TensorDictBase) -> TensorDictBase:
+        return present
 
     def seed(present: TensorDictBase) -> TensorDictBase:
         env.set_seed(1)
@@ -68,9 +90,7 @@ def _check_partial_reset(env: EnvBase) -> None:
         torch.manual_seed(0)  # of the action
         return env.step(env.rand_action(present))["next"]
 
-    plain, seeded, after_reset = (
-        second_step(change) for change in (lambda present: present, seed, reset)
-    )
+    plain, seeded, after_reset = second_step(leave_alone), second_step(seed), second_step(reset)
     if (plain == seeded).all():
         for key, value in plain.items(True, True):
             if not torch.equal(value[1:], after_reset[key][1:]):
@@ -84,13 +104,11 @@ def check_guide(
     tolerance: float = 0.0,
     steps: int = 12,
 ) -> None:
-    """Check that a guide writes valid actions, does not change its input, and depends on nothing but its own row.
+    """Check that a guide writes valid actions, and depends on nothing but its own row.
 
-    With an env the guide is asked through `GuideActions`, and the history is checked too: the same
-    history gives the same action, an episode begins without the memory of the one before, and the
-    reset of a row leaves the others alone.
-
-    A `ValueError` states the first property that does not hold.
+    It must not change its input either. With an env the guide is asked through `GuideActions`, and
+    the history is checked too: the same history gives the same action, an episode begins without
+    the memory of the one before, and the reset of a row leaves the others alone.
 
     Args:
         guide: without random numbers.
@@ -98,6 +116,9 @@ def check_guide(
         action_key: of the action.
         tolerance: allowed effect of other rows; a network rounds differently in another batch.
         steps: number of steps in the env, of random actions.
+
+    Raises:
+        ValueError: states the first property that does not hold.
     """
     action_key = nested_key(action_key)
     if action_key not in guide.out_keys:
@@ -112,9 +133,8 @@ def check_guide(
     copy = inputs.clone()
     with torch.no_grad():
         together = guide(inputs.copy())[action_key]
-        alone = torch.cat(
-            [guide(inputs[row : row + 1].copy())[action_key] for row in range(len(inputs))]
-        )
+        single = [guide(inputs[row : row + 1].copy())[action_key] for row in range(len(inputs))]
+        alone = torch.cat(single)
     if not together.isfinite().all():
         raise ValueError("the guide's action is not finite")
     if not (inputs == copy).all():
@@ -124,7 +144,14 @@ def check_guide(
 
 
 class _Recorded(EnvBase):
-    """Recorded data [B, T] as an env: each reset of all rows begins anew, a reset of some rows goes on in them."""
+    """Recorded data as an env.
+
+    A reset of all rows begins the data anew; after a reset of some rows they go on in the data.
+
+    Args:
+        env: of which the data is.
+        data: [B, T].
+    """
 
     def __init__(self, env: EnvBase, data: TensorDictBase) -> None:
         super().__init__(device=env.device, batch_size=data.batch_size[:1])
@@ -144,10 +171,8 @@ class _Recorded(EnvBase):
         return self._present().update(self.full_reward_spec.zero())
 
     def _present(self) -> TensorDictBase:
-        present = (
-            self.data[:, self.step_number].select(*self.observation_spec.keys(True, True)).clone()
-        )
-        return present.update(self.full_done_spec.zero())
+        observed = self.data[:, self.step_number].select(*self.observation_spec.keys(True, True))
+        return observed.clone().update(self.full_done_spec.zero())
 
     def _set_seed(self, seed: int | None) -> None:
         pass
@@ -156,61 +181,19 @@ class _Recorded(EnvBase):
 def _check_history(
     guide: TensorDictModuleBase, env: EnvBase, action_key: NestedKey, tolerance: float, steps: int
 ) -> None:
-    with torch.no_grad():
-        data = [
-            env.rollout(steps, break_when_any_done=False) for _ in range(1 if env.batch_size else 2)
-        ]
-    shortest = min(map(len, data))
-    recorded: TensorDictBase = (
-        data[0] if env.batch_size else TensorDict.stack([one[:shortest] for one in data])
-    )
-    if len(recorded.batch_size) != 2 or len(recorded) < 2:
-        raise ValueError(
-            f"check_guide needs an env with one batch dimension of at least 2 rows, not {env.batch_size}"
-        )
-    env = TransformedEnv(_Recorded(env, recorded), GuideActions({"guide": guide}, action_key))
-    space, middle, last = (
-        ActionSpace(env.full_action_spec[action_key], 1),
-        recorded.shape[1] // 2,
-        recorded.shape[1],
-    )
-
-    def check_action(_: object, __: object, written: TensorDictBase) -> None:
-        action = written[action_key]
-        space.check_advice(action, written.batch_size)
-        if space.continuous and not action.is_floating_point():
-            raise ValueError(f"is of {action.dtype}, but the env's of {space.spec.dtype}")
-        if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
-            raise ValueError("lies outside the bounds of the env's action")
-
-    def advice(begin: int = 0, reset: bool = False) -> Tensor:
-        """Return the advice from a step on, [B, T]; with `reset` row 0 begins anew in the middle."""
-        recordings, taken = recorded[:, begin:].exclude("next"), []
-        env.base_env.data = recordings
-        present = env.reset()
-        for step in range(recordings.shape[1]):
-            if reset and step == middle:
-                mask = torch.tensor(
-                    [True, *[False] * (len(recorded) - 1)], device=env.device
-                ).unsqueeze(-1)
-                present = env.reset(present.set("_reset", mask))
-            taken.append(present["guide_action"])
-            if step + 1 < recordings.shape[1]:
-                action = TensorDict(
-                    {action_key: recordings[action_key][:, step]}, present.batch_size
-                )
-                present = env.step(present.update(action))["next"]
-        return torch.stack(taken, 1)
-
-    hook = guide.register_forward_hook(check_action)
+    """Check what the advice of a guide depends on over the steps of an episode."""
+    recorded = _recorded_rollout(env, steps)
+    asked = _AskedGuide(guide, env, action_key, recorded)
+    middle = recorded.shape[1] // 2
+    hook = guide.register_forward_hook(asked.check_action)
     try:
-        first, again, fresh = advice(), advice(), advice(middle)
+        first, again, fresh = asked.advice(), asked.advice(), asked.advice(begin=middle)
         try:
-            interrupted = advice(reset=True)
+            interrupted = asked.advice(reset_at=middle)
         except (IndexError, RuntimeError) as error:
-            cause = "so it may remember in itself, not in entries"
             raise ValueError(
-                f"the guide fails after a single row was reset, {cause}: {error}"
+                "the guide fails after a single row was reset, "
+                f"so it may remember in itself, not in entries: {error}"
             ) from error
     finally:
         hook.remove()
@@ -219,16 +202,99 @@ def _check_history(
         return torch.allclose(one, other, rtol=0, atol=tolerance)
 
     if not torch.equal(first, again):
-        cause = "it draws, or remembers earlier episodes"
-        raise ValueError(f"the guide's action is another one for the same history; {cause}")
+        raise ValueError(
+            "the guide's action is another one for the same history; "
+            "it draws, or remembers earlier episodes"
+        )
     if not equal(interrupted[1:], first[1:]):
         raise ValueError("the guide's action for a row depends on the reset of another row")
-    if not equal(interrupted[0, middle:], fresh[0, : last - middle]):
+    if not equal(interrupted[0, middle:], fresh[0]):
         raise ValueError(
             "the guide's action after the reset of a row depends on what was before it"
         )
 
 
+def _recorded_rollout(env: EnvBase, steps: int) -> TensorDictBase:
+    """Return data [B, T] of random actions, with at least two rows.
+
+    For an env without batch dimension these are two episodes.
+    """
+    with torch.no_grad():
+        if env.batch_size:
+            recorded: TensorDictBase = env.rollout(steps, break_when_any_done=False)
+        else:
+            episodes = [env.rollout(steps, break_when_any_done=False) for _ in range(2)]
+            shortest = min(map(len, episodes))
+            recorded = TensorDict.stack([episode[:shortest] for episode in episodes])
+    if len(recorded.batch_size) != 2 or len(recorded) < 2:
+        raise ValueError(
+            "check_guide needs an env with one batch dimension of at least 2 rows, "
+            f"not {env.batch_size}"
+        )
+    return recorded
+
+
+class _AskedGuide:
+    """A guide that is asked along recorded data.
+
+    Args:
+        guide: the guide.
+        env: of which the data is.
+        action_key: of the action.
+        recorded: the data, [B, T].
+    """
+
+    def __init__(
+        self,
+        guide: TensorDictModuleBase,
+        env: EnvBase,
+        action_key: NestedKey,
+        recorded: TensorDictBase,
+    ) -> None:
+        self.action_key, self.recorded = action_key, recorded
+        self.env = TransformedEnv(
+            _Recorded(env, recorded), GuideActions({"guide": guide}, action_key)
+        )
+        self.space = ActionSpace(self.env.full_action_spec[action_key], 1)
+
+    def check_action(self, _: object, __: object, written: TensorDictBase) -> None:
+        """Raise a `ValueError` for an invalid action; a forward hook of the guide."""
+        action, space = written[self.action_key], self.space
+        space.check_advice(action, written.batch_size)
+        if space.continuous and not action.is_floating_point():
+            raise ValueError(f"is of {action.dtype}, but the env's of {space.spec.dtype}")
+        if space.bounds is not None and not torch.equal(action, action.clamp(*space.bounds)):
+            raise ValueError("lies outside the bounds of the env's action")
+
+    def advice(self, begin: int = 0, reset_at: int | None = None) -> Tensor:
+        """Return the advice at each step, [B, T - begin].
+
+        Args:
+            begin: step of the data with which the episodes begin.
+            reset_at: step at which an episode of row 0 begins anew; None for no reset.
+        """
+        data, taken = self.recorded[:, begin:].exclude("next"), []
+        self.env.base_env.data = data
+        present = self.env.reset()
+        for step in range(data.shape[1]):
+            if step == reset_at:
+                mask = torch.zeros(len(data), 1, dtype=torch.bool, device=self.env.device)
+                mask[0] = True
+                present = self.env.reset(present.set("_reset", mask))
+            taken.append(present["guide_action"])
+            if step + 1 < data.shape[1]:
+                action = TensorDict(
+                    {self.action_key: data[self.action_key][:, step]}, present.batch_size
+                )
+                present = self.env.step(present.update(action))["next"]
+        return torch.stack(taken, 1)
+
+
 def check_transform(env: EnvBase, transform: Transform) -> None:
-    """Check an env with a transform; see `check_env`. The random state must be in the transform's `state_dict()`."""
+    """Check an env with a transform; see `check_env`.
+
+    Args:
+        env: the env.
+        transform: the transform; its random state must be in its `state_dict()`.
+    """
     check_env(TransformedEnv(env, transform))

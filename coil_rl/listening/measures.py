@@ -28,25 +28,37 @@ PICTURES = {
     "gradient": ("Effect of small changes of the advice on the action", "|da / dg|"),
 }
 
+# Maps states [N] with `guide_action` to actions [N, A]; it may write to the states, which are
+# copies.
 Act = Callable[[TensorDictBase], Tensor]
-"""Maps states [N] with `guide_action` to actions [N, A]; it may write to the states, which are copies."""
 
 
 def drawn(measures: Mapping[str, NDArray[np.float64]]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield each measure that has a picture and a number, with title, axis label and file name of its picture."""
+    """Yield the measures that can be drawn: those that have a picture and any number.
+
+    Args:
+        measures: the values of each measure.
+
+    Yields:
+        The name of the measure, and title, axis label and file name of its picture.
+    """
     for measure, (title, label) in PICTURES.items():
         if not np.isnan(measures[measure]).all():
-            yield (
-                measure,
-                title,
-                label,
-                f"listening{'' if measure == 'intervention' else f'_{measure}'}.png",
-            )
+            name = "listening" if measure == "intervention" else f"listening_{measure}"
+            yield measure, title, label, f"{name}.png"
 
 
 @torch.no_grad()
 def agreement(act: Act, states: TensorDictBase) -> Tensor:
-    """Return |a - g_k|, the distance between the action and the advice of each guide, [N, n_guides] in action units."""
+    """Return |a - g_k|, the distance between the action and the advice of each guide.
+
+    Args:
+        act: the agent.
+        states: [N], with `guide_action` [N, n_guides, A].
+
+    Returns:
+        [N, n_guides], in action units.
+    """
     return (_act(act, states, states[ADVICE]).unsqueeze(-2) - states[ADVICE]).norm(dim=-1)
 
 
@@ -54,7 +66,7 @@ def agreement(act: Act, states: TensorDictBase) -> Tensor:
 def intervention(
     act: Act, states: TensorDictBase, donors: int = 16, generator: torch.Generator | None = None
 ) -> Tensor:
-    """Return the mean change of the action when one guide's advice is replaced by its advice in another state.
+    """Return the mean change of the action when one guide's advice comes from another state.
 
     Permutation importance (Breiman 2001) of the action instead of a loss: the replacement is a
     likely advice without information on this state; the advice of other guides stays. Donors come
@@ -66,14 +78,13 @@ def intervention(
         act: the agent.
         states: [N], with `guide_action` [N, n_guides, A].
         donors: number of replacements per state and guide, at least 1.
-        generator: of the donors, on the CPU.
+        generator: of the donors, on the CPU; by default PyTorch's own.
     """
     advice = states[ADVICE]
     action, change = _act(act, states, advice), torch.zeros_like(advice[..., 0])
     for _ in range(donors):
-        other = advice[
-            torch.randint(len(advice), (len(advice),), generator=generator).to(advice.device)
-        ]
+        donor = torch.randint(len(advice), (len(advice),), generator=generator)
+        other = advice[donor.to(advice.device)]
         for guide in range(advice.shape[-2]):
             replaced = advice.clone()
             replaced[:, guide] = other[:, guide]
@@ -82,9 +93,16 @@ def intervention(
 
 
 def gradient(act: Act, states: TensorDictBase) -> Tensor:
-    """Return the Frobenius norm of da/dg_k, [N, n_guides]: the effect of small changes of each guide's advice.
+    """Return the effect of small changes of each guide's advice, the Frobenius norm of da/dg_k.
 
     It is 1 if the action is the advice, and NaN without a derivative, as for discrete actions.
+
+    Args:
+        act: the agent.
+        states: [N], with `guide_action` [N, n_guides, A].
+
+    Returns:
+        [N, n_guides].
     """
     with torch.enable_grad():
         advice = states[ADVICE].detach().clone().requires_grad_()
@@ -107,18 +125,24 @@ def _act(act: Act, states: TensorDictBase, advice: Tensor) -> Tensor:
 def split_policy(
     policy: TensorDictModuleBase,
 ) -> tuple[TensorDictModuleBase | None, TensorDictModuleBase]:
-    """Split a policy into its first module if that writes `guide_action`, else None, and modules that read it.
+    """Split a policy into what writes `guide_action` and what reads it.
 
-    A policy that does not read advice is a `ValueError`.
+    Args:
+        policy: the policy of an agent.
+
+    Returns:
+        The first module of the policy if it writes `guide_action`, else None; and the rest of it.
+
+    Raises:
+        ValueError: if the policy does not read advice.
     """
     advising, acting = None, policy
     if isinstance(policy, TensorDictSequential) and ADVICE in policy.module[0].out_keys:
-        sequential = (
-            ProbabilisticTensorDictSequential
-            if hasattr(policy, "get_dist")
-            else TensorDictSequential
-        )
-        advising, acting = policy.module[0], sequential(*policy.module[1:])
+        advising, others = policy.module[0], policy.module[1:]
+        if hasattr(policy, "get_dist"):
+            acting = ProbabilisticTensorDictSequential(*others)
+        else:
+            acting = TensorDictSequential(*others)
     if ADVICE not in acting.in_keys:
         raise ValueError(
             f"the policy does not read {ADVICE}; it reads {', '.join(map(str, acting.in_keys))}"
@@ -127,7 +151,13 @@ def split_policy(
 
 
 class InterceptedPolicy(TensorDictModuleBase):
-    """A policy whose input, with `guide_action` [B, n_guides, A], is changed between the advice and the action."""
+    """A policy whose input is changed between the advice and the action.
+
+    Args:
+        policy: the policy, which reads `guide_action`.
+        change: returns the changed input of the acting part, given the input, which has
+            `guide_action` [B, n_guides, A].
+    """
 
     def __init__(
         self, policy: TensorDictModuleBase, change: Callable[[TensorDictBase], TensorDictBase]

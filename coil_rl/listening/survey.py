@@ -32,26 +32,41 @@ EVERYWHERE = "everywhere"
 
 @dataclass(frozen=True)
 class Survey:
-    """Measures in the N states of all episodes."""
+    """Measures in the N states of all episodes.
 
-    guides: list[str]  # names, one per slot of the advice
+    Attributes:
+        guides: names of the guides, one per slot of the advice.
+        result: the evaluated episodes.
+        step: [N], number of the step in its episode.
+        place: where the states are, as `WholeEpisode.locate` returns it, [N, ...].
+        section: [N], index of the section.
+        advice: [N, n_guides, A].
+        measures: agreement, intervention and gradient, [N, n_guides] each.
+    """
+
+    guides: list[str]
     result: EvaluationResult
-    step: NDArray[np.int64]  # [N], of the episode
-    place: dict[str, NDArray[Any]]  # as `WholeEpisode.locate` returns it, [N, ...]
-    section: NDArray[np.int64]  # [N], index of the section
-    advice: Tensor  # [N, n_guides, A]
-    measures: dict[str, Array]  # agreement, intervention and gradient, [N, n_guides] each
+    step: NDArray[np.int64]
+    place: dict[str, NDArray[Any]]
+    section: NDArray[np.int64]
+    advice: Tensor
+    measures: dict[str, Array]
 
     def means(self, **groups: NDArray[np.int64]) -> list[dict[str, Any]]:
-        """Return a row for each guide and group of states, given its numbers [N] by name.
+        """Return the means of the measures for each guide in each group of states.
 
-        Rows have `guide`, the groups, the number of `states`, and the means of the measures.
+        Args:
+            groups: what the states are grouped by: the number of the group of each state, [N].
+
+        Returns:
+            Rows with `guide`, the groups, the number of `states`, and the means of the measures.
         """
         rows = []
         for slot, guide in enumerate(self.guides):
-            table = pd.DataFrame(
-                {**groups, **{name: values[:, slot] for name, values in self.measures.items()}}
-            )
+            columns: dict[str, NDArray[Any]] = dict(groups)
+            for name, values in self.measures.items():
+                columns[name] = values[:, slot]
+            table = pd.DataFrame(columns)
             grouped = table.groupby(list(groups))
             means = grouped.size().rename("states").to_frame().join(grouped.mean()).reset_index()
             rows += [{"guide": guide} | row for row in means.to_dict("records")]
@@ -68,10 +83,19 @@ def survey(
     seed: int = 0,
     tick: Callable[[], Any] | None = None,
 ) -> Survey:
-    """Evaluate the deterministic agent for one episode per row of an env [B], and measure in every visited state.
+    """Evaluate the deterministic agent, and measure in every visited state.
 
-    The agent reads `guide_action`. `donors` are as for `intervention`, the seed is theirs, and
-    `tick` is called every step.
+    Args:
+        env: [B], one episode per row.
+        policy: the agent, which reads `guide_action`.
+        sections: the division of the episodes.
+        evaluation: the cases and the measures of the episodes.
+        donors: number of replacements of the advice per state and guide, as for `intervention`.
+        seed: of the donors.
+        tick: called at every step.
+
+    Raises:
+        ValueError: if nothing writes `guide_action`.
     """
     history: list[TensorDictBase] = []
 
@@ -83,13 +107,7 @@ def survey(
         return state
 
     recorder = InterceptedPolicy(policy, record)
-    sources = [
-        recorder.advising,
-        *(module for module in env.modules() if isinstance(module, GuideActions)),
-    ]
-    guides = next((list(source.names) for source in sources if source is not None), None)
-    if guides is None:
-        raise ValueError("nothing writes guide_action: put GuideActions into the env")
+    guides = _guide_names(env, recorder)
     result = evaluation.run(env, recorder, tick=tick)
     steps = torch.tensor([episode["steps"] for episode in result.episodes], device=env.device)
     running = torch.arange(len(history), device=env.device).unsqueeze(-1) < steps
@@ -116,18 +134,39 @@ def survey(
     )
 
 
+def _guide_names(env: EnvBase, policy: InterceptedPolicy) -> list[str]:
+    """Return the names of the guides whose advice the policy reads, one per slot of the advice."""
+    if policy.advising is not None:
+        return list(policy.advising.names)
+    for module in env.modules():
+        if isinstance(module, GuideActions):
+            return list(module.names)
+    raise ValueError("nothing writes guide_action: put GuideActions into the env")
+
+
 class Ablation(NamedTuple):
-    """A guide, by its slot in the advice, that is removed in one section, by its index, or everywhere (None)."""
+    """The removal of a guide's advice.
+
+    Attributes:
+        guide: the slot of the guide in the advice.
+        section: index of the section where the advice is removed; None for everywhere.
+    """
 
     guide: int
     section: int | None = None
 
 
 def ablations(guides: int, sections: int) -> list[Ablation]:
-    """Return the removal of each guide everywhere and in each section, given their numbers."""
-    return [
-        Ablation(guide, section) for guide in range(guides) for section in (None, *range(sections))
-    ]
+    """Return the removal of each guide everywhere and in each section.
+
+    Args:
+        guides: number of guides.
+        sections: number of sections.
+    """
+    removed = []
+    for guide in range(guides):
+        removed += [Ablation(guide, section) for section in (None, *range(sections))]
+    return removed
 
 
 def drive_ablated(
@@ -145,9 +184,20 @@ def drive_ablated(
     Removed advice is replaced by a constant, such as its mean: it carries no information and is not
     misleading, as advice from other states would be.
 
-    The arguments are those of `survey` and the `replacement` [n_guides, A]. Each ablation gets an
-    equal share of the rows of the env, in order. The result is the episodes of each ablation, as in
-    `EvaluationResult`.
+    Args:
+        env: [B]; each ablation gets an equal share of the rows, in order.
+        policy: the agent, which reads `guide_action`.
+        sections: the division of the episodes.
+        evaluation: the cases and the measures of the episodes.
+        removed: the ablations.
+        replacement: what replaces the removed advice, [n_guides, A].
+        tick: called at every step.
+
+    Returns:
+        The episodes of each ablation, as in `EvaluationResult`.
+
+    Raises:
+        ValueError: if the rows cannot be divided equally.
     """
     rows = env.batch_size.numel()
     if not removed or rows % len(removed):
@@ -176,7 +226,13 @@ def table_by_section(
     evaluation: Evaluation,
     ablated: Mapping[Ablation, Sequence[Mapping[str, Any]]],
 ) -> list[dict[str, Any]]:
-    """Return one row per guide everywhere and in each section: means over states, and the effect of its removal.
+    """Return how much the agent uses each guide everywhere and in each section.
+
+    Args:
+        data: the measures.
+        sections: the division of the episodes.
+        evaluation: the measures of the episodes.
+        ablated: the episodes of each ablation.
 
     Returns:
         Rows with `guide`, `section`, `share` of the states, `agreement`, `intervention`,
@@ -186,22 +242,18 @@ def table_by_section(
     intact = summarise(data.result.episodes, evaluation.measures)[-1]
     rows = []
     for (slot, section), episodes in ablated.items():
-        states = (
-            np.ones(len(data.section), dtype=bool) if section is None else data.section == section
-        )
-        if states.any():
-            without = summarise(episodes, evaluation.measures)[-1]
-            rows.append(
-                {
-                    "guide": data.guides[slot],
-                    "section": EVERYWHERE if section is None else sections.names[section],
-                }
-                | {"share": float(states.mean())}
-                | {
-                    name: float(values[states, slot].mean())
-                    for name, values in data.measures.items()
-                }
-                | {"lost": intact["reward"] - without["reward"]}
-                | ({"completed": without["completed"]} if "completed" in without else {})
-            )
+        if section is None:
+            name, states = EVERYWHERE, np.ones(len(data.section), dtype=bool)
+        else:
+            name, states = sections.names[section], data.section == section
+        if not states.any():
+            continue
+        row = {"guide": data.guides[slot], "section": name, "share": float(states.mean())}
+        for measure, values in data.measures.items():
+            row[measure] = float(values[states, slot].mean())
+        without = summarise(episodes, evaluation.measures)[-1]
+        row["lost"] = intact["reward"] - without["reward"]
+        if "completed" in without:
+            row["completed"] = without["completed"]
+        rows.append(row)
     return rows

@@ -1,4 +1,7 @@
-"""Annotated recordings: a copy with the policies' steering and the perceived cones, and a Foxglove layout for it."""
+"""Annotated recordings, and a Foxglove layout for them.
+
+An annotated recording is a copy with the steering of the policies and with the perceived cones.
+"""
 
 import json
 import math
@@ -15,21 +18,20 @@ from coil_rl.envs.recordings.messages import TWIST, header, twist
 from coil_rl.envs.robot.course import THICK, THIN
 from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
 from coil_rl.envs.track import SIDES
-from coil_rl.replay.open_loop import RECORDED, OpenLoop
+from coil_rl.replay.open_loop import RECORDED, Floats, OpenLoop
 from coil_rl.report import style
 
-MARKERS, FLOAT, BOOL = (
-    "visualization_msgs/msg/MarkerArray",
-    "std_msgs/msg/Float64",
-    "std_msgs/msg/Bool",
-)
-CYLINDER, LINE_STRIP, DELETE_ALL = 3, 4, 3
+MARKERS = "visualization_msgs/msg/MarkerArray"
+FLOAT = "std_msgs/msg/Float64"
+BOOL = "std_msgs/msg/Bool"
+CYLINDER, LINE_STRIP = 3, 4  # types of a marker
+DELETE_ALL = 3  # action of a marker
 COLOURS = {"left": {"r": 1.0, "g": 0.85}, "right": {"g": 0.3, "b": 1.0}}
 DIAMETERS = {"left": 2 * THIN, "right": 2 * THICK}  # m, of a cone
 CONE_HEIGHT, LINE_WIDTH = 0.1, 0.01  # m
 FADED = 0.3  # opacity of a boundary from the memory
 
-# metadata record with the numbers of messages in the original, which the copy does not have
+# Metadata record with the numbers of messages in the original, which the copy does not have
 ROSBAG2 = "rosbag2"
 TRANSFORMS = ("/tf", "/tf_static")
 POLICY, SCAN, COMMAND = "POLICY", "/scan", "/cmd_vel"  # placeholders in the shipped layout
@@ -51,8 +53,7 @@ def annotate(
     Adds `/coil/POLICY/steering` (radians) and `/coil/POLICY/cmd_vel` per policy, `/coil/cones`
     (yellow left, blue right), `/coil/boundary` and `/coil/valid` (both sides valid), at the log
     times of the scans. Markers have the stamp and the frame of the scan. A boundary from the memory
-    is faded. Metadata and attachments are copied. Equal results make equal bytes. A recording that
-    can no longer be read is a `RecordingError`.
+    is faded. Metadata and attachments are copied. Equal results make equal bytes.
 
     Args:
         result: of one recording.
@@ -64,6 +65,9 @@ def annotate(
         about: entries of the metadata record `coil`, to which the SHA-256 of the recording is
             added.
         attachments: YAML files by name.
+
+    Raises:
+        RecordingError: if the recording can no longer be read.
     """
     recording = result.recording
     contents = read_messages(recording.path, [*topics, *TRANSFORMS])
@@ -92,12 +96,10 @@ def annotate(
 
 
 def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale: float) -> None:
+    """Write what the car perceives at each scan: the cones and the boundaries as markers."""
     cos, sin = math.cos(laser_yaw), math.sin(laser_yaw)
     to_laser = np.array([[cos, -sin], [sin, cos]]) / scale
-    # The inverse of `sight.encode_samples`.
-    distance, angle = np.moveaxis(result.observation.reshape(-1, 2, SAMPLES, 2), -1, 0)
-    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
-    lines = np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1) @ to_laser
+    lines = _boundaries(result) @ to_laser
     cones = result.cones @ to_laser
     ever_valid = np.logical_or.accumulate(result.valid, axis=0)
     recording = result.recording
@@ -105,32 +107,50 @@ def _add_view(writer: RecordingWriter, result: OpenLoop, laser_yaw: float, scale
         zip(recording.log_time.tolist(), recording.stamp.tolist(), strict=True)
     ):
         top = header(stamp, recording.frame)
-        cone_markers, line_markers = ([{"header": top, "action": DELETE_ALL}] for _ in range(2))
+        cone_markers: list[dict[str, Any]] = [{"header": top, "action": DELETE_ALL}]
+        line_markers: list[dict[str, Any]] = [{"header": top, "action": DELETE_ALL}]
         for side, name in enumerate(SIDES):
-            size = {"x": DIAMETERS[name], "y": DIAMETERS[name], "z": CONE_HEIGHT}
-            for number, (x, y) in enumerate(cones[row, side, : result.count[row, side]].tolist()):
-                pose = {
-                    "position": {"x": x, "y": y, "z": CONE_HEIGHT / 2},
-                    "orientation": {"w": 1.0},
-                }
-                cone_markers.append(
-                    _marker(top, name, CYLINDER, 1.0, id=number, pose=pose, scale=size)
-                )
+            cone_markers += _cone_markers(top, name, cones[row, side, : result.count[row, side]])
             if ever_valid[row, side]:
                 opacity = 1.0 if result.valid[row, side] else FADED
-                points = [{"x": x, "y": y} for x, y in lines[row, side].tolist()]
-                pose, size = {"orientation": {"w": 1.0}}, {"x": LINE_WIDTH}
-                line_markers.append(
-                    _marker(top, name, LINE_STRIP, opacity, pose=pose, scale=size, points=points)
-                )
+                line_markers.append(_line_marker(top, name, opacity, lines[row, side]))
         writer.add("/coil/cones", MARKERS, time, {"markers": cone_markers})
         writer.add("/coil/boundary", MARKERS, time, {"markers": line_markers})
         writer.add("/coil/valid", BOOL, time, {"data": bool(result.both_valid[row])})
 
 
+def _boundaries(result: OpenLoop) -> Floats:
+    """Return the estimated boundaries at each of N scans, [N, 2, SAMPLES, 2] m in the car's frame.
+
+    This is the inverse of `sight.encode_samples`. The scale is that of the cone world.
+    """
+    distance, angle = np.moveaxis(result.observation.reshape(-1, 2, SAMPLES, 2), -1, 0)
+    distance, angle = (distance + 1) * (SIGHT / 2), angle * WIDEST_ANGLE
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
+
+
+def _cone_markers(top: dict[str, Any], side: str, cones: Floats) -> list[dict[str, Any]]:
+    """Return a cylinder for each cone of one side, [N, 2] m in the frame of the scan."""
+    size = {"x": DIAMETERS[side], "y": DIAMETERS[side], "z": CONE_HEIGHT}
+    markers = []
+    for number, (x, y) in enumerate(cones.tolist()):
+        position = {"x": x, "y": y, "z": CONE_HEIGHT / 2}
+        pose = {"position": position, "orientation": {"w": 1.0}}
+        markers.append(_marker(top, side, CYLINDER, 1.0, id=number, pose=pose, scale=size))
+    return markers
+
+
+def _line_marker(top: dict[str, Any], side: str, opacity: float, line: Floats) -> dict[str, Any]:
+    """Return a line for the boundary of one side, [SAMPLES, 2] m in the frame of the scan."""
+    points = [{"x": x, "y": y} for x, y in line.tolist()]
+    pose, size = {"orientation": {"w": 1.0}}, {"x": LINE_WIDTH}
+    return _marker(top, side, LINE_STRIP, opacity, pose=pose, scale=size, points=points)
+
+
 def _marker(
     top: dict[str, Any], side: str, kind: int, opacity: float, **fields: Any
 ) -> dict[str, Any]:
+    """Return a marker in the colour of a side; `fields` are those that depend on its kind."""
     return {
         "header": top,
         "ns": side,
@@ -141,7 +161,13 @@ def _marker(
 
 
 def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:
-    """Return the shipped Foxglove layout with the policies, the frame and the topics of a recording."""
+    """Return the shipped Foxglove layout with the policies, frame and topics of a recording.
+
+    Args:
+        result: of the recording.
+        scan: topic of the LiDAR.
+        command: topic of the robot's commands; None for none.
+    """
     text = files("coil_rl.replay").joinpath("foxglove_layout.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = json.loads(text)
     for name, panel in layout["configById"].items():
@@ -152,27 +178,26 @@ def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None =
                 scan if topic == SCAN else topic: value for topic, value in panel["topics"].items()
             }
         elif name.startswith("Plot!"):
-            panel["paths"] = [
-                line for path in panel["paths"] for line in _plot_lines(path, result, command)
-            ]
+            lines = []
+            for path in panel["paths"]:
+                lines += _plot_lines(path, result, command)
+            panel["paths"] = lines
     return json.dumps(layout, indent=2) + "\n"
 
 
 def _plot_lines(
     path: Mapping[str, Any], result: OpenLoop, command: str | None
 ) -> list[dict[str, Any]]:
-    """Return the lines for a path of the shipped layout: one per policy, or the recorded commands if there are any."""
+    """Return the lines for a path of the shipped layout.
+
+    It is one line per policy, or the line of the recorded commands if there are any.
+    """
     if POLICY in path["value"]:
-        colours = style.strong_strokes(result.policies)
-        return [
-            {
-                **path,
-                "value": path["value"].replace(POLICY, policy),
-                "label": policy,
-                "color": colours[policy].colour,
-            }
-            for policy in result.policies
-        ]
+        lines = []
+        for policy, stroke in style.strong_strokes(result.policies).items():
+            value = path["value"].replace(POLICY, policy)
+            lines.append({**path, "value": value, "label": policy, "color": stroke.colour})
+        return lines
     if command is None or RECORDED not in result.steering:
         return []
     fields = f"{command}.twist" if result.recording.stamped_commands else command

@@ -1,4 +1,7 @@
-"""Open-loop evaluation of policies on recordings: their actions at every scan of a drive that they did not control."""
+"""Open-loop evaluation of policies on recordings.
+
+The policies act at every scan of a drive that they did not control.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,29 +30,41 @@ Policies = Mapping[str, tuple[EnvBase, TensorDictModuleBase]]
 
 @dataclass(frozen=True)
 class Steering:
-    """Steering of one policy at each of N scans, [N] each."""
+    """Steering of one policy at each of N scans.
 
-    # the steering that reaches the robot, as a fraction of the maximum, positive to the left
+    Attributes:
+        action: [N], the steering that reaches the robot, as a fraction of the maximum, positive to
+            the left.
+        omega: [N] radians/s, the turn rate at that steering.
+        smoothness: [N], |a - a_avg|, as in the cone world.
+    """
+
     action: Floats
-    omega: Floats  # radians/s, the turn rate at that steering
-    smoothness: Floats  # |a - a_avg|, as in the cone world
+    omega: Floats
+    smoothness: Floats
 
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Result for one recording of N scans."""
+    """Result for one recording of N scans.
+
+    Attributes:
+        recording: the recording.
+        cones: [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first.
+        count: [N, 2], number of the cones.
+        observation: [N, 20], see `coil_rl.envs.sight`.
+        valid: [N, 2], whether each side is valid in the scan.
+        steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
+        max_steering: radians of an action of 1.
+    """
 
     recording: Recording
-    cones: NDArray[
-        np.float32
-    ]  # [N, 2, K, 2] m in the scale of the cone world, in the car's frame, left side first
-    count: NDArray[np.int64]  # [N, 2], of the cones
-    observation: NDArray[np.float32]  # [N, 20]
-    valid: NDArray[np.bool_]  # [N, 2] whether each side is valid in the scan
-    steering: dict[
-        str, Steering
-    ]  # by policy; `recorded_steering` is last, as `RECORDED`, if there are commands
-    max_steering: float  # radians of an action of 1
+    cones: NDArray[np.float32]
+    count: NDArray[np.int64]
+    observation: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    steering: dict[str, Steering]
+    max_steering: float
 
     @property
     def both_valid(self) -> NDArray[np.bool_]:
@@ -70,10 +85,15 @@ def open_loop(
     seed: int = 0,
     tick: Callable[[str], Any] | None = None,
 ) -> list[OpenLoop]:
-    """Return the result of each recording of an env without transforms. Each policy observes its own last action.
+    """Return the result of each recording of an env.
 
-    The seed of PyTorch's generator is set again for each policy. `tick` is called with its name
-    after every scan.
+    Each policy observes its own last action.
+
+    Args:
+        env: the env of the recordings, without transforms.
+        policies: the policies by name, each with an env that has the transforms it needs.
+        seed: of PyTorch's generator, set again for each policy.
+        tick: called with the name of the policy after every scan.
     """
     scans = int(env.length.max())
     rollouts: dict[str, TensorDictBase] = {}
@@ -97,10 +117,10 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
     recording = env.recordings[row]
     # A recording shorter than the longest one restarts; its first pass counts.
     steps = {name: rollout[row, : len(recording.ranges)] for name, rollout in rollouts.items()}
-    steering = {
-        name: Steering(*(step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS))
-        for name, step in steps.items()
-    }
+    steering = {}
+    for name, step in steps.items():
+        columns = [step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS]
+        steering[name] = Steering(*columns)
     if recording.commands is not None:
         steering[RECORDED] = recorded_steering(
             recording, env.speed, env.car_length, env.max_steering
@@ -113,15 +133,15 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
 def recorded_steering(
     recording: Recording, speed: float, car_length: float, max_steering: float
 ) -> Steering:
-    """Return the recorded commands as steering, NaN before the first command (equations 99 and 100).
+    """Return the recorded commands as steering (equations 99 and 100).
 
     See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the
-    steering is straight.
+    steering is straight. It is NaN before the first command.
 
     Args:
-        recording: with commands.
+        recording: a recording with commands.
         speed: m/s of the robot, for a recording without speeds.
-        car_length: m.
+        car_length: length L of the robot, m.
         max_steering: radians of an action of 1.
     """
     speeds, omega = recording.commands_of_scans(speed).T

@@ -1,4 +1,7 @@
-"""Report of an open-loop evaluation: a Markdown table, a row per scan, and a figure of the steering over time."""
+"""Report of an open-loop evaluation.
+
+It has a Markdown table, a CSV file with a row per scan, and a figure of the steering over time.
+"""
 
 import os
 from typing import Any
@@ -37,18 +40,32 @@ def describe(result: OpenLoop) -> str:
         columns |= {f"from {name}": (f"from {name}", ".3f") for name in result.steering}
     rows = frame.rename_axis("policy").reset_index().to_dict("records")
     simulated = " (simulated)" if result.recording.simulated else ""
-    return f"## {result.recording.path}{simulated}\n\n{extent(result)}.\n\n{markdown_table(rows, columns)}"
+    heading = f"## {result.recording.path}{simulated}"
+    return f"{heading}\n\n{extent(result)}.\n\n{markdown_table(rows, columns)}"
 
 
 def extent(result: OpenLoop) -> str:
-    """Return the number of scans, their duration, the share with both boundaries valid, and remarks on the file."""
-    scans, seconds = len(result.both_valid), result.recording.seconds[-1]
-    text = f"{scans} scans in {seconds:.1f} s; both boundaries valid in {result.both_valid.mean():.0%} of them"
+    """Return what a recording holds.
+
+    These are the number of scans, their duration, the share of them with both boundaries valid, and
+    remarks on the file.
+    """
+    text = (
+        f"{len(result.both_valid)} scans in {result.recording.seconds[-1]:.1f} s; "
+        f"both boundaries valid in {result.both_valid.mean():.0%} of them"
+    )
     return "; the file ".join([text, *result.recording.remarks])
 
 
 def caution(result: OpenLoop, perception: object) -> str:
-    """Return a sentence if no scan shows both boundaries or most clusters in sight are no cones, else nothing."""
+    """Return a warning if the perception hardly fits the recording, else an empty text.
+
+    It does not if no scan shows both boundaries, or if most clusters in sight are no cones.
+
+    Args:
+        result: of the recording.
+        perception: of the env; only a `Perception` is asked for the clusters.
+    """
     problems, recording = [], result.recording
     if not result.both_valid.any():
         problems.append("no scan shows both boundaries")
@@ -61,8 +78,11 @@ def caution(result: OpenLoop, perception: object) -> str:
             )
     if not problems:
         return ""
-    remedy = "check env.perception, or train the classifier on your own cones with coil-reproduce figure=25"
-    return f"{recording.path}: {' and '.join(problems)}, so the actions mean little; {remedy}"
+    return (
+        f"{recording.path}: {' and '.join(problems)}, so the actions mean little; "
+        "check env.perception, or train the classifier on your own cones "
+        "with coil-reproduce figure=25"
+    )
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:
@@ -83,7 +103,11 @@ def outcome(result: OpenLoop) -> str:
 
 
 def over_time(result: OpenLoop) -> list[dict[str, Any]]:
-    """Return a row per scan: time (s), whether both boundaries are valid, actions and omegas (radians/s)."""
+    """Return a row per scan.
+
+    Its columns are the time (s), whether both boundaries are valid, and the actions and omegas
+    (radians/s) of all policies.
+    """
     columns: dict[str, Any] = {
         "time": result.recording.seconds,
         "valid": result.both_valid.astype(int),
@@ -96,14 +120,22 @@ def over_time(result: OpenLoop) -> list[dict[str, Any]]:
 def draw_steering(
     result: OpenLoop, path: str | os.PathLike[str], *, title: str | None = None
 ) -> None:
-    """Draw steering and omega of each policy over time; recorded commands are dashed, scans not valid are grey."""
+    """Draw steering and omega of each policy over time.
+
+    Recorded commands are dashed. Scans without both boundaries are grey.
+
+    Args:
+        result: of the recording.
+        path: of the picture.
+        title: above the picture.
+    """
     seconds, invalid = result.recording.seconds, ~result.both_valid
     strokes = style.strong_strokes(result.policies)
     if RECORDED in result.steering:
         strokes[RECORDED] = style.Stroke(style.GUIDES[0], style.DASHED)
-    lines = {
-        name: {"color": stroke.colour, "ls": stroke.linestyle} for name, stroke in strokes.items()
-    }
+    lines: dict[str, dict[str, Any]] = {}
+    for name, stroke in strokes.items():
+        lines[name] = {"color": stroke.colour, "ls": stroke.linestyle}
     handles: list[Artist] = [
         Line2D([], [], lw=1.6, label=name, **line) for name, line in lines.items()
     ]
@@ -119,20 +151,19 @@ def draw_steering(
             axes.spines[["top", "right"]].set_visible(False)
             axes.axhline(0, color=style.KERB, lw=0.7)
             axes.margins(x=0.01)
-            background = {
-                "step": "mid",
-                "transform": axes.get_xaxis_transform(),
-                "color": style.ASPHALT,
-                "lw": 0,
-            }
-            axes.fill_between(seconds, 0, 1, where=invalid, **background)
+            axes.fill_between(
+                seconds,
+                0,
+                1,
+                where=invalid,
+                step="mid",
+                transform=axes.get_xaxis_transform(),
+                color=style.ASPHALT,
+                lw=0,
+            )
             axes.set_axisbelow(True)
         for name, line in lines.items():
-            steering_axes.plot(
-                seconds,
-                np.degrees(result.steering[name].action * result.max_steering),
-                lw=1.1,
-                **line,
-            )
+            degrees = np.degrees(result.steering[name].action * result.max_steering)
+            steering_axes.plot(seconds, degrees, lw=1.1, **line)
             omega_axes.plot(seconds, result.steering[name].omega, lw=1.1, **line)
         omega_axes.set_xlabel("time (s)")

@@ -1,10 +1,11 @@
-"""Comparison of drivers over seeds: agents grouped by label, and their guides."""
+"""Comparison of policies over seeds: agents grouped by label, and their guides."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -20,24 +21,29 @@ LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
 @dataclass(frozen=True, eq=False)
 class Group:
-    """Evaluations of one driver over seeds."""
+    """Evaluations of one policy over seeds.
 
-    # The label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if several
-    # guides share it.
+    Attributes:
+        name: the label of an agent, "guide" or "guide NAME" for a guide; the labels are appended if
+            several guides share it.
+        advice: modification of the advice; empty for none.
+        table: indexed by (seed, case); for a guide the seeds number its different evaluations.
+        is_guide: whether the policy is a guide alone.
+        guide: the best guide of an agent; None for none.
+        needs_guide: whether the policy needs its guide during evaluation; None if that does not
+            apply.
+        measures: definitions of the measures in the table by name.
+        reference: [cases], rewards that scores are divided by; None if scores are rewards.
+    """
+
     name: str
-    advice: str  # modification of the advice; empty for none
-    table: (
-        pd.DataFrame
-    )  # indexed by (seed, case); for a guide the seeds number its different evaluations
+    advice: str
+    table: pd.DataFrame
     is_guide: bool = False
-    guide: Group | None = None  # the best one of an agent
-    needs_guide: bool | None = None  # during evaluation; None if that does not apply
-    measures: Mapping[str, Measure] = field(
-        default_factory=dict, repr=False
-    )  # definitions of those in the table
-    reference: Array | None = (
-        None  # rewards that scores are divided by, [cases]; None: scores are rewards
-    )
+    guide: Group | None = None
+    needs_guide: bool | None = None
+    measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
+    reference: Array | None = None
 
     @property
     def title(self) -> str:
@@ -61,7 +67,11 @@ class Group:
         return self.by_seed("score").to_numpy()
 
     def by_seed(self, measure: str) -> pd.DataFrame:
-        """Return the reward, a measure, or "score", with seeds as rows and cases as columns."""
+        """Return a measure with seeds as rows and cases as columns.
+
+        Args:
+            measure: name of the measure, "reward", or "score".
+        """
         index, score = self.table.index.unique("seed"), measure == "score"
         values = self.table["reward" if score else measure].to_numpy().reshape(len(index), -1)
         if score and self.reference is not None:
@@ -81,7 +91,11 @@ class Group:
 
     @property
     def crashes(self) -> str | None:
-        """Number of seeds that crashed in any case, with the interval of its share; cases for a single guide."""
+        """Number of seeds that crashed in any case, with the interval of its share.
+
+        For a guide with a single evaluation it is the number of cases. It is None if crashes are
+        not measured.
+        """
         if not self.has("crashed"):
             return None
         crashed = self.by_seed("crashed")
@@ -94,24 +108,36 @@ class Group:
         return measure in self.table and not self.table[measure].isna().to_numpy().any()
 
     def means(self, case: int | None = None) -> dict[str, float]:
-        """Return reward and measures over seeds and cases, or one case: means, of minima the smallest."""
+        """Return reward and measures over seeds and cases: means, of minima the smallest.
+
+        Args:
+            case: index of the only case to count; None for all of them.
+        """
         rows = self.table if case is None else self.table.xs(self.cases[case], level="case")
         means = {"reward": float(rows["reward"].mean())}
-        return means | {
-            name: each.pool(rows[name].tolist())
-            for name, each in self.measures.items()
-            if name in rows
-        }
+        for name, each in self.measures.items():
+            if name in rows:
+                means[name] = each.pool(rows[name].tolist())
+        return means
 
     def parts(self, prefix: str) -> dict[str, float]:
-        """Return the mean of each column with a prefix, PER_STEP or TERM, over the seeds and cases that have it."""
+        """Return the mean of each column with a prefix, over the seeds and cases that have it.
+
+        Args:
+            prefix: PER_STEP or TERM.
+        """
         columns = [column for column in self.table if column.startswith(prefix)]
         return {column: float(self.table[column].mean()) for column in columns}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Guides, best first, and agents, best first, each followed by its variants with altered advice."""
+    """The compared policies.
+
+    Attributes:
+        guides: the guides, best first.
+        agents: the agents, best first, each followed by its variants with altered advice.
+    """
 
     guides: tuple[Group, ...]
     agents: tuple[Group, ...]
@@ -132,10 +158,14 @@ class Comparison:
         return ("reward / guide's", ".3f") if self.normalised else ("reward", ".1f")
 
     def table(self, against: str | None = None) -> list[dict[str, Any]]:
-        """Return one row per driver, guides first.
+        """Return one row per policy, guides first.
 
-        `difference` is the score of an agent minus that of the agent with the label `against`, or
-        of its guide if `against` is "guide", with the same seed; `p` is corrected for all rows.
+        `difference` is the score of an agent minus that of another policy with the same seed; `p`
+        is corrected for all rows.
+
+        Args:
+            against: label of the agent to compare with; "guide" for the guide of each agent; None
+                for no comparison.
         """
         rows: list[dict[str, Any]] = []
         for group in self.groups:
@@ -166,80 +196,108 @@ class Comparison:
         return rows
 
     def case_table(self) -> list[dict[str, Any]]:
-        """Return one row per driver and case."""
-        return [
-            {"driver": group.name, "advice": group.advice, "seeds": group.seeds, "case": case}
-            | group.means(index)
-            for group in self.groups
-            for index, case in enumerate(group.cases)
-        ]
+        """Return one row per policy and case."""
+        rows = []
+        for group in self.groups:
+            about = {"driver": group.name, "advice": group.advice, "seeds": group.seeds}
+            for index, case in enumerate(group.cases):
+                rows.append(about | {"case": case} | group.means(index))
+        return rows
 
     def _pairs(self, group: Group, against: str | None) -> Paired | None:
-        agents = {agent.name: agent for agent in self.agents if not agent.advice}
-        other = group.guide if against == GUIDE else agents.get(against or "")
-        return None if other is None or other is group or group.is_guide else paired(group, other)
+        """Return the comparison of a policy with `against`; None if they cannot be compared."""
+        if against == GUIDE:
+            other = group.guide
+        else:
+            agents = {agent.name: agent for agent in self.agents if not agent.advice}
+            other = agents.get(against or "")
+        if other is None or other is group or group.is_guide:
+            return None
+        return paired(group, other)
 
 
 def compare(runs: Sequence[Run], actions: str = "deterministic") -> Comparison:
-    """Group the finished runs, at least one, by label; `actions` of the agents are "deterministic" or "sampled".
+    """Group the finished runs by label.
 
-    Two runs with the same label and seed, or with the same label and other cases, are a
-    `UserError`.
+    Args:
+        runs: of which at least one is finished.
+        actions: of the agents, "deterministic" or "sampled".
+
+    Raises:
+        UserError: if two runs have the same label and seed, or the same label and other cases.
     """
     finished = [run for run in runs if run.finished]
     names = dict.fromkeys(run.label for run in finished)
     labels = {label: _join_runs([run for run in finished if run.label == label]) for label in names}
-    is_guide = {
-        label: frame["driver"].str.split().str[0] == GUIDE for label, frame in labels.items()
-    }
-    measures = {
-        name: measure for run in reversed(finished) for name, measure in run.measures.items()
-    }
-    guides = _group_guides(
-        {label: frame[is_guide[label]] for label, frame in labels.items()}, measures
-    )
-    references = _references(
-        [group for of_label in guides.values() for group in of_label], finished
-    )
-    unique = dict.fromkeys(group for of_label in guides.values() for group in of_label)
+    measures = _definitions(finished)
+    guides = _group_guides(labels, measures)
+    unique = dict.fromkeys(chain.from_iterable(guides.values()))
+    references = _references(list(unique), finished)
     normalised = {group: replace(group, reference=references.get(group.cases)) for group in unique}
-    guides = {
-        label: [normalised[group] for group in of_label] for label, of_label in guides.items()
-    }
     needs_guide = {run.label: run.needs_guide for run in reversed(finished)}
     agents: list[Group] = []
     for label, frame in labels.items():
-        rows = frame[~is_guide[label] & (frame["actions"] == actions)]
-        guide = next(iter(guides.get(label, ())), None)
-        variants = [
-            Group(
-                label,
-                advice,
-                _index(label, variant),
-                False,
-                guide,
-                None if advice else needs_guide[label],
-                measures,
-            )
-            for advice, variant in rows.groupby("advice", sort=False)
-        ]
-        variants = [
-            replace(variant, reference=references.get(variant.cases)) for variant in variants
-        ]
+        rows = frame[~_is_guide(frame) & (frame["actions"] == actions)]
+        best_guide = normalised[guides[label][0]] if label in guides else None
+        variants = _variants(label, rows, references, measures, best_guide, needs_guide[label])
         agents += sorted(variants, key=lambda group: (group.advice != "", group.rank))
-    best = {
-        group.name: group.rank for group in reversed(agents)
-    }  # the first group of a label: unaltered advice
+    # The first group of a label is the one with unaltered advice.
+    best = {group.name: group.rank for group in reversed(agents)}
     agents.sort(key=lambda group: (best[group.name], group.name))
-    return Comparison(
-        tuple(sorted(normalised.values(), key=lambda group: group.rank)), tuple(agents)
-    )
+    ranked = sorted(normalised.values(), key=lambda group: group.rank)
+    return Comparison(tuple(ranked), tuple(agents))
+
+
+def _definitions(runs: Sequence[Run]) -> dict[str, Measure]:
+    """Return the measures of all runs by name, as the first run defines each of them."""
+    measures: dict[str, Measure] = {}
+    for run in reversed(runs):
+        measures |= run.measures
+    return measures
+
+
+def _is_guide(frame: pd.DataFrame) -> pd.Series:
+    """Return whether the policy of each row of an evaluation is a guide."""
+    return frame["driver"].str.split().str[0] == GUIDE
+
+
+def _variants(
+    label: str,
+    rows: pd.DataFrame,
+    references: Mapping[tuple[str, ...], Array],
+    measures: Mapping[str, Measure],
+    guide: Group | None,
+    needs_guide: bool | None,
+) -> list[Group]:
+    """Return the agent of a label, and the same agent with each alteration of its advice.
+
+    Args:
+        label: of the agent.
+        rows: its evaluations.
+        references: the rewards that scores are divided by, by cases.
+        measures: definitions by name.
+        guide: its best guide.
+        needs_guide: whether it needs the guide during evaluation.
+    """
+    variants = []
+    for advice, own in rows.groupby("advice", sort=False):
+        variant = Group(
+            label,
+            advice,
+            _index(label, own),
+            guide=guide,
+            needs_guide=None if advice else needs_guide,
+            measures=measures,
+        )
+        variants.append(replace(variant, reference=references.get(variant.cases)))
+    return variants
 
 
 def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str, ...], Array]:
-    """Return by cases the rewards of the best guide; where it crashes or earns nothing, its mean over the others.
+    """Return by cases the rewards of the best guide in each case.
 
-    The result is empty if a run drove cases in which no guide earns anything: scores of all runs
+    In a case where it crashes or earns nothing, its mean over the other cases is taken. The result
+    is empty if a run was evaluated in cases in which no guide earns anything: scores of all runs
     are to be alike.
     """
     references: dict[tuple[str, ...], Array] = {}
@@ -249,14 +307,12 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
         if guide.has("crashed"):
             earned = earned[~(guide.by_seed("crashed") > 0).any()]
         if len(earned):
-            references.setdefault(
-                guide.cases, rewards.where(rewards.index.isin(earned.index), earned.mean()).values
-            )
-    return (
-        references
-        if all(tuple(run.evaluation["case"].unique()) in references for run in runs)
-        else {}
-    )
+            filled = rewards.where(rewards.index.isin(earned.index), earned.mean())
+            references.setdefault(guide.cases, filled.values)
+    for run in runs:
+        if tuple(run.evaluation["case"].unique()) not in references:
+            return {}
+    return references
 
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
@@ -264,86 +320,139 @@ def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
     first: dict[int, Run] = {}
     for run in runs:
         if run.seed in first:
-            problem = (
-                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of {run.label}"
+            raise UserError(
+                f"{first[run.seed].folder} and {run.folder} are both seed {run.seed} of "
+                f"{run.label}; remove one from the folder, or give different runs their own labels "
+                "(coil-train label=TEXT)"
             )
-            remedy = "remove one from the folder, or give different runs their own labels (coil-train label=TEXT)"
-            raise UserError(f"{problem}; {remedy}")
         first[run.seed] = run
     return pd.concat([run.evaluation.assign(seed=run.seed) for run in runs])
 
 
 def _index(name: str, rows: pd.DataFrame) -> pd.DataFrame:
-    """Index the evaluations of one driver by seed and case."""
+    """Index the evaluations of one policy by seed and case."""
     cases = rows.groupby("seed")["case"].agg(tuple).unique()
     if len(cases) > 1:
-        different = f"{', '.join(cases[0])}, and {', '.join(cases[1])}"
-        remedy = (
-            "evaluate them on the same ones, or give them their own labels (coil-train label=TEXT)"
+        raise UserError(
+            f"runs of {name} were evaluated in different cases "
+            f"({', '.join(cases[0])}, and {', '.join(cases[1])}); evaluate them on the same ones, "
+            "or give them their own labels (coil-train label=TEXT)"
         )
-        raise UserError(f"runs of {name} were evaluated in different cases ({different}); {remedy}")
     return rows.set_index(["seed", "case"]).drop(columns=list(DRIVER), errors="ignore")
 
 
+@dataclass(frozen=True, eq=False)
+class _Guide:
+    """A guide that some labels share.
+
+    Attributes:
+        name: "guide", or "guide NAME".
+        labels: which share the guide.
+        results: the different evaluations of the guide, by their cases and rewards.
+    """
+
+    name: str
+    labels: list[str]
+    results: dict[Any, pd.DataFrame]
+
+    def add(self, label: str, results: Mapping[Any, pd.DataFrame]) -> None:
+        """Let another label share the guide."""
+        self.labels.append(label)
+        self.results.update(results)
+
+    def listed(self) -> str:
+        """Return the labels as a text, the first ones of many."""
+        more = len(self.labels) - LABELS_IN_NAME
+        if more <= 1:
+            return ", ".join(self.labels)
+        return f"{', '.join(self.labels[:LABELS_IN_NAME])} and {more} more"
+
+    def table(self) -> pd.DataFrame:
+        """Return all different evaluations, numbered by the column of the seed."""
+        numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results.values())]
+        return _index(f"the guide of {self.labels[0]}", pd.concat(numbered))
+
+
 def _group_guides(
-    labels: dict[str, pd.DataFrame], measures: Mapping[str, Measure]
+    labels: Mapping[str, pd.DataFrame], measures: Mapping[str, Measure]
 ) -> dict[str, list[Group]]:
     """Return the guides of each label, best first.
 
-    Every run evaluates its guides: equal results of one guide count once, and labels share a guide
-    if the results of one contain those of the other. A guide with random actions has one result per
-    seed.
+    Args:
+        labels: the evaluations by label.
+        measures: definitions by name.
     """
-    guides: list[
-        tuple[str, list[str], dict[Any, pd.DataFrame]]
-    ] = []  # name, labels and different results
-    for label, frame in labels.items():
-        for name, rows in frame.groupby("driver", sort=False):
-            seeds = [seed_rows for _, seed_rows in rows.groupby("seed", sort=False)]
-            results = {
-                (*seed_rows["case"], *seed_rows["reward"].round(3)): seed_rows
-                for seed_rows in seeds
-            }
-            for other, other_labels, other_results in guides:
-                fewer, more = sorted((results.keys(), other_results.keys()), key=len)
-                if other == name and fewer <= more:
-                    other_labels.append(label)
-                    other_results.update(results)
-                    break
-            else:
-                guides.append((name, [label], results))
-    names = [name for name, _, _ in guides]
+    guides = _shared_guides(labels)
+    names = [guide.name for guide in guides]
     groups: dict[str, list[Group]] = {}
-    for name, shared_by, results in guides:
-        listed = ", ".join(shared_by)
-        if len(shared_by) > LABELS_IN_NAME + 1:
-            listed = f"{', '.join(shared_by[:LABELS_IN_NAME])} and {len(shared_by) - LABELS_IN_NAME} more"
-        table = pd.concat(
-            [rows.assign(seed=number) for number, rows in enumerate(results.values())]
-        )
-        table = _index(f"the guide of {shared_by[0]}", table)
-        unique = name if names.count(name) == 1 else f"{name} ({listed})"
-        group = Group(unique, "", table, is_guide=True, measures=measures)
-        for label in shared_by:
+    for guide in guides:
+        is_unique = names.count(guide.name) == 1
+        name = guide.name if is_unique else f"{guide.name} ({guide.listed()})"
+        group = Group(name, "", guide.table(), is_guide=True, measures=measures)
+        for label in guide.labels:
             groups.setdefault(label, []).append(group)
     return {
         label: sorted(of_label, key=lambda group: group.rank) for label, of_label in groups.items()
     }
 
 
+def _shared_guides(labels: Mapping[str, pd.DataFrame]) -> list[_Guide]:
+    """Return the different guides of all labels.
+
+    Every run evaluates its guides: equal results of one guide count once, and labels share a guide
+    if the results of one contain those of the other. A guide with random actions has one result per
+    seed.
+    """
+    guides: list[_Guide] = []
+    for label, frame in labels.items():
+        for name, rows in frame[_is_guide(frame)].groupby("driver", sort=False):
+            results = {}
+            for _, of_seed in rows.groupby("seed", sort=False):
+                results[(*of_seed["case"], *of_seed["reward"].round(3))] = of_seed
+            same = _same_guide(guides, name, results)
+            if same is None:
+                guides.append(_Guide(name, [label], results))
+            else:
+                same.add(label, results)
+    return guides
+
+
+def _same_guide(
+    guides: Sequence[_Guide], name: str, results: Mapping[Any, pd.DataFrame]
+) -> _Guide | None:
+    """Return the first guide with a name whose results contain the given ones, or the reverse."""
+    for guide in guides:
+        ours, theirs = results.keys(), guide.results.keys()
+        if guide.name == name and (ours <= theirs or theirs <= ours):
+            return guide
+    return None
+
+
 @dataclass(frozen=True)
 class Paired:
-    """Difference between two drivers with the same seeds."""
+    """Difference between two policies with the same seeds.
 
-    difference: Estimate  # of a measure, mean over cases
-    better: float  # share of seeds and cases with a higher value, ties counting half
+    Attributes:
+        difference: of a measure, mean over cases.
+        better: share of seeds and cases with a higher value, ties counting half.
+    """
+
+    difference: Estimate
+    better: float
 
 
 def paired(group: Group, other: Group, measure: str = "score") -> Paired | None:
-    """Compare two drivers seed by seed by the score or by a measure; a single guide has one value for all seeds.
+    """Compare two policies seed by seed.
 
-    A case counts for a seed if both have a number there, as lap times where both completed one. The
-    result is None without common cases and seeds, or if a seed has no such case.
+    A case counts for a seed if both have a number there, as lap times where both completed one.
+
+    Args:
+        group: the first policy.
+        other: the second policy; a guide with a single evaluation has one value for all seeds.
+        measure: name of the measure to compare, "reward", or "score".
+
+    Returns:
+        None without common cases and seeds, or if a seed has no such case.
     """
     if group.cases != other.cases or (other.is_guide and other.seeds is not None):
         return None

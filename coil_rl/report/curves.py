@@ -1,4 +1,7 @@
-"""Evaluation curves: in one plot or in a grid, in numbers, and with the training phases of one run."""
+"""Evaluation curves: drawn in one plot or in a grid, and in numbers.
+
+For a run of Dynamic COIL they are drawn with the phases of the training.
+"""
 
 import math
 import os
@@ -51,10 +54,8 @@ def draw_learning_curves(
     strokes = style.strong_strokes(runs)
     handles: list[Artist] = []
     for label, stroke in strokes.items():
-        seeds = f" ({len(runs[label])} runs)" if len(runs[label]) > 1 else ""
-        handles.append(
-            Line2D([], [], color=stroke.colour, ls=stroke.linestyle, lw=2, label=label + seeds)
-        )
+        line = {"color": stroke.colour, "ls": stroke.linestyle}
+        handles.append(Line2D([], [], lw=2, label=_with_count(label, runs[label]), **line))
     if any(len(seeds) > 1 for seeds in runs.values()):
         handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
     with style.picture(path, title, handles, 4.2) as figure:
@@ -68,6 +69,7 @@ def draw_learning_curves(
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
         _draw_anchors(axes, runs, strokes)
+        # Their names are beside the plot, where no curve is.
         for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
             axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
             axes.annotate(
@@ -81,10 +83,18 @@ def draw_learning_curves(
             )
 
 
+def _with_count(label: str, runs: Sequence[Rows]) -> str:
+    """Return a label with the number of its runs if there are several."""
+    return f"{label} ({len(runs)} runs)" if len(runs) > 1 else label
+
+
 def _draw_anchors(
     axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]
 ) -> None:
-    """Draw the weights of guides on an axis inside the plot, and a cross where the brake restored an earlier policy."""
+    """Draw the weights of guides on an axis inside the plot.
+
+    A cross marks where the brake restored an earlier policy.
+    """
     if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
         return
     weights = axes.twinx()
@@ -113,9 +123,12 @@ def draw_curve_grid(
     *,
     guides: Mapping[str, float] | None = None,
 ) -> None:
-    """Draw one small learning curve per label, at least one, with the other labels faint behind it.
+    """Draw one small learning curve per label, with the other labels faint behind it.
 
-    `runs` are as in `draw_learning_curves`; `guides` are the mean returns of the guides by label.
+    Args:
+        runs: by label, at least one, the runs as in `draw_learning_curves`.
+        path: output file.
+        guides: mean return of the guide of each label, drawn as a dashed line.
     """
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
     columns, colour = min(GRID_COLUMNS, len(runs)), style.AGENTS[0]
@@ -124,10 +137,10 @@ def draw_curve_grid(
     handles: list[Artist] = [Line2D([], [], color=colour, lw=1.5, label="mean of the runs")]
     handles.append(Patch(color=colour, alpha=0.25, lw=0, label="95 % interval of the mean"))
     handles.append(Line2D([], [], color=style.KERB, lw=0.6, label="the others"))
-    handles += [Line2D([], [], label="its guide", **guide_line)] if guides else []
-    with style.picture(
-        path, None, handles, 0.35 + GRID_ROW_HEIGHT * rows, add_header=True, h_pad=0.08
-    ) as figure:
+    if guides:
+        handles.append(Line2D([], [], label="its guide", **guide_line))
+    height = 0.35 + GRID_ROW_HEIGHT * rows
+    with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
         for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
             for other_frames, other_mean, *_ in curves.values():  # its own is drawn over
@@ -136,11 +149,7 @@ def draw_curve_grid(
             axes.plot(frames, mean, color=colour, lw=1.5, zorder=2.2)
             if guides and label in guides:
                 axes.axhline(guides[label], **guide_line)
-            axes.set_title(
-                f"{label} ({len(runs[label])} runs)" if len(runs[label]) > 1 else label,
-                size=9,
-                loc="left",
-            )
+            axes.set_title(_with_count(label, runs[label]), size=9, loc="left")
             axes.spines[["top", "right"]].set_visible(False)
             axes.set_xlim(left=0)
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
@@ -160,63 +169,82 @@ def draw_phases(
 ) -> None:
     """Draw one run of Dynamic COIL: returns, change of each guide's action, and learning rates.
 
-    The background has the colour of the guide that is trained. `rows` are those of `metrics.csv`,
-    at least one, and `guides` the names in the order of the run.
+    The background has the colour of the guide that is trained.
+
+    Args:
+        rows: of `metrics.csv`, at least one.
+        guides: names of the guides in the order of the run.
+        path: output file.
+        title: above the plot.
     """
-    colours = {name: style.AGENTS[index % len(style.AGENTS)] for index, name in enumerate(guides)}
-    updates = [
-        row for row in rows if not math.isnan(row["learner/guide"])
-    ]  # without the state before the first one
-    frames = _column(updates, "frames")
+    colours = [style.AGENTS[index % len(style.AGENTS)] for index in range(len(guides))]
+    # Without the row of the state before the first update.
+    updates = [row for row in rows if not math.isnan(row["learner/guide"])]
     handles: list[Artist] = [Line2D([], [], color=AGENT, lw=1.6, label="agent")]
     alone: dict[str, Any] = {"ls": style.DASHED, "lw": 1.1, "marker": "o", "ms": 4}
-    handles += [
-        Line2D([], [], color=colour, label=f"{name} alone", **alone)
-        for name, colour in colours.items()
-    ]
+    for name, colour in zip(guides, colours, strict=True):
+        handles.append(Line2D([], [], color=colour, label=f"{name} alone", **alone))
     handles.append(Patch(color=style.QUIET, alpha=0.25, lw=0, label="a guide learns (its colour)"))
     with style.picture(path, title, handles, 6.8, h_pad=0.08) as figure:
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(2.4, 1, 1))
         top.plot(*points(rows, RETURN).T, color=AGENT, lw=1.6, marker="o", ms=3)
-        for name, colour in colours.items():
+        frames = _column(updates, "frames")
+        for name, colour in zip(guides, colours, strict=True):
             top.plot(*points(rows, f"guide/{name}").T, color=colour, **alone)
             middle.plot(frames, _column(updates, f"learner/moved_{name}"), color=colour, lw=1.4)
-        learner = _column(
-            updates, "learner/guide"
-        )  # index of the guide that learns; their number for all of them
-        guide_rate = _column(updates, "learner/guide_learning_rate")
-        rates = {AGENT: _column(updates, "learner/learning_rate")}
-        for index, colour in enumerate(colours.values()):
-            rates[colour] = np.where(
-                (learner == index) | (learner == len(colours)), guide_rate, np.nan
-            )
-        edges = np.concatenate([[0.0], frames])
-        for colour, values in rates.items():
-            bottom.stairs(
-                np.where(values > 0, values, np.nan), edges, color=colour, lw=1.6, baseline=None
-            )
-        bottom.set_yscale("log")
-        bottom.yaxis.set_major_formatter("{x:g}")
-        for axes, label in {
-            top: "return",
-            middle: "moved (action)",
-            bottom: "learning rate",
-        }.items():
+        _draw_learning_rates(bottom, updates, colours)
+        labels = {top: "return", middle: "moved (action)", bottom: "learning rate"}
+        for axes, label in labels.items():
             style.lighten(axes)
             axes.set(ylabel=label, xmargin=0, xlim=(0, None))
-            for start, end, index in zip(edges, frames, learner.astype(int), strict=False):
-                if 0 <= index < len(colours):
-                    axes.axvspan(start, end, color=list(colours.values())[index], alpha=0.12, lw=0)
+            _mark_phases(axes, updates, colours)
         middle.set_ylim(bottom=0)
         bottom.set_xlabel("frames")
         bottom.xaxis.set_major_formatter(EngFormatter(sep=""))
 
 
-def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
-    """Return the mean curve of several runs, each part [P]; P = 0 without data.
+def _draw_learning_rates(
+    axes: Axes, updates: Sequence[Mapping[str, float]], colours: Sequence[str]
+) -> None:
+    """Draw the learning rates of the agent and of the guides, which have the given colours."""
+    # Index of the guide that learns; their number if all of them do.
+    learner = _column(updates, "learner/guide")
+    guide_rate = _column(updates, "learner/guide_learning_rate")
+    rates = {AGENT: _column(updates, "learner/learning_rate")}
+    for index, colour in enumerate(colours):
+        learns = (learner == index) | (learner == len(colours))
+        rates[colour] = np.where(learns, guide_rate, np.nan)
+    edges = np.concatenate([[0.0], _column(updates, "frames")])
+    for colour, values in rates.items():
+        # A logarithmic axis cannot show 0.
+        visible = np.where(values > 0, values, np.nan)
+        axes.stairs(visible, edges, color=colour, lw=1.6, baseline=None)
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter("{x:g}")
 
-    These are the frames, the mean over the runs, and the low and the high end of its 95 % t
-    interval.
+
+def _mark_phases(
+    axes: Axes, updates: Sequence[Mapping[str, float]], colours: Sequence[str]
+) -> None:
+    """Give the background the colour of the guide that learns; none if it is not exactly one."""
+    frames = _column(updates, "frames")
+    learner = _column(updates, "learner/guide").astype(int)
+    starts = np.concatenate([[0.0], frames])
+    for start, end, index in zip(starts, frames, learner, strict=False):
+        if 0 <= index < len(colours):
+            axes.axvspan(start, end, color=colours[index], alpha=0.12, lw=0)
+
+
+def mean_curve(runs: Sequence[Rows], key: str) -> tuple[Array, Array, Array, Array]:
+    """Return the mean curve of several runs.
+
+    Args:
+        runs: one run per seed, see `draw_learning_curves`.
+        key: column of the values.
+
+    Returns:
+        The frames, the mean over the runs, and the low and the high end of its 95 % t interval, [P]
+        each; P = 0 without data. A single run has no interval: both ends are its values.
     """
     curves = [curve for curve in (points(run, key) for run in runs) if len(curve)]
     if not curves:
@@ -262,7 +290,10 @@ def learning(run: Run) -> dict[str, float]:
 def frames_until(
     frames: Sequence[float] | Array, returns: Sequence[float] | Array, level: float
 ) -> float:
-    """Return the frames at which a curve first reaches a level, by linear interpolation; NaN if it never does."""
+    """Return the frames at which a curve first reaches a level; NaN if it never does.
+
+    Between two points of the curve, [P] each, the frames are interpolated linearly.
+    """
     reached = np.flatnonzero(np.asarray(returns) >= level)
     if not len(reached):
         return math.nan

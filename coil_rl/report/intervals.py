@@ -1,4 +1,4 @@
-"""Interval plot: the score of each driver with its confidence interval, one row per driver."""
+"""Interval plot: the score of each policy with its confidence interval, one row per policy."""
 
 from __future__ import annotations
 
@@ -48,21 +48,32 @@ GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.3
 
 @dataclass(frozen=True)
 class Interval:
-    """One row of the plot."""
+    """One row of the plot.
+
+    Args:
+        label: name of the row.
+        value: the dot.
+        low: the left end of the bar; NaN for no bar.
+        high: the right end of the bar; NaN for no bar.
+        points: small dots, the values of single seeds.
+        guide: value of the policy's guide, a dashed line; None for none.
+        hollow: whether the dot is hollow, as for a variant of the policy above.
+    """
 
     label: str
-    value: float  # the dot
-    low: float = math.nan  # ends of the bar; NaN for no bar
+    value: float
+    low: float = math.nan
     high: float = math.nan
-    points: Sequence[float] = ()  # single seeds
-    guide: float | None = None  # value of the driver's guide, a dashed line
-    hollow: bool = False  # hollow dot, for a variant of the driver above
+    points: Sequence[float] = ()
+    guide: float | None = None
+    hollow: bool = False
 
 
 def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
-    """Return a row for the score of each driver, with its single seeds and its guide."""
-    return [
-        Interval(
+    """Return a row for the score of each policy, with its single seeds and its guide."""
+    rows = []
+    for group in groups:
+        row = Interval(
             group.title,
             group.score.mean,
             group.score.low,
@@ -71,8 +82,8 @@ def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
             guide=group.guide.score.mean if group.guide else None,
             hollow=bool(group.advice),
         )
-        for group in groups
-    ]
+        rows.append(row)
+    return rows
 
 
 def draw_intervals(
@@ -82,8 +93,15 @@ def draw_intervals(
     measure: str,
     title: str | None = None,
 ) -> None:
-    """Draw one panel, or several side by side that share their rows; `panels` are at least one row by heading."""
-    rows = [row for panel in panels.values() for row in panel]
+    """Draw one panel, or several side by side that share their rows.
+
+    Args:
+        panels: by heading, the rows of each panel; at least one row in all.
+        path: output file.
+        measure: label of the axis.
+        title: above the plot.
+    """
+    rows = list(itertools.chain.from_iterable(panels.values()))
     labels = list(dict.fromkeys(row.label for row in rows))
     legend = {
         "all seeds": (DOT, True),
@@ -95,9 +113,8 @@ def draw_intervals(
     handles = [
         Line2D([], [], label=label, **stroke) for label, (stroke, used) in legend.items() if used
     ]
-    with style.picture(
-        path, title, handles, 0.62 + 0.27 * len(labels), add_header=True, h_pad=0.08
-    ) as figure:
+    height = 0.62 + 0.27 * len(labels)
+    with style.picture(path, title, handles, height, add_header=True, h_pad=0.08) as figure:
         axes_row = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
         for axes, (heading, panel) in zip(axes_row, panels.items(), strict=True):
             axes.set_xlabel(measure)

@@ -1,7 +1,12 @@
-"""Markdown page of `coil-report`: tables of drivers, cases, parts of the reward and training, and how to read them."""
+"""Markdown page of `coil-report`.
+
+It has tables of the policies, of the cases, of the parts of the reward and of the training, and
+says how to read them.
+"""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from statistics import mean
 from typing import Any
 
@@ -18,93 +23,139 @@ GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
 def section(
     heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
 ) -> str:
-    """Return the section for one kind of actions; `rows` are `comparison.table(against)`."""
-    score, spec = comparison.score
-    names = {"other": _other(against), "score": score}
-    hidden = {"advice"} if not any(row["advice"] for row in rows) else set()
-    hidden |= {"difference cell", "p", "better"} if against is None else set()
-    hidden |= set() if comparison.normalised else {"reward"}
-    hidden |= {key for key in ("completed", "crashes") if all(row[key] is None for row in rows)}
-    measures = {name: each for group in comparison.groups for name, each in group.measures.items()}
-    columns = {
-        key: (text.format(**names), spec)
-        for key, (text, spec) in TABLES["drivers"]["columns"].items()
-        if key not in hidden
-    }
-    columns |= {
-        name: (measure.title, measure.format)
-        for name, measure in measures.items()
-        if measure.title and name not in ("completed", "crashed") and not name.startswith(PER_STEP)
-    }
-    columns["needs_guide"] = ("guide at test time", "")
-    table = markdown_table(with_cells(rows, spec), columns)
+    """Return the section for one kind of actions.
+
+    Args:
+        heading: of the section.
+        comparison: of the policies.
+        rows: `comparison.table(against)`.
+        against: what the policies are compared with, see `Comparison.table`.
+    """
+    table = markdown_table(
+        with_cells(rows, comparison.score[1]), _columns(comparison, rows, against)
+    )
     parts = _parts(comparison, TERM, "term of the reward", ".1f")
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
-    return "\n\n".join(
-        [f"## {heading}", table, *parts, cases_table(comparison.groups, "report_cases.csv")]
-    )
+    cases = cases_table(comparison.groups, "report_cases.csv")
+    return "\n\n".join([f"## {heading}", table, *parts, cases])
+
+
+def _columns(
+    comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
+) -> dict[str, tuple[str, str]]:
+    """Return heading and format of the columns of the table of policies."""
+    hidden = _hidden(comparison, rows, against)
+    columns: dict[str, tuple[str, str]] = {}
+    for key, (text, spec) in TABLES["drivers"]["columns"].items():
+        if key not in hidden:
+            columns[key] = (text.format(other=_other(against), score=comparison.score[0]), spec)
+    for group in comparison.groups:
+        for name, measure in group.measures.items():
+            has_column = name in ("completed", "crashed") or name.startswith(PER_STEP)
+            if measure.title and not has_column:
+                columns[name] = (measure.title, measure.format)
+    columns["needs_guide"] = ("guide at test time", "")
+    return columns
+
+
+def _hidden(
+    comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
+) -> set[str]:
+    """Return the keys of columns that would say nothing."""
+    hidden = set()
+    if not any(row["advice"] for row in rows):
+        hidden.add("advice")
+    if against is None:
+        hidden |= {"difference cell", "p", "better"}
+    if not comparison.normalised:
+        hidden.add("reward")  # it is the score
+    for key in ("completed", "crashes"):
+        if all(row[key] is None for row in rows):
+            hidden.add(key)
+    return hidden
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
-    """Return rows of `Comparison.table` with `score cell` and `difference cell`, which show the intervals too."""
-    return [
-        {
-            **row,
-            "score cell": Estimate(row["score"], row["low"], row["high"]).cell(spec),
-            "difference cell": Estimate(
-                *(row[f"difference{end}"] for end in ("", "_low", "_high"))
-            ).cell(f"+{spec}"),
-        }
-        for row in rows
-    ]
+    """Return rows of `Comparison.table` with `score cell` and `difference cell`.
+
+    These cells show the intervals too.
+
+    Args:
+        rows: of the table.
+        spec: format of the scores.
+    """
+    shown = []
+    for row in rows:
+        score = Estimate(row["score"], row["low"], row["high"])
+        difference = Estimate(row["difference"], row["difference_low"], row["difference_high"])
+        cells = {"score cell": score.cell(spec), "difference cell": difference.cell(f"+{spec}")}
+        shown.append({**row, **cells})
+    return shown
 
 
 def guide_training(runs: Sequence[Run]) -> list[str]:
-    """Return the table of guides' own returns before and after training; no table if no guide was trained."""
+    """Return the table of guides' own returns before and after training.
+
+    The list is empty if no guide was trained.
+    """
     rows: list[dict[str, Any]] = []
+    columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
     for label, of_label in _trained(runs):
         curves = [run.curve for run in of_label]
         row: dict[str, Any] = {"label": label, "seeds": len(curves)}
-        for key in dict.fromkeys(
-            key for curve in curves for key in curve[0] if key.startswith(GUIDE_RETURN)
-        ):
-            returns = [
-                [line[key] for line in curve if not math.isnan(line[key])] for curve in curves
-            ]
-            row[key] = (
-                f"{mean(seed[0] for seed in returns):.1f} to {mean(seed[-1] for seed in returns):.1f}"
-            )
-        rows += [row] if len(row) > 2 else []
-    columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
-    columns |= {key: (key.removeprefix(GUIDE_RETURN), "") for row in rows for key in list(row)[2:]}
+        for key in chain.from_iterable(curve[0] for curve in curves):
+            if key.startswith(GUIDE_RETURN) and key not in row:
+                row[key] = _before_to_after(curves, key)
+                columns[key] = (key.removeprefix(GUIDE_RETURN), "")
+        if len(row) > 2:
+            rows.append(row)
     return [markdown_table(rows, columns)] if rows else []
 
 
+def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str:
+    """Return the first and the last number of a column as a cell, means over the runs."""
+    columns = [[line[key] for line in curve if not math.isnan(line[key])] for curve in curves]
+    before, after = mean(column[0] for column in columns), mean(column[-1] for column in columns)
+    return f"{before:.1f} to {after:.1f}"
+
+
 def training(runs: Sequence[Run]) -> list[str]:
-    """Return the table of evaluation curves, means over seeds; no table if nothing was trained."""
+    """Return the table of evaluation curves, means over seeds.
+
+    The list is empty if nothing was trained.
+    """
     rows: list[dict[str, Any]] = []
     for label, of_label in _trained(runs):
         numbers = [learning(run) for run in of_label]
         seconds = [run.seconds for run in of_label if run.seconds is not None]
         row: dict[str, Any] = {key: mean(seed[key] for seed in numbers) for key in numbers[0]}
-        row |= {
-            "label": label,
-            "seeds": len(of_label),
-            "seconds": mean(seconds) if seconds else None,
-        }
+        row["label"], row["seeds"] = label, len(of_label)
+        row["seconds"] = mean(seconds) if seconds else None
         for key in ("until_90", "until_100"):
-            reached = [seed[key] for seed in numbers if not math.isnan(seed[key])]
-            some = (
-                f" ({len(reached)} of {len(numbers)} seeds)" if len(reached) < len(numbers) else ""
-            )
-            row[f"{key} cell"] = f"{mean(reached):,.0f}{some}" if reached else None
-        rows += [row] if not math.isnan(row["area"]) else []
+            row[f"{key} cell"] = _reached([seed[key] for seed in numbers])
+        if not math.isnan(row["area"]):
+            rows.append(row)
     rows.sort(key=lambda row: -float(row["area"]))
     return [markdown_table(rows, TABLES["learning"]["columns"])] if rows else []
 
 
+def _reached(frames: Sequence[float]) -> str | None:
+    """Return the mean frames up to a level as a cell, given those of each seed; NaN for never."""
+    reached = [number for number in frames if not math.isnan(number)]
+    if not reached:
+        return None
+    some = f" ({len(reached)} of {len(frames)} seeds)" if len(reached) < len(frames) else ""
+    return f"{mean(reached):,.0f}{some}"
+
+
 def notes(against: str | None, normalised: bool, sampled: bool) -> str:
-    """Return an explanation of the tables."""
+    """Return an explanation of the tables.
+
+    Args:
+        against: what the policies are compared with, see `Comparison.table`.
+        normalised: whether scores are fractions of a guide's reward.
+        sampled: whether there is a section for sampled actions.
+    """
     used = {
         "order": True,
         "normalised": normalised,
@@ -116,10 +167,18 @@ def notes(against: str | None, normalised: bool, sampled: bool) -> str:
 
 
 def progress(finished: int, started: int) -> str:
-    """Return a sentence on unfinished runs."""
+    """Return a sentence on unfinished runs.
+
+    Args:
+        finished: number of finished runs.
+        started: number of all runs.
+    """
     if finished == started:
         return f"All {started} runs that were started are finished."
-    return f"{finished} of {started} runs that were started are finished; repeat their command to finish the others."
+    return (
+        f"{finished} of {started} runs that were started are finished; "
+        "repeat their command to finish the others."
+    )
 
 
 def _trained(runs: Sequence[Run]) -> Iterator[tuple[str, list[Run]]]:
@@ -133,19 +192,33 @@ def _other(against: str | None) -> str:
 
 
 def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[str]:
-    """Return the table of the columns with a prefix, PER_STEP or TERM; no table without such columns."""
-    groups = {group.title: group.parts(prefix) for group in comparison.groups}
-    rows = [{"driver": title} | parts for title, parts in groups.items() if parts]
-    names = dict.fromkeys(key for row in rows for key in list(row)[1:])
-    columns = {"driver": (heading, "")} | {
-        name: (name.removeprefix(prefix), spec) for name in names
-    }
+    """Return the table of the parts of the reward; no table without such columns.
+
+    Args:
+        comparison: of the policies.
+        prefix: of the columns, PER_STEP or TERM.
+        heading: of the column with the names of the policies.
+        spec: format of the numbers.
+    """
+    rows: list[dict[str, Any]] = []
+    columns = {"driver": (heading, "")}
+    for group in comparison.groups:
+        parts = group.parts(prefix)
+        for name in parts:
+            columns[name] = (name.removeprefix(prefix), spec)
+        if parts:
+            rows.append({"driver": group.title, **parts})
     return [markdown_table(rows, columns)] if rows else []
 
 
 def cases_table(groups: Sequence[Group], file: str) -> str:
-    """Return the mean reward by driver and case, with the completed share below 1; a hint at a file for many cases."""
-    names = dict.fromkeys(case for group in groups for case in group.cases)
+    """Return the table of the mean reward by policy and case, with the completed share below 1.
+
+    Args:
+        groups: the policies.
+        file: name of the file with these numbers, which is named instead if there are many cases.
+    """
+    names = dict.fromkeys(chain.from_iterable(group.cases for group in groups))
     if len(names) > MAX_CASES:
         return f"The rewards in each of the {len(names)} cases are in {file}."
     rows = []
@@ -156,6 +229,7 @@ def cases_table(groups: Sequence[Group], file: str) -> str:
             reward, completed = means["reward"], means.get("completed", 1.0)
             row[case] = f"{reward:.1f} ({completed:.0%} completed)" if completed < 1 else reward
         rows.append(row)
-    return markdown_table(
-        rows, {"driver": ("mean reward", "")} | {name: (name, ".1f") for name in names}
-    )
+    columns = {"driver": ("mean reward", "")}
+    for name in names:
+        columns[name] = (name, ".1f")
+    return markdown_table(rows, columns)

@@ -1,4 +1,7 @@
-"""Pictures of an evaluation, which a run draws from the configuration of its env."""
+"""Pictures of an evaluation.
+
+A run draws those that the configuration of its env names (`evaluation.pictures`).
+"""
 
 from __future__ import annotations
 
@@ -25,75 +28,96 @@ if TYPE_CHECKING:
 
 
 class Picture:
-    """A picture of deterministic episodes."""
+    """A picture of deterministic episodes.
 
-    record: ClassVar[Mapping[str, NestedKey]] = {}  # entries of every step that it needs, by name
+    Attributes:
+        record: entries of every step that the picture needs, by name.
+    """
+
+    record: ClassVar[Mapping[str, NestedKey]] = {}
 
     def watch(self, env: EnvBase) -> None:
-        """See the env before each step of the agent's deterministic episodes; by default do nothing."""
+        """See the env before each step of the agent's episodes; by default do nothing."""
 
-    def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Draw the episodes of each driver, one for each case, into a folder."""
+    def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
+        """Draw the picture.
+
+        Args:
+            results: the episodes of each policy, one for each case.
+            folder: where the picture is written.
+        """
         raise NotImplementedError
 
 
 @dataclass(eq=False)
 class DrivenLines(Picture):
-    """Driven lines on the tracks as `lines.png`, and as an animation, `lines.gif`."""
+    """Driven lines on the tracks as `lines.png`, and as an animation, `lines.gif`.
+
+    Args:
+        tracks: one for each case.
+        gif: whether to make the animation, for an env that has a `rate`.
+        most: number of tracks that are drawn, the first ones.
+    """
 
     record: ClassVar[Mapping[str, NestedKey]] = {"pose": ("info", "pose")}
-    tracks: Sequence[Track]  # one for each case
-    gif: bool = True  # whether to make the animation, for an env that has a `rate`
-    most: int = 12  # tracks that are drawn, the first ones
+    tracks: Sequence[Track]
+    gif: bool = True
+    most: int = 12
 
-    def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Draw the lines."""
-        tracks, first = (
-            self.tracks[: self.most],
-            {driver: result[: self.most] for driver, result in drives.items()},
-        )
-        lines = {
-            driver: [pose[:, :2] for pose in result.histories["pose"]]
-            for driver, result in first.items()
-        }
-        crashed = {
-            driver: [bool(row.get("crashed")) for row in result.episodes]
-            for driver, result in first.items()
-        }
+    def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
+        """Draw the lines; see `Picture.draw`."""
+        tracks, lines, crashed = self.tracks[: self.most], {}, {}
+        for policy, result in results.items():
+            first = result[: self.most]
+            lines[policy] = [pose[:, :2] for pose in first.histories["pose"]]
+            crashed[policy] = [bool(row.get("crashed")) for row in first.episodes]
         draw_lines(tracks, lines, folder / "lines.png", crashed=crashed)
-        rate = next(iter(drives.values())).rate
+        rate = next(iter(results.values())).rate
         if self.gif and not math.isnan(rate):
             animate_lines(tracks, lines, folder / "lines.gif", rate=rate, crashed=crashed)
 
 
 class Returns(Picture):
-    """Return of each driver in each case, as `returns.png`."""
+    """Return of each policy in each case, as `returns.png`."""
 
-    def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Draw one row for each driver, with a dot for each episode and a line at the mean."""
-        names, strokes = list(drives)[::-1], style.strokes(drives)
+    def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
+        """Draw one row for each policy, with a dot for each episode and a line at the mean.
+
+        Args:
+            results: the episodes of each policy.
+            folder: where the picture is written.
+        """
+        names, strokes = list(results)[::-1], style.strokes(results)
         with style.picture(folder / "returns.png", None, [], 0.9 + 0.45 * len(names)) as figure:
             axes = figure.add_subplot(xlabel="return of an episode")
             style.lighten(axes)
             for row, name in enumerate(names):
-                rewards = np.array([episode["reward"] for episode in drives[name].episodes])
+                rewards = np.array([episode["reward"] for episode in results[name].episodes])
                 # Spread evenly, so that equal returns stay visible.
                 heights = row + 0.3 * (np.arange(len(rewards)) / max(1, len(rewards) - 1) - 0.5)
-                axes.plot(rewards, heights, "o", color=strokes[name].colour, ms=4, alpha=0.5, mew=0)
-                axes.plot(
-                    [rewards.mean()] * 2, [row - 0.3, row + 0.3], color=strokes[name].colour, lw=2
-                )
+                colour = strokes[name].colour
+                axes.plot(rewards, heights, "o", color=colour, ms=4, alpha=0.5, mew=0)
+                axes.plot([rewards.mean()] * 2, [row - 0.3, row + 0.3], color=colour, lw=2)
             axes.set_yticks(range(len(names)), names)
 
 
 @dataclass(eq=False)
 class Film(Picture):
-    """The agent's episode in the first case as an animation, `episode.gif`, drawn by the env itself."""
+    """The agent's episode in the first case as an animation, `episode.gif`.
 
-    every: int = 2  # steps between two frames
-    frames: int = 300  # at most
-    width: int = 320  # of the animation in pixels, at most
-    duration: int = 40  # of a frame in ms
+    The env itself draws the frames.
+
+    Args:
+        every: number of steps between two frames.
+        frames: largest number of frames.
+        width: largest width of the animation, pixels.
+        duration: of a frame, ms.
+    """
+
+    every: int = 2
+    frames: int = 300
+    width: int = 320
+    duration: int = 40
 
     def __post_init__(self) -> None:
         self.images: list[Image.Image] = []
@@ -109,9 +133,14 @@ class Film(Picture):
                 self.images.append(image)
         self.steps += 1
 
-    def draw(self, drives: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Write the animation; nothing without frames."""
-        steps = list(drives.values())[-1].episodes[0]["steps"]
+    def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
+        """Write the animation; nothing without frames.
+
+        Args:
+            results: the episodes of each policy, the agent last.
+            folder: where the animation is written.
+        """
+        steps = list(results.values())[-1].episodes[0]["steps"]
         images = self.images[: max(1, -(-steps // self.every))]
         if images:
             with whole_file(folder / "episode.gif") as unfinished:

@@ -1,5 +1,6 @@
-"""Statistics of a few seeds: t intervals, tests of paired differences, Holm's correction, intervals of shares.
+"""Statistics of a few seeds.
 
+These are t intervals, tests of paired differences, Holm's correction, and intervals of shares.
 `scipy.stats` is imported where it is used, because that takes a second and a training run does not
 use it.
 """
@@ -17,7 +18,15 @@ RESAMPLES = 2**14  # sign patterns of up to 14 seeds are enumerated
 
 
 class Estimate(NamedTuple):
-    """Mean over seeds, the ends of its 95 % t interval, and the p-value of the hypothesis that it is 0."""
+    """Mean of a number over seeds, and what is known about it.
+
+    Attributes:
+        mean: the mean.
+        low: the lower end of its 95 % t interval; NaN if unknown.
+        high: the upper end.
+        seeds: number of seeds.
+        p: p-value of the hypothesis that the mean is 0; NaN if unknown.
+    """
 
     mean: float
     low: float = math.nan
@@ -26,7 +35,13 @@ class Estimate(NamedTuple):
     p: float = math.nan
 
     def cell(self, spec: str) -> str | None:
-        """Return mean and interval as a table cell: None if the mean is NaN, no interval if that is NaN."""
+        """Return mean and interval as a table cell.
+
+        It is None if the mean is NaN, and without interval if that is NaN.
+
+        Args:
+            spec: format of the numbers.
+        """
         if math.isnan(self.mean):
             return None
         interval = "" if math.isnan(self.low) else f" ({self.low:{spec}} to {self.high:{spec}})"
@@ -34,7 +49,14 @@ class Estimate(NamedTuple):
 
 
 def mean_interval(values: ArrayLike) -> tuple[Any, Any, Any]:
-    """Return the mean over seeds and the ends of its 95 % t interval; `values` are [seeds, ...], at least two seeds."""
+    """Return the mean over seeds, and the ends of its 95 % t interval.
+
+    Args:
+        values: [seeds, ...], at least two seeds.
+
+    Returns:
+        Mean, lower end and upper end, [...] each.
+    """
     from scipy import stats
 
     table = np.asarray(values, dtype=np.float64)
@@ -75,7 +97,11 @@ def estimate(values: ArrayLike) -> Estimate:
 
 
 def holm(p_values: ArrayLike) -> Array:
-    """Return the p-values of a family of tests after Holm's correction (1979); NaN is not part of the family."""
+    """Return the p-values of a family of tests after Holm's correction (1979).
+
+    Args:
+        p_values: [N], of the tests; NaN is not part of the family.
+    """
     p = np.asarray(p_values, dtype=np.float64)
     order = p.argsort()  # NaN last
     factors = np.isfinite(p).sum() - np.arange(len(p))
@@ -85,7 +111,12 @@ def holm(p_values: ArrayLike) -> Array:
 
 
 def count_of_seeds(count: int, seeds: int) -> str:
-    """Return a number of seeds and the 95 % interval of its share (Clopper-Pearson), as a table cell."""
+    """Return a number of seeds and the 95 % interval of its share as a table cell.
+
+    Args:
+        count: number of seeds with some property.
+        seeds: number of all seeds. The interval is that of Clopper and Pearson.
+    """
     from scipy import stats
 
     interval = stats.binomtest(count, seeds).proportion_ci(method="exact")
@@ -95,7 +126,9 @@ def count_of_seeds(count: int, seeds: int) -> str:
 def wins(x: ArrayLike, y: ArrayLike) -> Array:
     """Return 1 where x scores more than y for the same seed and case, 0.5 for ties, 0 otherwise.
 
-    x is [seeds, cases]; y is the same, or [1, cases] for a score shared by all seeds.
+    Args:
+        x: [seeds, cases].
+        y: the same, or [1, cases] for a score shared by all seeds.
     """
     first, second = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
     return (first > second) + 0.5 * (first == second)

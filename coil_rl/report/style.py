@@ -1,4 +1,7 @@
-"""Shared style of all figures: colours safe for colour-blind readers, fonts, title, legend and output file."""
+"""Shared style of all figures: colours, fonts, title, legend and output file.
+
+The colours are safe for colour-blind readers.
+"""
 
 import os
 from collections.abc import Iterable, Iterator, Sequence
@@ -40,38 +43,46 @@ LETTERS: Any = {
     "figure.facecolor": BACKGROUND,
     "axes.labelcolor": INK,
     "axes.edgecolor": KERB,
-}
-LETTERS |= {
-    f"{axis}tick.{key}": colour
-    for axis in "xy"
-    for key, colour in (("color", KERB), ("labelcolor", INK))
+    "xtick.color": KERB,
+    "xtick.labelcolor": INK,
+    "ytick.color": KERB,
+    "ytick.labelcolor": INK,
 }
 
 
 class Stroke(NamedTuple):
-    """Colour and line style of one driver or method."""
+    """Colour and line style of one policy or method.
+
+    Attributes:
+        colour: as matplotlib takes it.
+        linestyle: as matplotlib takes it; solid by default.
+    """
 
     colour: str
     linestyle: Any = "-"
 
 
 def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
-    """Return a stroke for each driver: grey dashes if its name starts with "guide", the next strong colour if not."""
+    """Return a stroke for each policy.
+
+    A policy whose name starts with "guide" gets grey dashes, another one the next strong colour.
+    """
     labels = list(labels)
     guides = [label for label in labels if label.lower().startswith("guide")]
-    greys = {
-        label: Stroke(GUIDES[index % len(GUIDES)], DASHED) for index, label in enumerate(guides)
-    }
+    greys = {}
+    for index, label in enumerate(guides):
+        greys[label] = Stroke(GUIDES[index % len(GUIDES)], DASHED)
     strong = strong_strokes(label for label in labels if label not in greys)
     return {label: greys.get(label) or strong[label] for label in labels}
 
 
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke in a strong colour for each label, dashed once the colours are used again."""
-    return {
-        label: Stroke(AGENTS[index % len(AGENTS)], SECOND_ROUND if index >= len(AGENTS) else "-")
-        for index, label in enumerate(labels)
-    }
+    result = {}
+    for index, label in enumerate(labels):
+        linestyle = SECOND_ROUND if index >= len(AGENTS) else "-"
+        result[label] = Stroke(AGENTS[index % len(AGENTS)], linestyle)
+    return result
 
 
 @contextmanager
@@ -84,10 +95,15 @@ def picture(
     add_header: bool = False,
     h_pad: float = 0.1,
 ) -> Iterator[Figure]:
-    """Yield an empty figure with title and legend; write it when the block ends.
+    """Yield an empty figure with title and legend, 8 inches wide; write it when the block ends.
 
-    It is 8 inches wide and `height` inches high, with `add_header` without title and legend. The
-    suffix of the path decides the format. `h_pad` is the vertical padding of the layout in inches.
+    Args:
+        path: output file, whose suffix decides the format.
+        title: above the legend; None for none.
+        handles: of the legend.
+        height: of the figure, inches.
+        add_header: whether the height does not count title and legend.
+        h_pad: vertical padding of the layout, inches.
     """
     with mpl.rc_context(LETTERS):
         figure = Figure(figsize=(WIDTH, height), dpi=RESOLUTION)
@@ -104,20 +120,39 @@ def picture(
 
 
 def save(figure: Figure, path: str | os.PathLike[str]) -> None:
-    """Write a figure in the format of the path's suffix, PNG if it has none; the file appears whole or not at all."""
+    """Write a figure; the file appears whole or not at all.
+
+    Args:
+        figure: the figure.
+        path: output file, whose suffix decides the format, PNG without a suffix.
+    """
     with whole_file(path) as unfinished, mpl.rc_context(LETTERS):
         figure.savefig(unfinished, format=Path(path).suffix[1:] or "png")
 
 
 def lighten(axes: Axes, grid: str = "y") -> None:
-    """Remove the upper and right spine and draw a faint grid along one axis."""
+    """Remove the upper and right spine and draw a faint grid along one axis.
+
+    Args:
+        axes: the axes.
+        grid: "y" for horizontal lines, "x" for vertical ones.
+    """
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y" if grid == "y" else "x", color=ASPHALT, lw=0.7)
     axes.set_axisbelow(True)
 
 
 def draw_header(figure: Figure, handles: Sequence[Artist], title: str | None) -> float:
-    """Draw title and legend, in as few lines as fit, in the upper left corner; return their height in inches."""
+    """Draw title and legend in the upper left corner, in as few lines as fit.
+
+    Args:
+        figure: 8 inches wide.
+        handles: of the legend.
+        title: above the legend; None for none.
+
+    Returns:
+        The height of both, inches.
+    """
     corner = figure.dpi_scale_trans + ScaledTranslation(0, 1, BboxTransformTo(figure.bbox))
     height = 0.11
     if title:

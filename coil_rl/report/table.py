@@ -4,6 +4,7 @@ import csv
 import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
+from itertools import chain
 from numbers import Real
 from typing import Any
 
@@ -23,22 +24,27 @@ def markdown_table(
 ) -> str:
     """Return a Markdown table; columns of numbers are right-aligned.
 
-    A column that no row has, or a number that does not fit its format, is a `ValueError`.
-
     Args:
         rows: one mapping per line. Missing keys, None and NaN become "-", booleans yes and no; text
             stays as it is, so a cell may be a formatted "31.2 ± 0.4".
         columns: heading (with unit) and number format by key, in the order of the table.
 
+    Raises:
+        ValueError: if no row has a column, or a number does not fit its format.
+
     Example:
-        >>> rows = [{"driver": "guide", "lap": 31.25, "crash": False}, {"driver": "agent", "lap": None, "crash": True}]
-        >>> print(markdown_table(rows, {"driver": ("driver", ""), "lap": ("lap (s)", ".1f"), "crash": ("crash", "")}))
-        | driver | lap (s) | crash |
+        >>> rows = [
+        ...     {"policy": "guide", "lap": 31.25, "crash": False},
+        ...     {"policy": "agent", "lap": None, "crash": True},
+        ... ]
+        >>> columns = {"policy": ("policy", ""), "lap": ("lap (s)", ".1f"), "crash": ("crash", "")}
+        >>> print(markdown_table(rows, columns))
+        | policy | lap (s) | crash |
         |:-------|--------:|:------|
         | guide  |    31.2 | no    |
         | agent  |       - | yes   |
     """
-    keys = dict.fromkeys(key for row in rows for key in row)
+    keys = dict.fromkeys(chain.from_iterable(rows))
     for key, (heading, _) in columns.items():
         if rows and key not in keys:
             raise ValueError(
@@ -64,8 +70,12 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]
 
     The columns are all keys in the order of their first appearance. Missing keys and None become an
     empty cell, NaN becomes nan.
+
+    Args:
+        rows: one mapping per line.
+        path: output file.
     """
-    columns = list(dict.fromkeys(key for row in rows for key in row))
+    columns = list(dict.fromkeys(chain.from_iterable(rows)))
     with whole_file(path) as unfinished, unfinished.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         if columns:
@@ -75,7 +85,9 @@ def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]
 
 def _to_python(value: object) -> object:
     """Convert a NumPy or torch scalar to a Python number."""
-    return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
+    if getattr(value, "ndim", None) == 0 and hasattr(value, "item"):
+        return value.item()
+    return value
 
 
 def _is_number(value: object) -> bool:
@@ -87,8 +99,6 @@ def _format(value: object, spec: str) -> str:
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return (
-        format(value, spec)
-        if _is_number(value)
-        else " ".join(str(value).split()).replace("|", "\\|")
-    )
+    if _is_number(value):
+        return format(value, spec)
+    return " ".join(str(value).split()).replace("|", "\\|")

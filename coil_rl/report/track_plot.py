@@ -13,12 +13,15 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
+from numpy.typing import NDArray
 
 from coil_rl.report import style
 from coil_rl.report.statistics import Array
 
 if TYPE_CHECKING:
     from coil_rl.envs.track import Track
+
+Integers = NDArray[np.int64]
 
 GAP = 0.22  # inches, as the next two
 NAME_HEIGHT = 0.26
@@ -36,6 +39,13 @@ class TrackPlot:
         title: above the legend.
         dpi: pixels per inch.
         groups: number of groups of equally many tracks; each group begins a row.
+
+    Attributes:
+        figure: the figure.
+        canvas: of the figure.
+        axes: the axes with all tracks, in metres.
+        scale: inches per metre.
+        offsets: [N, 2] m, from the coordinates of each of the N tracks to those of the axes.
     """
 
     def __init__(
@@ -50,79 +60,91 @@ class TrackPlot:
         with mpl.rc_context(style.LETTERS):
             self.figure = Figure(dpi=dpi)
             self.canvas = FigureCanvasAgg(self.figure)
-            edges = [
-                np.vstack([track.boundary("left", 0.25), track.boundary("right", 0.25)])
-                for track in tracks
-            ]
-            lows = np.array([edge.min(axis=0) for edge in edges]) - 2 * CONE_RADIUS
-            sizes = np.array([edge.max(axis=0) for edge in edges]) + 2 * CONE_RADIUS - lows
-            grouped = np.arange(len(tracks)).reshape(groups, -1)
-            rows = [
-                row
-                for group in grouped
-                for row in np.array_split(group, -(-len(group) // TRACKS_PER_ROW))
-            ]
-            widths = [style.WIDTH - 2 * style.MARGIN - (len(row) - 1) * GAP for row in rows]
-            fits = [width / sizes[row, 0].sum() for width, row in zip(widths, rows, strict=True)]
-            self.scale = float(min(*fits, MAX_TRACK_HEIGHT / sizes[:, 1].max()))  # inches per metre
+            self._measure(tracks, groups)
             self.figure.set_size_inches(style.WIDTH, 3.0)
-            cone: dict[str, Any] = {
-                "ls": "",
-                "marker": "o",
-                "ms": 4.5,
-                "mec": style.INK,
-                "mew": 0.4,
-            }
-            colours = {"left cones": style.LEFT_CONE, "right cones": style.RIGHT_CONE}
-            cones = [
-                Line2D([], [], mfc=colour, label=label, **cone) for label, colour in colours.items()
-            ]
-            header = style.draw_header(self.figure, [*legend, *cones], title) + 0.12
-            heights = [NAME_HEIGHT + self.scale * float(sizes[row, 1].max()) for row in rows]
-            height = header + sum(heights) + GAP * (len(rows) - 1) + 0.34
-            height = round(height * dpi) / dpi  # whole pixels, for video players and GIF readers
+            handles = [*legend, *_cone_handles()]
+            header = style.draw_header(self.figure, handles, title) + 0.12
+            height = header + sum(map(self._height, self._rows)) + GAP * (len(self._rows) - 1)
+            # Whole pixels, for video players and GIF readers.
+            height = round((height + 0.34) * dpi) / dpi
             self.figure.set_size_inches(style.WIDTH, height)
             xlim, ylim = (0, style.WIDTH / self.scale), (0, height / self.scale)
             self.axes = self.figure.add_axes((0, 0, 1, 1), xlim=xlim, ylim=ylim)
             self.axes.axis("off")
-            self.offsets = np.empty(
-                (len(tracks), 2)
-            )  # m, from the coordinates of each track to those of the axes
+            self.offsets = np.empty((len(tracks), 2))
             top = header
-            for row, row_height in zip(rows, heights, strict=True):
-                free = (style.WIDTH - 2 * style.MARGIN - self.scale * sizes[row, 0].sum()) / len(
-                    row
-                )
-                left = style.MARGIN + free / 2
-                for index in row:
-                    width, track_height = self.scale * sizes[index]
-                    self.offsets[index] = (
-                        self._metres(left, top + NAME_HEIGHT + track_height) - lows[index]
-                    )
-                    x, y = self._metres(left + width / 2, top + 0.04)
-                    self.axes.text(
-                        x, y, tracks[index].name, ha="center", va="top", color=style.QUIET
-                    )
-                    _draw_track(self.axes, tracks[index], self.offsets[index], self.scale)
-                    left += width + free
-                top += row_height + GAP
-            x, y = self._metres(style.MARGIN, height - 0.14)
-            bar = 10 if 10 * self.scale <= style.WIDTH / 2 else 1  # m
-            ends = np.array([0.04, 0, 0, 0.04]) / self.scale
-            self.axes.plot([x, x, x + bar, x + bar], ends + y, color=style.INK, lw=1)
-            self.axes.text(x + bar + 0.07 / self.scale, y, f"{bar} m", size=8, va="center")
+            for row in self._rows:
+                self._draw_row(tracks, row, top)
+                top += self._height(row) + GAP
+            self._draw_scale_bar()
+
+    def _measure(self, tracks: Sequence[Track], groups: int) -> None:
+        """Divide the tracks into rows, and choose the scale at which they fit."""
+        edges = [
+            np.vstack([track.boundary("left", 0.25), track.boundary("right", 0.25)])
+            for track in tracks
+        ]
+        # Lower left corner and size of each track, [N, 2] m.
+        self._lows = np.array([edge.min(axis=0) for edge in edges]) - 2 * CONE_RADIUS
+        self._sizes = np.array([edge.max(axis=0) for edge in edges]) + 2 * CONE_RADIUS - self._lows
+        self._rows: list[Integers] = []
+        for group in np.arange(len(tracks)).reshape(groups, -1):
+            self._rows += np.array_split(group, -(-len(group) // TRACKS_PER_ROW))
+        self.scale = float(MAX_TRACK_HEIGHT / self._sizes[:, 1].max())
+        for row in self._rows:
+            width = style.WIDTH - 2 * style.MARGIN - (len(row) - 1) * GAP
+            self.scale = min(self.scale, float(width / self._sizes[row, 0].sum()))
+
+    def _height(self, row: Integers) -> float:
+        """Return the height of a row of tracks with their names, in inches."""
+        return NAME_HEIGHT + self.scale * float(self._sizes[row, 1].max())
+
+    def _draw_row(self, tracks: Sequence[Track], row: Integers, top: float) -> None:
+        """Draw the tracks with some indices side by side.
+
+        Args:
+            tracks: all tracks.
+            row: indices of those to draw.
+            top: distance to the upper edge of the figure, inches.
+        """
+        used = self.scale * self._sizes[row, 0].sum()
+        free = (style.WIDTH - 2 * style.MARGIN - used) / len(row)
+        left = style.MARGIN + free / 2
+        for index in row:
+            width, height = self.scale * self._sizes[index]
+            corner = self._metres(left, top + NAME_HEIGHT + height)
+            self.offsets[index] = corner - self._lows[index]
+            x, y = self._metres(left + width / 2, top + 0.04)
+            self.axes.text(x, y, tracks[index].name, ha="center", va="top", color=style.QUIET)
+            _draw_track(self.axes, tracks[index], self.offsets[index], self.scale)
+            left += width + free
+
+    def _draw_scale_bar(self) -> None:
+        """Draw a bar of 10 m, or of 1 m if the tracks are small, in the lower left corner."""
+        x, y = self._metres(style.MARGIN, self.figure.get_size_inches()[1] - 0.14)
+        bar = 10 if 10 * self.scale <= style.WIDTH / 2 else 1  # m
+        ends = np.array([0.04, 0, 0, 0.04]) / self.scale
+        self.axes.plot([x, x, x + bar, x + bar], ends + y, color=style.INK, lw=1)
+        self.axes.text(x + bar + 0.07 / self.scale, y, f"{bar} m", size=8, va="center")
 
     def _metres(self, right: float, down: float) -> Array:
         """Convert inches from the upper left corner to coordinates of the axes."""
         return np.array([right, self.figure.get_size_inches()[1] - down]) / self.scale
 
 
+def _cone_handles() -> list[Line2D]:
+    """Return the handles of the cones in the legend."""
+    cone: dict[str, Any] = {"ls": "", "marker": "o", "ms": 4.5, "mec": style.INK, "mew": 0.4}
+    colours = {"left cones": style.LEFT_CONE, "right cones": style.RIGHT_CONE}
+    return [Line2D([], [], mfc=colour, label=label, **cone) for label, colour in colours.items()]
+
+
 def _draw_track(axes: Axes, track: Track, offset: Array, scale: float) -> None:
+    """Draw surface, finish line and cones of a track; the scale is in inches per metre."""
     # The opposite direction of the second ring makes the inner one a hole.
     rings = track.boundary("left", 0.1) + offset, track.boundary("right", 0.1)[::-1] + offset
-    surface = Outline.make_compound_path(
-        *(Outline(np.vstack([ring, ring[:1]]), closed=True) for ring in rings)
-    )
+    outlines = [Outline(np.vstack([ring, ring[:1]]), closed=True) for ring in rings]
+    surface = Outline.make_compound_path(*outlines)
     axes.add_patch(PathPatch(surface, fc=style.ASPHALT, ec=style.KERB, lw=0.6, zorder=1))
     line = np.stack([track.left[0], track.right[0]]) + offset
     width = float(np.clip(0.35 * scale * 72, 2.4, 6.0))

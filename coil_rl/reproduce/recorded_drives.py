@@ -1,4 +1,8 @@
-"""Recorded drives of a robot: the reuse of existing recordings, and measures of smoothness, laps, crashes and lines."""
+"""Recorded drives of a robot.
+
+Existing recordings are reused. A drive is measured by its smoothness, its laps, its crash and its
+line, and drawn.
+"""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -31,14 +35,19 @@ MAX_POSES = 1000  # in one call, to limit the memory
 
 @dataclass(frozen=True, eq=False)
 class RecordedDrive:
-    """A recorded drive."""
+    """A recorded drive.
 
-    method: str  # display name of the driver
-    row: (
-        Row  # its measures without `smoothness`; `seed` is that of its run, None if there is no run
-    )
-    line: Array  # [M, 2] m, positions of the robot
-    track: Track | None  # None if the recording has none
+    Attributes:
+        method: display name of the policy that drove.
+        row: its measures without `smoothness`; `seed` is that of its run, None if there is no run.
+        line: [M, 2] m, positions of the robot.
+        track: the track; None if the recording has none.
+    """
+
+    method: str
+    row: Row
+    line: Array
+    track: Track | None
 
 
 def record(
@@ -47,16 +56,23 @@ def record(
     notes: Mapping[str, str],
     tick: Callable[[], Any] | None = None,
 ) -> list[Recording]:
-    """Return recordings of a deterministic episode of each robot of an env; complete ones with equal notes are reused.
+    """Return recordings of a deterministic episode of each robot of an env.
 
-    The arguments are those of `record_drives`. The notes tell a driver and its robots from others.
-    A policy that cannot drive the robots is a `UserError`.
+    If all recordings exist, are complete and have the given notes, they are reused.
+
+    Args:
+        make_env_and_policy: makes the env of simulated robots, and the policy that drives them.
+        paths: where to write the recordings, one for each robot.
+        notes: what is noted in the recordings; it tells a policy and its robots from others.
+        tick: called after each step.
+
+    Raises:
+        UserError: if the policy cannot drive the robots.
     """
     try:
         recordings = [read_recording(path, strict=True) for path in paths]
-        if all(
-            notes.items() <= recording.notes.get(SIMULATED, {}).items() for recording in recordings
-        ):
+        noted = [recording.notes.get(SIMULATED, {}) for recording in recordings]
+        if all(notes.items() <= of_recording.items() for of_recording in noted):
             return recordings
     except RecordingError:
         pass
@@ -67,16 +83,16 @@ def record(
 def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     """Measure a recorded drive, except for its smoothness.
 
-    `method` is the driver's display name; by default the `policy` in the recording's notes, or the
-    file name. An invalid track in the notes is a `RecordingError`.
+    Args:
+        recording: the drive.
+        method: display name of the policy that drove; by default the `policy` in the recording's
+            notes, or the file name.
+
+    Raises:
+        RecordingError: if the notes have an invalid track.
     """
     notes = recording.notes.get(SIMULATED, {})
-    if recording.odometry is None:
-        poses, seconds = recording.poses(), recording.seconds
-    else:  # all of its poses, not only those of the scans
-        poses, log_time, stamp = recording.odometry
-        clock = stamp if (np.diff(stamp) > 0).all() else log_time
-        seconds = (clock - clock[0]) / 1e9
+    poses, seconds = _poses(recording)
     completed = laps(poses, seconds)
     row: dict[str, Any] = {
         "method": method or notes.get("policy", recording.path.stem),
@@ -92,24 +108,45 @@ def measure(recording: Recording, method: str | None = None) -> RecordedDrive:
     }
     track = track_of(recording) if "track" in recording.notes else None
     if track is not None:
-        course, middle = RobotCourse([track]), cKDTree(middle_line(track, MIDDLE_SPACING))
-        parts = torch.from_numpy(poses).float().t().split(MAX_POSES, 1)
-        index = torch.zeros(MAX_POSES, dtype=torch.int64)
-        row["clearance"] = min(
-            float(course.clearance(index[: part.shape[1]], part)[0].min()) for part in parts
-        )
+        row["clearance"] = _smallest_clearance(poses, track)
         row["crashed"] = row["clearance"] <= 0
+        middle = cKDTree(middle_line(track, MIDDLE_SPACING))
         row["off_centre"] = float(middle.query(poses[:, :2])[0].mean())
         if len(completed.metres):
             row["corner_cut"] = float(completed.metres.mean()) / track.length
     return RecordedDrive(row["method"], row, poses[:, :2], track)
 
 
-def smoothness(recording: Recording, car_length: float, max_steering: float) -> float:
-    """Return the mean of |a - weighted mean of the last 20 actions|; NaN for a recording without commands.
+def _poses(recording: Recording) -> tuple[Array, Array]:
+    """Return all poses of a drive, [M, 3] (m, m, radians), and their seconds since the start, [M].
 
-    The robot has the length `car_length` in m; `max_steering` is the angle of an action of 1 in
-    degrees.
+    These are the poses of the odometry; without odometry, only those of the scans.
+    """
+    if recording.odometry is None:
+        return recording.poses(), recording.seconds
+    poses, log_time, stamp = recording.odometry
+    clock = stamp if (np.diff(stamp) > 0).all() else log_time
+    return poses, (clock - clock[0]) / 1e9
+
+
+def _smallest_clearance(poses: Array, track: Track) -> float:
+    """Return the smallest distance in m between the robot and a cone; poses are [M, 3]."""
+    course = RobotCourse([track])
+    index = torch.zeros(MAX_POSES, dtype=torch.int64)
+    smallest = []
+    for part in torch.from_numpy(poses).float().t().split(MAX_POSES, 1):
+        clearance, *_ = course.clearance(index[: part.shape[1]], part)
+        smallest.append(float(clearance.min()))
+    return min(smallest)
+
+
+def smoothness(recording: Recording, car_length: float, max_steering: float) -> float:
+    """Return how much the steering changes: the mean of |a - weighted mean of the last 20 actions|.
+
+    Args:
+        recording: the drive; without commands its smoothness is NaN.
+        car_length: length of the robot, m.
+        max_steering: angle of an action of 1, degrees.
     """
     if recording.commands is None:
         return np.nan
@@ -118,34 +155,44 @@ def smoothness(recording: Recording, car_length: float, max_steering: float) -> 
 
 
 def means(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return the means over drives: the minimum of the clearance, lap time and corner cut weighted by laps."""
+    """Return the measures of several drives together.
+
+    Lap time and corner cut are means weighted by the laps, the clearance is the smallest one, and
+    the other measures are means over the drives.
+
+    Args:
+        rows: the measures of the drives, at least one.
+    """
     crashes = [row["crashed"] for row in rows if row["crashed"] is not None]
     completed = [row for row in rows if row["laps"]]
     counts = [row["laps"] for row in completed]
-    values = {
-        key: float(np.mean([row[key] for row in rows])) for key in ("smoothness", "off_centre")
-    }
-    for key in ("lap_time", "corner_cut"):
-        values[key] = (
-            float(np.average([row[key] for row in completed], weights=counts)) if counts else np.nan
-        )
-    clearance, crashed = min(row["clearance"] for row in rows), sum(crashes) if crashes else None
-    return {
+    together: dict[str, Any] = {
         "drives": len(rows),
         "laps": sum(counts),
-        "crashes": crashed,
-        "clearance": clearance,
-        **values,
+        "crashes": sum(crashes) if crashes else None,
+        "clearance": min(row["clearance"] for row in rows),
     }
+    for key in ("smoothness", "off_centre"):
+        together[key] = float(np.mean([row[key] for row in rows]))
+    for key in ("lap_time", "corner_cut"):
+        together[key] = np.nan
+        if counts:
+            values = [row[key] for row in completed]
+            together[key] = float(np.average(values, weights=counts))
+    return together
 
 
 def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None:
-    """Draw the lines of each driver in a panel, with the cones of known tracks."""
-    names = [(drive.row["world"], drive.method) for drive in drives]
-    panels = {
-        name: [drive for drive, of in zip(drives, names, strict=True) if of == name]
-        for name in names
-    }
+    """Draw the lines of each policy in a panel, with the cones of known tracks.
+
+    Args:
+        drives: the drives, at least one.
+        path: of the picture.
+        title: above the picture.
+    """
+    panels: dict[tuple[str, str], list[RecordedDrive]] = {}
+    for drive in drives:
+        panels.setdefault((drive.row["world"], drive.method), []).append(drive)
     strokes = style.strokes(dict.fromkeys(method for _, method in panels))
     handles: list[Line2D] = []
     if any(drive.track is not None for drive in drives):
@@ -160,7 +207,9 @@ def draw_drives(drives: Sequence[RecordedDrive], path: Path, title: str) -> None
         axes = list(figure.subplots(rows, 2, squeeze=False).flat)
         for panel, ((world, method), shown) in zip(axes, panels.items(), strict=False):
             count = f"{len(shown)} drives" if len(shown) > 1 else "one drive"
-            name = "\n".join([f"{method}, {count} (m)", *filter(None, [world])])
+            name = f"{method}, {count} (m)"
+            if world:
+                name += f"\n{world}"
             _draw_panel(panel, shown, name, strokes[method].colour)
         for panel in axes[len(panels) :]:
             panel.axis("off")
@@ -173,21 +222,22 @@ def _draw_panel(axes: Axes, drives: Sequence[RecordedDrive], name: str, colour: 
     axes.tick_params(length=0, labelsize=7)
     axes.grid(color=style.ASPHALT, lw=0.5)
     axes.set_axisbelow(True)
-    for track in {
-        id(drive.track): drive.track for drive in drives if drive.track is not None
-    }.values():
-        for cones, radius, fill in (
-            (track.left, THIN, style.LEFT_CONE),
-            (track.right, THICK, style.RIGHT_CONE),
-        ):
-            discs = [Circle((x, y), radius) for x, y in cones.tolist()]
-            axes.add_collection(PatchCollection(discs, fc=fill, ec=style.INK, lw=0.3, zorder=3))
+    tracks = {id(drive.track): drive.track for drive in drives if drive.track is not None}
+    for track in tracks.values():
+        _draw_cones(axes, track.left, THIN, style.LEFT_CONE)
+        _draw_cones(axes, track.right, THICK, style.RIGHT_CONE)
     for drive in drives:
         axes.plot(*drive.line.T, color=colour, lw=0.8, alpha=0.6, zorder=4)
         if drive.row["crashed"]:
             axes.plot(
                 *drive.line[-1], "X", ms=7, mfc=colour, mec=style.BACKGROUND, mew=0.8, zorder=5
             )
+
+
+def _draw_cones(axes: Axes, cones: Array, radius: float, colour: str) -> None:
+    """Draw cones, [N, 2] m, as discs with a radius in m."""
+    discs = [Circle((x, y), radius) for x, y in cones.tolist()]
+    axes.add_collection(PatchCollection(discs, fc=colour, ec=style.INK, lw=0.3, zorder=3))
 
 
 def _dot(marker: str, colour: str, label: str) -> Line2D:

@@ -1,8 +1,13 @@
-"""Base classes of reproduced results."""
+"""Base classes of the paper's reproduced results, and what all of them read.
+
+A result is built from its YAML file in `conf/reproduce` and makes its files and its page, see
+`Result`.
+"""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from importlib import resources
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -27,18 +32,22 @@ class Result(ABC):
 
     @abstractmethod
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
-        """Make the result from the finished runs of its experiments, and return its page in Markdown.
+        """Write the numbers and the picture of the result, and return its page in Markdown.
 
-        The numbers are written to `stem.csv`, the picture to `stem.png`; `stem` is a path without
-        suffix.
+        Args:
+            stem: the path of the result's files without suffix: the numbers are written to
+                `stem.csv`, the picture to `stem.png`.
+            runs: the finished runs of its `experiments`.
         """
 
 
 class WorldsResult(Result):
     """A result about runs in the main world and in variants of it.
 
-    `experiments` are in the main world, and `worlds` has those in each variant by its name. The
-    other runs are compared with those of the label `against`.
+    Args:
+        experiments: names of the experiments in the main world, files of `conf/experiment`.
+        worlds: the experiments in each variant of the main world by its name; none by default.
+        against: label of the runs with which the others are compared.
     """
 
     def __init__(
@@ -47,19 +56,24 @@ class WorldsResult(Result):
         worlds: Mapping[str, Sequence[str]] | None = None,
         against: str = "ppo",
     ) -> None:
-        # The main world has no name.
-        self.worlds = {"": list(experiments)} | {
-            name: list(variant) for name, variant in (worlds or {}).items()
-        }
-        self.experiments = [
-            experiment for experiments in self.worlds.values() for experiment in experiments
-        ]
+        self.worlds = {"": list(experiments)}  # the main world has no name
+        for name, variant in (worlds or {}).items():
+            self.worlds[name] = list(variant)
+        self.experiments = list(chain.from_iterable(self.worlds.values()))
         self.against = against
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:
-    """Return the runs of each label; raises a `UserError` if a label has no run."""
-    available = [run for of_experiment in runs.values() for run in of_experiment]
+    """Return the runs of each label.
+
+    Args:
+        labels: the wanted labels.
+        runs: the available runs by experiment.
+
+    Raises:
+        UserError: if a label has no run.
+    """
+    available = list(chain.from_iterable(runs.values()))
     selected = {label: [run for run in available if run.label == label] for label in labels}
     for label, of_label in selected.items():
         if not of_label:

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.transforms import ScaledTranslation
 from scipy.stats import binomtest
@@ -34,24 +35,30 @@ PLAIN: Any = {"color": style.INK, "lw": 1.6, "ls": style.SECOND_ROUND}
 
 @dataclass(eq=False)
 class TabularCoil(Result):
-    """Tabular COIL with guides of different quality."""
+    """Tabular COIL with guides of different quality.
 
-    worlds: int = 20  # number of random worlds; world k has the seed k
-    states: int = 12  # of each world
-    actions: int = 3  # of each world
-    classes: int = 4  # of states; the agent that observes classes does not observe the state
-    noise: float = 0.2  # probability of a random action of the noisy guide
-    epsilon: float = 0.2  # see `q_learning`
-    power: float = 0.6  # see `q_learning`
-    episode_steps: int = 50  # length of an episode
-    steps: Sequence[int] = (
-        100,
-        300,
-        1_000,
-        3_000,
-        10_000,
-        30_000,
-    )  # after which the policies are evaluated
+    Args:
+        worlds: number of random worlds; world k has the seed k.
+        states: number of states of each world, at least 3.
+        actions: number of actions of each world.
+        classes: number of classes of states, at most `states`; the agent that observes classes does
+            not observe the state.
+        noise: probability of a random action of the noisy guide.
+        epsilon: probability of a random action of the agent while it learns, see `q_learning`.
+        power: the step size at the n-th visit is n ** -power, see `q_learning`.
+        episode_steps: length of an episode.
+        steps: increasing numbers of steps, after which the policies are evaluated.
+    """
+
+    worlds: int = 20
+    states: int = 12
+    actions: int = 3
+    classes: int = 4
+    noise: float = 0.2
+    epsilon: float = 0.2
+    power: float = 0.6
+    episode_steps: int = 50
+    steps: Sequence[int] = (100, 300, 1_000, 3_000, 10_000, 30_000)
 
     def __post_init__(self) -> None:
         check_range(1, worlds=self.worlds, actions=self.actions, classes=self.classes)
@@ -82,26 +89,11 @@ class TabularCoil(Result):
         seeds = tqdm(range(self.worlds), unit="world", desc=stem.name, leave=False, mininterval=0.5)
         rows = [row for seed in seeds for row in self._world(seed)]
         write_csv(rows, stem.with_suffix(".csv"))
-        groups = [
-            self._group(rows, view, guide) for view in ("state", "class") for guide in self.guides
-        ]
+        groups = []
+        for view in ("state", "class"):
+            groups += [self._group(rows, view, guide) for guide in self.guides]
         _draw(groups, self.steps, stem.with_suffix(".png"))
-        table = markdown_table(
-            groups,
-            {
-                "view": ("agent observes", ""),
-                "guide": ("guide", ""),
-                "guide_score": ("guide's score", ".2f"),
-                "coil_score": ("COIL", ".2f"),
-                "plain_score": ("plain", ".2f"),
-                **{
-                    f"share_{n}": (f"≥ guide, {n:,} steps", ".0%") for n in self.steps[-1::-2][::-1]
-                },
-                "interval": ("95 %", ""),
-                "nearly": (f"≥ guide - {NEARLY}", ".0%"),
-                "plain_share": ("plain ≥ guide", ".0%"),
-            },
-        )
+        table = markdown_table(groups, self._columns())
         reached, cases = sum(group["reached"] for group in groups), self.worlds * len(groups)
         ours = pages.certain_verdict(
             reached == cases, f"in {reached} of {cases} worlds, guides and views"
@@ -111,18 +103,37 @@ class TabularCoil(Result):
         notes = PAGES["tabular_coil"]["notes"].format(worlds=self.worlds)
         return f"## COIL at least as good as its guide\n\n{table}\n\n{notes}\n\n{section}"
 
+    def _columns(self) -> dict[str, tuple[str, str]]:
+        """Return heading and format of the columns of the table."""
+        columns = {
+            "view": ("agent observes", ""),
+            "guide": ("guide", ""),
+            "guide_score": ("guide's score", ".2f"),
+            "coil_score": ("COIL", ".2f"),
+            "plain_score": ("plain", ".2f"),
+        }
+        every_second = self.steps[-1::-2][::-1]  # with the last one, or the table gets too wide
+        for n in every_second:
+            columns[f"share_{n}"] = (f"≥ guide, {n:,} steps", ".0%")
+        return columns | {
+            "interval": ("95 %", ""),
+            "nearly": (f"≥ guide - {NEARLY}", ".0%"),
+            "plain_share": ("plain ≥ guide", ".0%"),
+        }
+
     def _world(self, seed: int) -> Iterator[dict[str, Any]]:
-        """Yield the scores in one world, a row for each view, guide and number of steps."""
+        """Yield the scores in one world, a row for each view, guide and number of steps.
+
+        A score is 0 for the value of the random policy and 1 for that of the optimal one.
+        """
         rng = np.random.default_rng(seed)
         mdp = tabular.garnet(self.states, self.actions, rng)
         views = {
             "state": np.arange(self.states),
             "class": rng.permutation(self.states) % self.classes,
         }
-        random, best = (
-            _value(mdp, random_guide(mdp)),
-            _value(mdp, tabular.value_iteration(mdp).policy),
-        )
+        random = _value(mdp, random_guide(mdp))
+        best = _value(mdp, tabular.value_iteration(mdp).policy)
         for view, observations in views.items():
             plain = self._learned_values(mdp, observations, seed)
             for name, guide in self.guides.items():
@@ -131,10 +142,18 @@ class TabularCoil(Result):
                 coil = self._learned_values(tabular.with_advice(mdp, policy), advised, seed)
                 own = np.full(len(self.steps), _value(mdp, policy))
                 scores = (np.stack([own, coil, plain], axis=1) - random) / (best - random)
-                for n, of_step in zip(self.steps, scores.tolist(), strict=True):
-                    names = ("guide_score", "coil_score", "plain_score")
-                    row = {"view": view, "guide": name, "world": seed, "steps": n}
-                    yield row | dict(zip(names, of_step, strict=True))
+                for n, (guide_score, coil_score, plain_score) in zip(
+                    self.steps, scores.tolist(), strict=True
+                ):
+                    yield {
+                        "view": view,
+                        "guide": name,
+                        "world": seed,
+                        "steps": n,
+                        "guide_score": guide_score,
+                        "coil_score": coil_score,
+                        "plain_score": plain_score,
+                    }
 
     def _learned_values(self, mdp: tabular.MDP, observations: Integers, seed: int) -> Array:
         """Return the value of the greedy policy after each number of steps."""
@@ -147,10 +166,11 @@ class TabularCoil(Result):
     def _group(self, rows: Sequence[Mapping[str, Any]], view: str, guide: str) -> dict[str, Any]:
         """Return shares and mean scores over all worlds, for one view and guide."""
         of_group = [row for row in rows if row["view"] == view and row["guide"] == guide]
-        scores = [
-            [row[f"{agent}_score"] for row in of_group] for agent in ("guide", "coil", "plain")
-        ]
-        own, coil, plain = np.array(scores).reshape(3, self.worlds, len(self.steps))
+
+        def scores(key: str) -> Array:
+            return np.array([row[key] for row in of_group]).reshape(self.worlds, len(self.steps))
+
+        own, coil, plain = scores("guide_score"), scores("coil_score"), scores("plain_score")
         reached = (coil >= own - ROUNDING).sum(axis=0)
         shares = reached / self.worlds
         interval = binomtest(int(reached[-1]), self.worlds).proportion_ci(method="wilson")
@@ -178,9 +198,8 @@ def _value(mdp: tabular.MDP, policy: Array | Integers) -> float:
 
 def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path) -> None:
     """Draw one column per view: shares above, scores below."""
-    views, guides = (
-        list(dict.fromkeys(group[key] for group in groups)) for key in ("view", "guide")
-    )
+    views = list(dict.fromkeys(group["view"] for group in groups))
+    guides = list(dict.fromkeys(group["guide"] for group in groups))
     lines: dict[str, Any] = {
         name: {"color": colour, "lw": 2, "marker": "o", "ms": 4}
         for name, colour in zip(guides, style.AGENTS, strict=False)
@@ -202,14 +221,7 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
                 share.plot(
                     steps, group["shares"], transform=share.transData + shift, clip_on=False, **line
                 )
-                score.plot(steps, group["coil_scores"], **line)
-                score.axhline(
-                    group["guide_score"], color=line["color"], lw=1.2, ls=style.DASHED, zorder=1.5
-                )
-                if group["guide_score"] < LOWEST_SCORE:
-                    text = f"↓ guide {group['guide']} at {group['guide_score']:.2f}"
-                    where = {"xycoords": "axes fraction", "textcoords": "offset points"}
-                    score.annotate(text, (0, 0), (4, 4), color=line["color"], **where)
+                _draw_scores(score, group, steps, line)
             score.plot(steps, of_view[0]["plain_scores"], **PLAIN)
             share.set_title(f"the agent observes {view}", size=9, loc="left", color=style.QUIET)
             score.set_xlabel("steps of experience")
@@ -221,3 +233,20 @@ def _draw(groups: Sequence[Mapping[str, Any]], steps: Sequence[int], path: Path)
         grid[0, 0].set(ylabel="worlds where COIL\nis at least the guide", ylim=(0, 1))
         grid[0, 0].yaxis.set_major_formatter(lambda value, _: f"{value:.0%}")
         grid[1, 0].set(ylabel="mean score\n(0 random, 1 optimal)", ylim=(LOWEST_SCORE, 1.05))
+
+
+def _draw_scores(
+    axes: Axes, group: Mapping[str, Any], steps: Sequence[int], line: Mapping[str, Any]
+) -> None:
+    """Draw the scores of COIL with one guide, and the score of the guide."""
+    axes.plot(steps, group["coil_scores"], **line)
+    axes.axhline(group["guide_score"], color=line["color"], lw=1.2, ls=style.DASHED, zorder=1.5)
+    if group["guide_score"] < LOWEST_SCORE:
+        axes.annotate(
+            f"↓ guide {group['guide']} at {group['guide_score']:.2f}",
+            (0, 0),
+            (4, 4),
+            color=line["color"],
+            xycoords="axes fraction",
+            textcoords="offset points",
+        )

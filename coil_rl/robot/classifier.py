@@ -1,4 +1,7 @@
-"""Training and evaluation of the cone classifier: support vector machines on the features of LiDAR clusters."""
+"""Training and evaluation of the cone classifier.
+
+It consists of support vector machines on the features of LiDAR clusters.
+"""
 
 import json
 import os
@@ -6,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +35,8 @@ from coil_rl.errors import UserError
 from coil_rl.files import write_text
 
 Flags = NDArray[np.bool_]
-Scans = tuple[
-    NDArray[np.floating], NDArray[np.floating]
-]  # ranges [N, P] m and their bearings, [P] or [N, P] radians
+# Ranges [N, P] m, and their bearings, [P] or [N, P] radians.
+Scans = tuple[NDArray[np.floating], NDArray[np.floating]]
 
 FOLDS = 5
 EVERY = 4  # scans, as neighbouring scans are nearly equal
@@ -47,7 +49,14 @@ VISIBILITY_BINS = (0.0, 0.5, 0.999, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """A trained classifier, and the accuracy with which it tells thin from thick cones in cross-validation."""
+    """A trained classifier, and how well it tells thin from thick cones in cross-validation.
+
+    Attributes:
+        classifier: trained on all clusters.
+        accuracy: [folds], share of correctly classified clusters in each fold.
+        correct: number of correctly classified clusters in all folds.
+        total: number of clusters.
+    """
 
     classifier: ConeClassifier
     accuracy: Array
@@ -57,19 +66,37 @@ class Training:
 
 @dataclass(frozen=True, eq=False)
 class LabelledClusters:
-    """N clusters with their true cones."""
+    """N clusters with their true cones.
 
-    features: Array  # [N, 3] m: width, depth and girth
+    Attributes:
+        features: [N, 3] m, width, depth and girth.
+        thick: [N], whether the cone is thick.
+        drive: [N], index of the drive.
+        scan: [N], index of the scan in the drive.
+        cone: [N], index of the cone on its track.
+        distance: [N] m, of the centroid.
+        visibility: [N], share of the cone's beams that no nearer cone blocks.
+    """
+
+    features: Array
     thick: Flags
-    drive: Integers  # index of the drive, [N] as the following
-    scan: Integers  # index of the scan in the drive
-    cone: Integers  # index of the cone on its track
-    distance: Array  # m, of the centroid
-    visibility: Array  # share of the cone's beams that no nearer cone blocks
+    drive: Integers
+    scan: Integers
+    cone: Integers
+    distance: Array
+    visibility: Array
 
 
 class Share(NamedTuple):
-    """A share of clusters, with a 95 % interval (Wilson) that assumes independent ones; NaN without any cluster."""
+    """A share of clusters that are classified correctly.
+
+    Attributes:
+        share: the share; NaN without any cluster.
+        low: lower end of its 95 % interval (Wilson), which assumes independent clusters.
+        high: upper end of it.
+        wrong: number of wrongly classified clusters.
+        total: number of all clusters.
+    """
 
     share: float
     low: float
@@ -79,7 +106,12 @@ class Share(NamedTuple):
 
 
 def share_of(correct: int, total: int) -> Share:
-    """Return the share that was classified correctly."""
+    """Return the share that was classified correctly.
+
+    Args:
+        correct: number of correctly classified clusters.
+        total: number of all clusters.
+    """
     if not total:
         return Share(np.nan, np.nan, np.nan, 0, 0)
     low, high = binomtest(correct, total).proportion_ci(method="wilson")
@@ -92,25 +124,27 @@ def train_classifier(
     """Train a classifier, with cross-validation over drives, as clusters of one drive are alike.
 
     Outliers next to a cone make unusual clusters, so a one-class machine (Schoelkopf et al. 2001)
-    with a small share of exceptions tells cones from other objects. Fewer groups than folds, or
-    only one kind of cone, are a `UserError`.
+    with a small share of exceptions tells cones from other objects.
 
     Args:
         features: [N, 3] m, width, depth and girth of each cluster.
-        thick: [N] whether the cone is thick.
-        drives: [N] group of each cluster; a group is held out as a whole and should have both kinds
-            of cone.
+        thick: [N], whether the cone is thick.
+        drives: [N], group of each cluster; a group is held out as a whole and should have both
+            kinds of cone.
         folds: number of folds.
+
+    Raises:
+        UserError: if there are fewer groups than folds, or only one kind of cone.
     """
     groups = len(np.unique(drives))
     if groups < max(2, folds):
         raise UserError(
-            f"{groups} drives are too few for {folds} folds; record more, or set folds to at most {groups}"
+            f"{groups} drives are too few for {folds} folds; "
+            f"record more, or set folds to at most {groups}"
         )
     if thick.all() or not thick.any():
-        raise UserError(
-            f"all clusters are of {'thick' if thick.all() else 'thin'} cones; the other drive is missing"
-        )
+        kind = "thick" if thick.all() else "thin"
+        raise UserError(f"all clusters are of {kind} cones; the other drive is missing")
     pipeline = make_pipeline(StandardScaler(), SVC(C=100.0))
     splits = GroupKFold(folds).split(features, thick, drives)
     try:
@@ -122,56 +156,75 @@ def train_classifier(
             "without one fold only one kind of cone is left; number the drives in pairs"
         ) from None
     accuracy = predicted["test_score"]
-    correct = round(
-        sum(
-            score * len(rows)
-            for score, rows in zip(accuracy, predicted["indices"]["test"], strict=True)
-        )
-    )
-    scaler, machine = (step for _, step in pipeline.fit(features, thick).steps)
+    folds_and_rows = zip(accuracy, predicted["indices"]["test"], strict=True)
+    correct = round(sum(score * len(rows) for score, rows in folds_and_rows))
+    (_, scaler), (_, machine) = pipeline.fit(features, thick).steps
     known = OneClassSVM(nu=UNUSUAL, gamma=machine.gamma).fit(scaler.transform(features))
+    return Training(_joined(scaler, machine, known), accuracy, correct, len(features))
+
+
+def _joined(scaler: StandardScaler, machine: SVC, known: OneClassSVM) -> ConeClassifier:
+    """Join the machine that tells thin from thick cones and the one that knows cones."""
     machines = (machine, known)
     support = np.concatenate([each.support_vectors_ for each in machines])
     weights = block_diag(*(each.dual_coef_ for each in machines))
     intercept = np.concatenate([each.intercept_ for each in machines])
     # The value of gamma="scale" has no public name.
-    classifier = ConeClassifier(
+    return ConeClassifier(
         scaler.mean_, scaler.scale_, support, weights, intercept, float(machine._gamma)
     )
-    return Training(classifier, accuracy, correct, len(features))
 
 
 def train_on_drives(left: Sequence[Scans], right: Sequence[Scans]) -> Training:
-    """Train on the scans of drives past left cones alone and past right cones alone; errors as `train_classifier`.
+    """Train on drives past left cones alone, which are thin, and past right cones alone.
 
-    The k-th drives of both are held out together.
+    The k-th drives of both sides are held out together.
+
+    Args:
+        left: the scans of at least two drives past left cones.
+        right: the scans of at least two drives past right cones.
+
+    Raises:
+        UserError: if there are too few drives, and as `train_classifier`.
     """
     pairs = min(len(left), len(right))
     if pairs < 2:
-        given = f"{len(left)} drives past left cones and {len(right)} past right ones"
-        raise UserError(f"{given} are too few to learn from; record two of each, better five")
-    (thin, thin_drive), (thick, thick_drive) = (
-        clusters_in_range(left, EVERY),
-        clusters_in_range(right, EVERY),
-    )
+        raise UserError(
+            f"{len(left)} drives past left cones and {len(right)} past right ones "
+            "are too few to learn from; record two of each, better five"
+        )
+    thin, thin_drive = clusters_in_range(left, EVERY)
+    thick, thick_drive = clusters_in_range(right, EVERY)
     features = np.concatenate([thin, thick])
     is_thick = np.arange(len(features)) >= len(thin)
-    return train_classifier(
-        features, is_thick, np.concatenate([thin_drive, thick_drive]) % pairs, min(FOLDS, pairs)
-    )
+    groups = np.concatenate([thin_drive, thick_drive]) % pairs
+    return train_classifier(features, is_thick, groups, min(FOLDS, pairs))
 
 
 def save_classifier(classifier: ConeClassifier, path: str | os.PathLike[str]) -> None:
-    """Write a classifier as JSON."""
-    lines = [
-        f'  "{part.name}": {json.dumps(getattr(classifier, part.name).tolist())}'
-        for part in fields(classifier)
-    ]
+    """Write a classifier as JSON.
+
+    Args:
+        classifier: a trained classifier.
+        path: output file.
+    """
+    # One line for each array, so that the file can be compared and read.
+    lines = []
+    for part in fields(classifier):
+        numbers = json.dumps(getattr(classifier, part.name).tolist())
+        lines.append(f'  "{part.name}": {numbers}')
     write_text(Path(path), "{\n" + ",\n".join(lines) + "\n}")
 
 
 def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
-    """Read a file of `save_classifier`; raises a `UserError` if it is missing, or not a cone classifier."""
+    """Read a classifier.
+
+    Args:
+        path: of a file of `save_classifier`.
+
+    Raises:
+        UserError: if the file is missing, or not a cone classifier.
+    """
     try:
         classifier = ConeClassifier(**json.loads(Path(path).read_text(encoding="utf-8")))
     except OSError as error:
@@ -184,56 +237,84 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
         ) from None
     if len(classifier.mean) != len(FEATURES):
         raise UserError(
-            f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; train again"
+            f"{path} has {len(classifier.mean)} features instead of {', '.join(FEATURES)}; "
+            "train again"
         )
     return classifier
 
 
 def clusters_in_range(drives: Sequence[Scans], every: int = 1) -> tuple[Array, Integers]:
-    """Return the features [N, 3] m of all clusters within 1 m in one of `every` scans, and their drive [N]."""
+    """Return the features of all clusters within 1 m.
+
+    Args:
+        drives: the scans of each drive.
+        every: only one scan of so many is used.
+
+    Returns:
+        The features, [N, 3] m, and the index of the drive, [N].
+    """
     features = []
     for ranges, angles in drives:
         own_angles = np.broadcast_to(angles, ranges.shape)
         points = points_of(ranges[::every], own_angles[::every], RANGE_MIN, RANGE + MARGIN)
         clusters = measure(points, single_linkage(points))
         features.append(clusters.features[np.hypot(*clusters.centroid.T) <= RANGE])
-    return np.concatenate(features), np.repeat(
-        np.arange(len(features)), [len(rows) for rows in features]
-    )
+    counts = [len(rows) for rows in features]
+    return np.concatenate(features), np.repeat(np.arange(len(features)), counts)
 
 
 def label_clusters(
     drives: Sequence[SimulatedDrive], max_distance: float = RANGE
 ) -> LabelledClusters:
-    """Return the clusters of drives up to a distance in m, labelled with the cone of most of their points.
+    """Return the clusters of drives, labelled with the cone of most of their points.
 
     Clusters of outliers alone are left out.
+
+    Args:
+        drives: with the true cone of each range.
+        max_distance: largest distance of a cluster, m.
     """
-    columns: list[list[NDArray[np.generic]]] = []
-    for number, drive in enumerate(drives):
-        points = points_of(
-            drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN
-        )
-        label = single_linkage(points)
-        clusters = measure(points, label)
-        votes = np.zeros(
-            (int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64
-        )  # last: no cone
-        np.add.at(votes, (label, drive.hit.numpy()[points.scan, points.beam]), 1)
-        cone = np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)[clusters.label]
-        distance = np.hypot(*clusters.centroid.T)
-        rows = (distance <= max_distance) & (cone >= 0)
-        cone, scan = cone[rows], clusters.scan[rows]
-        thick, visibility = drive.thick.numpy()[cone], drive.visibility.numpy()[scan, cone]
-        drive_index = np.full(len(cone), number)
-        columns.append(
-            [clusters.features[rows], thick, drive_index, scan, cone, distance[rows], visibility]
-        )
-    return LabelledClusters(*(np.concatenate(column) for column in zip(*columns, strict=True)))
+    labelled = [_label_drive(drive, max_distance) for drive in drives]
+    columns: dict[str, Any] = {}
+    for column in ("features", "thick", "scan", "cone", "distance", "visibility"):
+        columns[column] = np.concatenate([getattr(of_drive, column) for of_drive in labelled])
+    counts = [len(of_drive.cone) for of_drive in labelled]
+    return LabelledClusters(drive=np.repeat(np.arange(len(labelled)), counts), **columns)
+
+
+def _label_drive(drive: SimulatedDrive, max_distance: float) -> LabelledClusters:
+    """Return the labelled clusters of one drive, whose index is 0; see `label_clusters`."""
+    points = points_of(drive.ranges.numpy(), drive.angles.numpy(), RANGE_MIN, max_distance + MARGIN)
+    label = single_linkage(points)
+    clusters = measure(points, label)
+    # Number of points of each cluster on each cone; the last column is for no cone, index -1.
+    votes = np.zeros((int(label.max(initial=-1)) + 1, drive.cones.shape[1] + 1), dtype=np.int64)
+    np.add.at(votes, (label, drive.hit.numpy()[points.scan, points.beam]), 1)
+    cone = np.where(votes[:, :-1].any(1), votes[:, :-1].argmax(1), -1)[clusters.label]
+    distance = np.hypot(*clusters.centroid.T)
+    rows = (distance <= max_distance) & (cone >= 0)
+    cone, scan = cone[rows], clusters.scan[rows]
+    return LabelledClusters(
+        features=clusters.features[rows],
+        thick=drive.thick.numpy()[cone],
+        drive=np.zeros(len(cone), dtype=np.int64),
+        scan=scan,
+        cone=cone,
+        distance=distance[rows],
+        visibility=drive.visibility.numpy()[scan, cone],
+    )
 
 
 def accuracy(classifier: ConeClassifier, labelled: LabelledClusters) -> dict[str, Share]:
-    """Return the share of correctly classified clusters of cones: `all`, by range, and by visibility of the cone."""
+    """Return the share of correctly classified clusters.
+
+    Args:
+        classifier: a trained classifier.
+        labelled: the clusters with their true cones.
+
+    Returns:
+        The share of `all` clusters, and the shares by range and by visibility of the cone.
+    """
     return _shares(
         classifier.classify(labelled.features) == labelled.thick,
         labelled.distance,
@@ -246,12 +327,19 @@ def recall(
 ) -> dict[str, dict[str, Share]]:
     """Return the share of `thin` and of `thick` cones with a correctly classified cluster.
 
-    A cone counts if its surface is in range and at least one beam hits it. Shares: `all`, by range,
-    by visibility.
+    A cone counts if its surface is in range and at least one beam hits it.
+
+    Args:
+        classifier: a trained classifier.
+        drives: with the true cone of each range.
+
+    Returns:
+        For either kind, the share of `all` cones, and the shares by range and by visibility.
     """
     labelled = label_clusters(drives, RANGE + MARGIN)
     correct = classifier.classify(labelled.features) == labelled.thick
-    columns: dict[str, list[list[Array]]] = {"thin": [], "thick": []}
+    # Of each kind and drive: whether a cone is recognised in a scan, its distance and visibility.
+    columns: dict[str, list[tuple[Array, Array, Array]]] = {"thin": [], "thick": []}
     for number, drive in enumerate(drives):
         offset = drive.cones[:, None] - drive.poses[:2, :, 0, None]
         distance = (offset.norm(dim=0) - drive.radius).numpy()
@@ -263,20 +351,19 @@ def recall(
         for name, thick in (("thin", False), ("thick", True)):
             cells = in_range & (drive.thick.numpy() == thick)
             columns[name].append(
-                [recognised[cells].astype(float), distance[cells], visibility[cells]]
+                (recognised[cells].astype(float), distance[cells], visibility[cells])
             )
-    return {
-        name: _shares(*map(np.concatenate, zip(*rows, strict=True)))
-        for name, rows in columns.items()
-    }
+    shares = {}
+    for name, parts in columns.items():
+        shares[name] = _shares(*map(np.concatenate, zip(*parts, strict=True)))
+    return shares
 
 
 def _shares(correct: NDArray[np.generic], distance: Array, visibility: Array) -> dict[str, Share]:
+    """Return the share of correct ones: of all, by range in m, and by visibility; all are [N]."""
     shares = {"all": share_of(int(correct.sum()), len(correct))}
-    for name, value, bins in (
-        ("m", distance, RANGE_BINS),
-        ("visible", visibility, VISIBILITY_BINS),
-    ):
+    properties = (("m", distance, RANGE_BINS), ("visible", visibility, VISIBILITY_BINS))
+    for name, value, bins in properties:
         for low, high in pairwise(bins):
             rows = (value > low) & (value <= high)
             shares[f"{low:g}-{high:g} {name}"] = share_of(int(correct[rows].sum()), int(rows.sum()))

@@ -21,8 +21,12 @@ from coil_rl.tabular.planning import value_iteration
 def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
     """Return the world with the guide's advice in the state.
 
-    The guide's policy is actions [S], or their probabilities [S, A]; then one is drawn whenever a
-    state is entered. Of the S * A states of the result, s * A + g is state s with the advice g.
+    Of the S * A states of the result, s * A + g is state s with the advice g.
+
+    Args:
+        mdp: the world without advice, with S states and A actions.
+        guide: the guide's policy: actions [S], or their probabilities [S, A], of which one is drawn
+            whenever a state is entered.
 
     Example:
         >>> from coil_rl.tabular import toymaker, with_advice
@@ -45,7 +49,15 @@ def with_advice(mdp: MDP, guide: ArrayLike) -> MDP:
 
 
 def observations_with_advice(observations: ArrayLike, actions: int) -> Integers:
-    """Return the observation of each state of `with_advice` [S * A], given that of each state without advice [S]."""
+    """Return what an agent with advice observes in each state of `with_advice`.
+
+    Args:
+        observations: [S] integers from 0, the observation of each state without advice.
+        actions: A, the number of actions.
+
+    Returns:
+        [S * A], a different number for each pair of an observation and an advice.
+    """
     return (np.asarray(observations)[:, None] * actions + np.arange(actions)).ravel()
 
 
@@ -55,7 +67,12 @@ def optimal_guide(mdp: MDP) -> Array:
 
 
 def noisy_guide(mdp: MDP, noise: float = 0.5) -> Array:
-    """Return an optimal policy that takes a random action with probability `noise`, [S, A] probabilities."""
+    """Return an optimal policy that sometimes takes a random action, [S, A] probabilities.
+
+    Args:
+        mdp: the world.
+        noise: the probability of the random action, which is drawn uniformly from all actions.
+    """
     return (1 - noise) * optimal_guide(mdp) + noise * random_guide(mdp)
 
 
@@ -65,5 +82,8 @@ def random_guide(mdp: MDP) -> Array:
 
 
 def worst_guide(mdp: MDP) -> Array:
-    """Return the policy with the lowest value, [S, A] probabilities: the optimal one for negated rewards."""
+    """Return the policy with the lowest value, [S, A] probabilities.
+
+    It is the optimal policy for the negated rewards.
+    """
     return optimal_guide(MDP(mdp.P, -mdp.R, mdp.gamma))

@@ -1,6 +1,7 @@
-"""Learning from experience: a simulator, a model estimate (equations 50 and 51) and Q-learning (equation 52).
+"""Learning from experience: a simulator, a model estimate, and Q-learning.
 
-Q-learning updates Q(s, a) <- Q(s, a) + alpha (r + gamma max Q(s', .) - Q(s, a)) after each step. Q
+The estimate of the model follows equations 50 and 51 of the paper, Q-learning equation 52: it
+updates Q(s, a) <- Q(s, a) + alpha (r + gamma max Q(s', .) - Q(s, a)) after each step. Q
 converges to the optimal Q if every action is taken infinitely often in every state, and the step
 sizes alpha of each pair have an infinite sum and their squares a finite one (theorem 2.3).
 `epsilon` provides the first, `power` the second.
@@ -20,7 +21,15 @@ from coil_rl.tabular.mdp import MDP, Array, Integers
 class Simulator:
     """Step-by-step simulation of a Markov decision process.
 
-    An episode ends in a terminal state, or after `episode_steps`, None for no limit.
+    Args:
+        mdp: the world.
+        rng: of the start states and of the transitions.
+        episode_steps: an episode ends in a terminal state, or after this number of steps; None for
+            no limit.
+
+    Attributes:
+        state: the present state.
+        steps: number of steps in the present episode.
     """
 
     def __init__(self, mdp: MDP, rng: Generator, episode_steps: int | None = None) -> None:
@@ -37,7 +46,11 @@ class Simulator:
         self.state, self.steps = bisect_right(self._start, self.rng.random()), 0
 
     def step(self, action: int) -> tuple[float, int]:
-        """Return the reward and the next state of an action; after an episode `state` is the next start state."""
+        """Take an action; return its reward and the next state.
+
+        At the end of an episode the next one begins: then `state` is its start state, and not the
+        state that is returned.
+        """
         next_state = bisect_right(self._next[self.state][action], self.rng.random())
         reward = self._rewards[self.state][action][next_state]
         self.state, self.steps = next_state, self.steps + 1
@@ -48,7 +61,14 @@ class Simulator:
 
 @dataclass(frozen=True)
 class Transitions:
-    """Sampled transitions: `state`, `action`, `reward` and `next_state`, [N] each."""
+    """N sampled transitions.
+
+    Attributes:
+        state: [N], the state before each transition.
+        action: [N], the action in it.
+        reward: [N], the reward of the transition.
+        next_state: [N], the state after it.
+    """
 
     state: Integers
     action: Integers
@@ -59,7 +79,15 @@ class Transitions:
 def sample_transitions(
     mdp: MDP, policy: ArrayLike, steps: int, rng: Generator, episode_steps: int | None = None
 ) -> Transitions:
-    """Sample N = `steps` consecutive transitions of a policy, actions [S] or their probabilities [S, A]."""
+    """Sample consecutive transitions of a policy.
+
+    Args:
+        mdp: the world.
+        policy: actions [S], or their probabilities [S, A].
+        steps: N, the number of transitions.
+        rng: of the world and of the actions.
+        episode_steps: number of steps after which an episode is truncated; None for no limit.
+    """
     choices = _cumulative(mdp.probabilities(policy)).tolist()
     world = Simulator(mdp, rng, episode_steps)
     rows = []
@@ -71,7 +99,12 @@ def sample_transitions(
 
 
 class ModelEstimate:
-    """Maximum-likelihood estimate of P and R from transitions (equations 50 and 51), for S states and A actions."""
+    """Maximum-likelihood estimate of P and R from transitions (equations 50 and 51).
+
+    Args:
+        states: S, the number of states.
+        actions: A, the number of actions.
+    """
 
     def __init__(self, states: int, actions: int) -> None:
         self.counts: Array = np.zeros((states, actions, states))  # number of observed transitions
@@ -97,22 +130,40 @@ class ModelEstimate:
         )
 
     def mdp(self, gamma: float) -> MDP:
-        """Return the estimate as a world to plan in; raises a `ValueError` if an action has no sample in some state."""
+        """Return the estimate as a world to plan in.
+
+        Args:
+            gamma: the discount factor, from 0 to less than 1.
+
+        Raises:
+            ValueError: if an action has no sample in some state.
+        """
         missing = np.argwhere(self.counts.sum(axis=2) == 0)
         if len(missing):
             state, action = missing[0]
-            problem = f"action {action} has no sample in state {state}, nor have {len(missing) - 1} other pairs"
-            raise ValueError(f"{problem}; add transitions of a policy that takes every action")
+            raise ValueError(
+                f"action {action} has no sample in state {state}, "
+                f"nor have {len(missing) - 1} other pairs; "
+                "add transitions of a policy that takes every action"
+            )
         return MDP(self.P, self.R, gamma)
 
 
 @dataclass(frozen=True)
 class QLearningResult:
-    """The learned Q; O is the number of observations, which are the states unless specified otherwise."""
+    """The learned Q.
 
-    Q: Array  # [O, A]
-    visits: Integers  # [O, A], number of updates of each pair
-    history: Array  # [K, O, A], Q after each of the requested numbers of steps
+    O is the number of observations, which are the states unless specified otherwise.
+
+    Attributes:
+        Q: [O, A], the estimated value of each action.
+        visits: [O, A], the number of updates of each pair.
+        history: [K, O, A], Q after each of the K requested numbers of steps.
+    """
+
+    Q: Array
+    visits: Integers
+    history: Array
 
     @property
     def policy(self) -> Integers:
@@ -137,11 +188,11 @@ def q_learning(
         mdp: the world; the learner uses its `Simulator` only.
         steps: number of transitions.
         rng: of the world and of the actions.
-        epsilon: probability of a random action, more than 0.
+        epsilon: probability of a random action, more than 0 and at most 1.
         power: alpha = n ** -power at the n-th visit of (s, a), more than 1/2 and at most 1 (theorem
             2.3).
-        episode_steps: steps after which an episode is truncated; the last state's value is still
-            bootstrapped.
+        episode_steps: steps after which an episode is truncated, None for no limit; the last
+            state's value is still bootstrapped.
         observations: [S] integers from 0, the observation of each state. States with the same
             observation share their row of Q, and the theorem no longer applies.
         snapshots: numbers of steps after which Q is added to `history`.
@@ -160,24 +211,25 @@ def q_learning(
         raise ValueError(
             f"power={power} must be more than 1/2 and at most 1, or Q-learning need not converge"
         )
-    if wrong := [snapshot for snapshot in snapshots if not 0 <= snapshot <= steps]:
-        raise ValueError(f"snapshots: {wrong[0]} must be between 0 and steps={steps}")
-    count, actions = len(mdp.states), len(mdp.actions)
-    observed = np.arange(count) if observations is None else np.asarray(observations)
-    if observed.shape != (count,) or observed.dtype.kind not in "iu" or observed.min() < 0:
-        raise ValueError(
-            f"observations must be {count} integers from 0, one a state; got {observed.tolist()}"
-        )
-
+    for snapshot in snapshots:
+        if not 0 <= snapshot <= steps:
+            raise ValueError(f"snapshots: {snapshot} must be between 0 and steps={steps}")
     # Plain lists: element by element they are several times faster than arrays.
-    observation = observed.tolist()
+    observation = _observations(len(mdp.states), observations).tolist()
+    actions = len(mdp.actions)
     Q = np.zeros((max(observation) + 1, actions)).tolist()
     visits = np.zeros((max(observation) + 1, actions), dtype=np.int64).tolist()
     world = Simulator(mdp, rng, episode_steps)
-    history = {0: np.array(Q)} if 0 in snapshots else {}
+    history = {}
+    if 0 in snapshots:
+        history[0] = np.array(Q)
     for step in range(1, steps + 1):
-        row = Q[o := observation[world.state]]
-        a = int(rng.random() * actions) if rng.random() < epsilon else row.index(max(row))
+        o = observation[world.state]
+        row = Q[o]
+        if rng.random() < epsilon:
+            a = int(rng.random() * actions)
+        else:
+            a = row.index(max(row))
         reward, next_state = world.step(a)
         visits[o][a] += 1
         alpha = visits[o][a] ** -power
@@ -188,9 +240,20 @@ def q_learning(
     return QLearningResult(np.array(Q), np.array(visits), ordered)
 
 
+def _observations(states: int, observations: ArrayLike | None) -> Integers:
+    """Return the observation of each state, [S]; by default the state itself."""
+    if observations is None:
+        return np.arange(states)
+    observed = np.asarray(observations)
+    if observed.shape != (states,) or observed.dtype.kind not in "iu" or observed.min() < 0:
+        raise ValueError(
+            f"observations must be {states} integers from 0, one a state; got {observed.tolist()}"
+        )
+    return observed
+
+
 def _cumulative(probabilities: Array) -> Array:
     """Return the cumulative distribution along the last axis; it ends at exactly 1."""
-    total = probabilities.cumsum(
-        axis=-1
-    )  # a draw below 1 must never select an outcome of probability 0
+    # A draw below 1 must never select an outcome of probability 0.
+    total = probabilities.cumsum(axis=-1)
     return total / total[..., -1:]

@@ -1,4 +1,7 @@
-"""Finite Markov decision processes as arrays, and two examples: the toymaker and random worlds."""
+"""Finite Markov decision processes as arrays, and two examples: the toymaker and random worlds.
+
+In all shapes S is the number of states and A the number of actions.
+"""
 
 from collections.abc import Sequence
 
@@ -21,7 +24,11 @@ class MDP:
         R: [S, A, S], R[s, a, s'] the reward of that transition.
         gamma: discount factor, from 0 to less than 1.
         start: [S], start-state probabilities; uniform by default.
-        states, actions: their names, for tables and messages; numbers by default.
+        states: the S names of the states, for tables and messages; numbers by default.
+        actions: the A names of the actions; numbers by default.
+
+    Attributes:
+        r: [S, A], the expected reward of each action in each state.
 
     Example:
         >>> stay, change = ([[1, 0], [0, 1]], [[0, 1], [1, 0]])
@@ -45,7 +52,8 @@ class MDP:
         self.R: Array = np.array(R, dtype=np.float64)
         if self.P.ndim != 3 or self.P.shape[0] != self.P.shape[2] or not self.P.size:
             raise ValueError(
-                f"P must have the shape [S, A, S], states by actions by states; it has {self.P.shape}"
+                "P must have the shape [S, A, S], states by actions by states; "
+                f"it has {self.P.shape}"
             )
         if self.R.shape != self.P.shape:
             raise ValueError(f"R must have the shape of P, {self.P.shape}; it has {self.R.shape}")
@@ -55,28 +63,29 @@ class MDP:
         count, choices = self.P.shape[:2]
         self.states = _names("states", states, count)
         self.actions = _names("actions", actions, choices)
+        self._check_entries()
+        if start is None:
+            self.start: Array = np.full(count, 1 / count)
+        else:
+            self.start = np.array(start, dtype=np.float64)
+        if self.start.shape != (count,) or not _is_distribution(self.start):
+            raise ValueError(
+                f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}"
+            )
+        self.r: Array = (self.P * self.R).sum(axis=2)
+
+    def _check_entries(self) -> None:
+        """Raise a `ValueError` for the first pair with invalid probabilities or rewards."""
         total = self.P.sum(axis=2)
         valid = np.isclose(total, 1, rtol=0, atol=1e-9) & (self.P >= 0).all(axis=2)
         for s, a in np.argwhere(~valid | ~np.isfinite(self.R).all(axis=2)):
             where = f"state {self.states[s]}, action {self.actions[a]}"
             if valid[s, a]:
                 raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
-            problem = f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where})"
-            raise ValueError(f"{problem}; they sum to {total[s, a]:g}")
-        self.start: Array = (
-            np.full(count, 1 / count) if start is None else np.array(start, dtype=np.float64)
-        )
-        if (
-            self.start.shape != (count,)
-            or (self.start < 0).any()
-            or not np.isclose(self.start.sum(), 1)
-        ):
             raise ValueError(
-                f"start must be {count} probabilities, one a state, that sum to 1; got {self.start}"
+                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where}); "
+                f"they sum to {total[s, a]:g}"
             )
-        self.r: Array = (self.P * self.R).sum(
-            axis=2
-        )  # [S, A], expected reward of an action in a state
 
     @property
     def terminal(self) -> NDArray[np.bool_]:
@@ -85,34 +94,50 @@ class MDP:
         return (stays & (self.r == 0)).all(axis=1)
 
     def q(self, V: Array) -> Array:
-        """Return r + gamma P V, [S, A], given state values V [S]."""
+        """Return the value of each action, r + gamma P V, [S, A].
+
+        Args:
+            V: [S], the value of each state.
+        """
         return self.r + self.gamma * self.P @ V
 
     def probabilities(self, policy: ArrayLike) -> Array:
-        """Return a policy, which is actions [S] or their probabilities [S, A], as probabilities [S, A].
+        """Return the probabilities of the actions under a policy, [S, A].
 
-        If it is neither, a `ValueError` names the state.
+        Args:
+            policy: actions, [S] integers; or already their probabilities, [S, A].
+
+        Raises:
+            ValueError: if it is neither; the message names the first state that is wrong.
         """
         array = np.asarray(policy)
         count, choices = self.P.shape[:2]
         if array.shape == (count,) and array.dtype.kind in "iu":
-            if wrong := [s for s in range(count) if not 0 <= array[s] < choices]:
-                problem = f"policy[{wrong[0]}]={array[wrong[0]]} is no action in state {self.states[wrong[0]]}"
-                raise ValueError(f"{problem}; actions are 0 to {choices - 1}")
+            for s in range(count):
+                if not 0 <= array[s] < choices:
+                    raise ValueError(
+                        f"policy[{s}]={array[s]} is no action in state {self.states[s]}; "
+                        f"actions are 0 to {choices - 1}"
+                    )
             return np.eye(choices)[array]
         if array.shape != (count, choices):
-            expected = (
-                f"[{count}] integers, an action a state, or [{count}, {choices}] probabilities"
-            )
             raise ValueError(
-                f"A policy is {expected}; got {array.dtype} of the shape {array.shape}"
+                f"A policy is [{count}] integers, an action a state, or "
+                f"[{count}, {choices}] probabilities; "
+                f"got {array.dtype} of the shape {array.shape}"
             )
         for s in range(count):
-            if (array[s] < 0).any() or not np.isclose(array[s].sum(), 1):
+            if not _is_distribution(array[s]):
                 raise ValueError(
-                    f"policy[{s}]={array[s]} must be probabilities that sum to 1, state {self.states[s]}"
+                    f"policy[{s}]={array[s]} must be probabilities that sum to 1, "
+                    f"state {self.states[s]}"
                 )
         return array.astype(np.float64)
+
+
+def _is_distribution(probabilities: Array) -> bool:
+    """Return whether numbers are not negative and sum to 1."""
+    return not (probabilities < 0).any() and bool(np.isclose(probabilities.sum(), 1))
 
 
 def _names(kind: str, names: Sequence[str] | None, count: int) -> tuple[str, ...]:
@@ -129,6 +154,9 @@ def toymaker(gamma: float = 0.95) -> MDP:
     The toy is successful or not, and the toymaker advertises or not. Advertising costs reward now
     and makes a successful toy more likely; with a discount factor below 20/29, about 0.69, it does
     not pay.
+
+    Args:
+        gamma: the discount factor, from 0 to less than 1.
     """
     P = [[[0.5, 0.5], [0.8, 0.2]], [[0.4, 0.6], [0.7, 0.3]]]
     R = [[[9.0, 3.0], [4.0, 4.0]], [[3.0, -7.0], [1.0, -19.0]]]
@@ -146,9 +174,15 @@ def garnet(
 ) -> MDP:
     """Return a random world (a Garnet, Archibald et al. 1995).
 
-    Each action leads to `branches` randomly drawn states, from 1 to `states`, with probabilities
-    from a flat Dirichlet distribution and a normally distributed reward that does not depend on the
-    next state.
+    Each action leads to some randomly drawn states, with probabilities from a flat Dirichlet
+    distribution and a normally distributed reward that does not depend on the next state.
+
+    Args:
+        states: number of states.
+        actions: number of actions.
+        rng: of all random numbers.
+        branches: number of states to which an action can lead, from 1 to `states`.
+        gamma: the discount factor, from 0 to less than 1.
     """
     if not 1 <= branches <= states:
         raise ValueError(f"branches={branches} must be between 1 and states={states}")

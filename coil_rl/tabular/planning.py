@@ -1,7 +1,7 @@
-"""Dynamic programming: optimal control of a known Markov decision process (paper algorithms 1 to 3).
+"""Dynamic programming: optimal control of a known Markov decision process (algorithms 1 to 3).
 
-All three iterate the Bellman equation as an assignment, V <- r + gamma P V, a contraction with
-factor gamma.
+All three algorithms of the paper iterate the Bellman equation as an assignment,
+V <- r + gamma P V, which is a contraction with factor gamma.
 """
 
 from dataclasses import dataclass
@@ -16,18 +16,31 @@ TIE = 1e-9  # smaller differences of Q are rounding
 
 @dataclass(frozen=True)
 class PlanningResult:
-    """An optimal policy and its values."""
+    """An optimal policy and its values.
 
-    policy: Integers  # [S] actions
-    V: Array  # [S], value of each state
-    Q: Array  # [S, A], value of each action, followed by the policy
-    history: Array  # [K + 1, S], V before and after each of the K iterations
+    Attributes:
+        policy: [S], the action in each state.
+        V: [S], the value of each state.
+        Q: [S, A], the value of each action, followed by the policy.
+        history: [K + 1, S], V before and after each of the K iterations.
+    """
+
+    policy: Integers
+    V: Array
+    Q: Array
+    history: Array
 
 
 def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> Array:
-    """Return V [S] of a policy, by iteration from 0 (algorithm 1); `tolerance` is the largest error of V, above 0.
+    """Return the value of each state under a policy, by iteration from 0 (algorithm 1).
 
-    The policy is actions [S], or their probabilities [S, A].
+    Args:
+        mdp: the world.
+        policy: actions [S], or their probabilities [S, A].
+        tolerance: the largest error of V, more than 0.
+
+    Returns:
+        V, [S].
     """
     pi = mdp.probabilities(policy)
     V = np.zeros(len(mdp.states))
@@ -38,7 +51,17 @@ def policy_evaluation(mdp: MDP, policy: ArrayLike, tolerance: float = 1e-9) -> A
 
 
 def solve(mdp: MDP, policy: ArrayLike) -> Array:
-    """Return V [S] of a policy as the solution of the linear equations V = r + gamma P V, without iteration."""
+    """Return the value of each state under a policy, by solving V = r + gamma P V.
+
+    The equations are linear in V, so this needs no iteration.
+
+    Args:
+        mdp: the world.
+        policy: actions [S], or their probabilities [S, A].
+
+    Returns:
+        V, [S].
+    """
     pi = mdp.probabilities(policy)
     P, r = np.einsum("sa,sat->st", pi, mdp.P), (pi * mdp.r).sum(axis=1)
     return np.linalg.solve(np.eye(len(r)) - mdp.gamma * P, r)
@@ -49,13 +72,19 @@ def policy_iteration(
 ) -> PlanningResult:
     """Alternate policy evaluation and greedy improvement until the policy is stable (algorithm 2).
 
-    It starts from `policy` [S], by default the first action everywhere. `history` has V of each
-    intermediate policy.
+    Args:
+        mdp: the world.
+        policy: actions [S] to begin with; by default the first action everywhere.
+        tolerance: the largest error of V in each policy evaluation, more than 0.
+
+    Returns:
+        The optimal policy; its `history` has V of each intermediate policy.
     """
     count = len(mdp.states)
-    policy = (
-        np.zeros(count, dtype=np.int64) if policy is None else np.asarray(policy, dtype=np.int64)
-    )
+    if policy is None:
+        policy = np.zeros(count, dtype=np.int64)
+    else:
+        policy = np.asarray(policy, dtype=np.int64)
     history = []
     while True:
         V = policy_evaluation(mdp, policy, tolerance)
@@ -71,7 +100,12 @@ def policy_iteration(
 def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
     """Iterate V <- max over actions of r + gamma P V from 0 until convergence (algorithm 3).
 
-    The tolerance is the largest error of V, above 0. `history` has V after each iteration.
+    Args:
+        mdp: the world.
+        tolerance: the largest error of V, more than 0.
+
+    Returns:
+        The optimal policy; its `history` has V after each iteration.
     """
     history = [np.zeros(len(mdp.states))]
     while True:
@@ -83,7 +117,10 @@ def value_iteration(mdp: MDP, tolerance: float = 1e-9) -> PlanningResult:
 
 
 def _converged(mdp: MDP, V: Array, previous: Array, tolerance: float) -> bool:
-    """Return whether V is within the tolerance of its limit, by the geometric bound on the remaining changes."""
+    """Return whether V is within the tolerance of its limit.
+
+    The change of an iteration bounds the sum of all later changes, which is a geometric series.
+    """
     if not tolerance > 0:
         raise ValueError(
             f"tolerance={tolerance} must be more than 0, or the iteration would not end"

@@ -9,7 +9,6 @@ from outside_package.install import PROXY, SOURCE, TINY
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
-from coil_rl.config.python import prepare
 from coil_rl.run.parts import TEST
 
 CONF = Path(__file__).parents[3] / "conf"
