@@ -19,7 +19,8 @@ from torchrl.envs import EnvBase, TransformedEnv
 
 import coil_rl.config.schema  # noqa: F401  registers the schema
 from benchmarks.timing import Row, measure, median_ratio, medians, synchronise
-from coil_rl.config.build import build_bare_env, build_guides, compile_steps
+from coil_rl.compiled import compile_steps
+from coil_rl.config.build import build_bare_env, build_guides
 from coil_rl.envs import (
     Perception,
     read_recording,
@@ -141,9 +142,8 @@ def measure_compiled(args: Namespace) -> list[Row]:
     """Return the speed of the guide's drives with compiled steps beside that without."""
     rows = []
     for cars in args.compile:
-        env = compile_steps(
-            train_config(args, "coil", "compile=true"), driving_env(args, cars, guide=True)
-        )
+        env = driving_env(args, cars, guide=True)
+        compile_steps(env)
         compiled, start = Driving(env, follow=True), time.perf_counter()
         compiled()
         synchronise()

@@ -19,14 +19,14 @@ from omegaconf import OmegaConf
 from benchmarks.driving import Driving, driving_env, train_config
 from benchmarks.ppo import PlainPPO
 from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
+from coil_rl.compiled import compile_steps
 from coil_rl.config.build import (
-    build,
     build_bare_env,
-    build_env,
     build_guides,
     build_learner,
-    compile_steps,
+    env_maker,
 )
+from coil_rl.config.nodes import build
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import read_runs
@@ -51,7 +51,9 @@ class Training:
         self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False
     ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
-        env = compile_steps(config, build_env(config, {"num_envs": cars}))
+        env = env_maker(config)(cars)
+        if config.compile:
+            compile_steps(env)
         learner = build_learner(config, env)
         keys = [*learner.keys, *watched_keys(env, {})]
         rollout = Rollout(env, learner.policy, steps, keys, config.training.noise_correlation)
@@ -143,7 +145,7 @@ def measure_training(args: Namespace) -> list[Row]:
 def floor_rate(args: Namespace, frames: int) -> float:
     """Return the frames per second of PPO if it only multiplied matrices, at the measured speed of its largest ones."""
     config = train_config(args, "ppo")
-    learner = build_learner(config, build_env(config, {"num_envs": 1}))
+    learner: Any = build_learner(config, env_maker(config)(1))
     sizes = [parameter.numel() for parameter in learner.gradient.parameters if parameter.ndim == 2]
     # Of each weight a multiplication and an addition: forward, and twice backward; and once to act
     # and to value.

@@ -21,7 +21,6 @@ from matplotlib.patches import Patch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from coil_rl.config import load
 from coil_rl.config.build import build_evaluation, guide_results
 from coil_rl.config.nodes import build
 from coil_rl.config.saved import read_config
@@ -90,9 +89,10 @@ def drive(
     )
     drives = dict(guide_results(configs[0], evaluation))
     for run, config in zip(runs, configs, strict=True):
-        env = build_env(config, {**config.evaluation.env, "num_envs": len(tracks)})
+        opened = assemble(config, run)
+        env = opened.make_env(len(tracks), TEST)
         name = config.label if config.label not in drives else f"{config.label}, seed {config.seed}"
-        drives[name] = evaluation.drive(env, load.load_policy(run, config, env, policy))
+        drives[name] = evaluation.run(env, opened.load_policy(env, policy))
     return tracks, drives
 
 

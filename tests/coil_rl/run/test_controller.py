@@ -33,7 +33,7 @@ def executed(run):
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(STEPS):
             observations.append(plant.rows[0].observation)
-            step, carrier = env.step_and_maybe_reset(policy(carrier))
+            _, carrier = env.step_and_maybe_reset(policy(carrier))
             actions.append(plant._decode(plant.actions[-1])[0])
     return observations, actions
 
