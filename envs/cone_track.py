@@ -3,6 +3,10 @@
 Each car drives on a closed track between two rings of cones at constant speed and chooses its
 steering. It observes the cones ahead. The reward pays for laps, newly visible cones and each step,
 and charges for rough steering and crashes.
+
+This file holds the state of the cars and puts a step together: move, count laps, look for cones,
+estimate the boundaries, judge. Each of these parts is in a file of its own. A step consists of the
+same tensor operations for all cars, whatever happens to them, and does not wait for the device.
 """
 
 import math
@@ -42,9 +46,9 @@ class SeededEnv(EnvBase):
     generator: torch.Generator
 
     def __setattr__(self, name: str, value: Any) -> None:
-        if name in (
-            buffers := self.__dict__.get("_buffers", {})
-        ):  # PyTorch's checks take longer than an operation
+        # For a buffer, the checks of PyTorch take longer than an operation on it.
+        buffers = self.__dict__.get("_buffers", {})
+        if name in buffers:
             buffers[name] = value
         else:
             super().__setattr__(name, value)
@@ -65,27 +69,35 @@ class SeededEnv(EnvBase):
 class ConeTrackEnv(SeededEnv):
     """Cars on tracks between cones.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes `observation` [B,
-    20], `cones` [B, 2, K, 2] m in the car's frame nearest first, `cone_count` [B, 2], `steering`
-    [B, 1] the action in force, `motion` [B, 3] (m ahead, m to the left, radians) since the last
-    observation in the car's frame there, `reward`, `done`, `terminated`, `truncated` [B, 1], and
-    for evaluation only, under `info`: `track`, `lap` (completed laps), `lap_time` s (of the lap
-    just completed, else 0), `crashed`, `completed`, `clearance` m (to a crash), `smoothness` |a -
-    mean of the last 20 actions|, `pose` [B, 3] (m, m, radians) and `reward`, with one entry per
-    term.
+    Reads `action` [B, 1], the steering angle as a fraction of `max_steering`. It writes:
+
+    | entry | shape | meaning |
+    | --- | --- | --- |
+    | `observation` | [B, 20] | the boundaries ahead, see `encode_samples` |
+    | `cones` | [B, 2, K, 2] | m, car frame (x ahead, y left), left side first, nearest first |
+    | `cone_count` | [B, 2] | number of real cones among the K |
+    | `steering` | [B, 1] | the action in force |
+    | `motion` | [B, 3] | way since the last observation: m ahead, m to the left, radians |
+    | `reward`, `done`, `terminated`, `truncated` | [B, 1] | as in every env |
+
+    For evaluation only, it writes under `info`: `track` (index), `lap` (completed laps), `lap_time`
+    (s, of the lap just completed, else 0), `crashed`, `completed`, `clearance` (m, to a crash),
+    `smoothness` (|a - mean of the last 20 actions|), each [B, 1], `pose` [B, 3] (m, m, radians) and
+    `reward`, with one entry [B, 1] per term.
 
     Args:
-        tracks: the tracks.
-        num_envs: B.
+        tracks: the tracks, at least one; cars refer to them by index.
+        num_envs: B, the number of cars, which are independent of each other.
         rate: control steps per second.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
             parabola).
         smoothing: lambda of the cubic smoothing spline, m^3.
         cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes
             into sight.
-        reward: weights, see `RewardWeights`.
+        reward: weights by the names of `RewardWeights`; the others, or all with None, are those of
+            the paper.
         laps: completed laps that end an episode.
-        time_limit: s, after which an episode is truncated.
+        time_limit: s, after which an episode is truncated; at least one step.
         held_steps: number of steps at the start of an episode with steering 0.
         starts: number of places where an episode may begin; place i is on track i mod len(tracks),
             and those of a track are spread along its middle. A lap that begins there counts as
@@ -100,12 +112,12 @@ class ConeTrackEnv(SeededEnv):
         late_observation: whether `observation` is the one of the step before; `cones` are not late.
         finish_in_sight: whether the finish line is between the first cones of the level file that
             are visible from the track's start, in place of the first ones.
-        kept_cones: K.
-        speed: m/s.
-        car_length: m.
-        max_steering: degrees of an action of 1.
-        info: whether to write `info`.
-        seed: of the draw of tracks.
+        kept_cones: K, the nearest visible cones of each side that are written.
+        speed: m/s, constant.
+        car_length: m, distance between the axles.
+        max_steering: degrees of an action of 1, at most 90.
+        info: whether to write `info`, which takes time.
+        seed: of the draw of places, at least 0.
         device: of all tensors.
         dtype: of all floating-point tensors.
 
@@ -171,13 +183,8 @@ class ConeTrackEnv(SeededEnv):
         check_weights("reward", reward or {}, RewardWeights._fields)
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.dtype_, self.generator = dtype, torch.Generator()
-        self.rate, self.laps, self.held_steps, self.assignment, self.info = (
-            rate,
-            laps,
-            held_steps,
-            assignment,
-            info,
-        )
+        self.rate, self.laps, self.held_steps = rate, laps, held_steps
+        self.assignment, self.info = assignment, info
         self.max_steps = round(time_limit * rate)
         self.every_sighting = cone_bonus == "every_sighting"
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
@@ -222,17 +229,11 @@ class ConeTrackEnv(SeededEnv):
                 pose=real((3,)),
                 reward=terms,
             )
-        ends = Composite(
-            {key: flag.clone() for key in ("done", "terminated", "truncated")}, device=self.device
-        )
-        self.observation_spec, self.done_spec = (
-            observation.expand(self.batch_size),
-            ends.expand(self.batch_size),
-        )
-        self.action_spec, self.reward_spec = (
-            bounded((*self.batch_size, 1)),
-            real((*self.batch_size, 1)),
-        )
+        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.observation_spec = observation.expand(self.batch_size)
+        self.done_spec = Composite(ends, device=self.device).expand(self.batch_size)
+        self.action_spec = bounded((*self.batch_size, 1))
+        self.reward_spec = real((*self.batch_size, 1))
 
     def _register_state(self, cars: int) -> None:
         """Register all state as buffers; their last dimension is the cars."""
@@ -245,78 +246,101 @@ class ConeTrackEnv(SeededEnv):
         self.history: Tensor = zeros(HISTORY)  # actions, newest first
         self.steps: Tensor = zeros(dtype=torch.int32)  # of the episode
         self.lap: Tensor = zeros(dtype=torch.int32)  # completed laps
-        self.lap_start: Tensor = zeros(
-            dtype=torch.int32
-        )  # step of the last entry of the finish circle
+        # Step of the last entry of the finish circle.
+        self.lap_start: Tensor = zeros(dtype=torch.int32)
         self.in_finish: Tensor = zeros(dtype=torch.bool)  # whether inside the finish circle
-        self.epoch: Tensor = zeros(
-            dtype=torch.int32
-        )  # number of steps over all episodes, and of resets
+        # Number of steps over all episodes, and of resets; a clock that never goes back.
+        self.epoch: Tensor = zeros(dtype=torch.int32)
         self.lap_epoch: Tensor = zeros(dtype=torch.int32)  # epoch in which the lap began
-        self.last_seen: Tensor = zeros(
-            2 * self.map.slots, dtype=torch.int32
-        )  # epoch of each cone's last sighting
-        self.samples: Tensor = zeros(
-            2, SAMPLES, 2
-        )  # m, last boundary estimate, in world coordinates
+        # Epoch of each cone's last sighting.
+        self.last_seen: Tensor = zeros(2 * self.map.slots, dtype=torch.int32)
+        # m, last boundary estimate, in world coordinates.
+        self.samples: Tensor = zeros(2, SAMPLES, 2)
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
-        self.latest: Tensor = zeros(
-            4 * SAMPLES if self.late_observation else 0
-        )  # observation that is not yet output
-        self.state_names = [
-            name for name, _ in self.named_buffers(recurse=False) if name != "weights"
-        ]
+        # Observation that is not yet output.
+        self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)
+        buffers = self.named_buffers(recurse=False)
+        self.state_names = [name for name, _ in buffers if name != "weights"]
 
     def _register_starts(self, starts: int | None) -> None:
         """Observe all P places where an episode may begin once, so that a reset only copies."""
         index, pose, driven = map(torch.as_tensor, places(self.map.tracks, starts))
         tracks, pose = index.to(self.device), pose.T.contiguous().to(self.map.starts)
-        lap_start = (
-            torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed)
-            .round()
-            .int()
-            .to(self.device)
-        )
+        # A negative step: the one at which a car at full speed would have been at the finish.
+        lap_start = torch.where(driven.isnan(), NEVER, -driven * self.rate / self.speed)
+        lap_start = lap_start.round().int().to(self.device)
         frame = Frame(pose)
         location = self.map.locate(tracks, frame.position)
         visible, _, cones = self._view(location, pose, frame)
         samples = torch.zeros(2, SAMPLES, 2, len(tracks), dtype=self.dtype_, device=self.device)
         new, sampled = torch.ones_like(lap_start, dtype=torch.bool), torch.zeros_like(samples[0, 0])
         observation, samples, sampled = self._observe(frame, visible, cones, new, samples, sampled)
-        latest = observation.t()
-        outputs = {"observation": latest, "cones": visible.cones, "count": visible.count.long()}
-        state = {
+        buffers = {
+            "observation": observation.t(),
+            "cones": visible.cones,
+            "count": visible.count.long(),
             "track": tracks,
             "pose": pose,
             "lap_start": lap_start,
             "samples": samples,
             "sampled": sampled,
+            "latest": observation.t()[: len(self.latest)],
+            "in_finish": _in_finish(location) & (lap_start > NEVER),
         }
-        state["latest"] = latest[: len(self.latest)]
-        state["in_finish"] = _in_finish(location) & (lap_start > NEVER)
-        for name, value in {**outputs, **state}.items():
+        for name, value in buffers.items():
             self.register_buffer(f"start_{name}", value, persistent=False)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         everyone = torch.arange(self.batch_size[0], device=self.device)
         cars = everyone if mask is None else mask.view(-1).nonzero().squeeze(-1)
-        count = len(self.start_track)
-        steps = torch.zeros_like(cars, dtype=self.steps.dtype)
-        if self.assignment == "cyclic":
-            place = cars % count
-        else:
-            # One draw per car, reset or not, keeps the random sequence independent of the data.
-            drawn = torch.randint(count, self.batch_size, generator=self.generator)
-            place = drawn.to(self.device).index_select(0, cars)
-            if mask is None and self.staggered:
-                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator).to(
-                    steps
-                )
+        place, steps = self._assign_places(cars, first=mask is None)
 
         def start(of_places: Tensor) -> Tensor:
             return of_places.index_select(-1, place)
 
+        self._begin(cars, steps, start)
+        zero = torch.zeros_like(self.pose[0])
+        observation, cones, count = (
+            at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
+            for at in (self.start_observation, self.start_cones, self.start_count)
+        )
+        flags = {"crashed": zero.bool(), "completed": zero.bool()}
+        info = {"lap_time": zero, **flags, "clearance": zero, "smoothness": zero}
+        motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
+        return self._output(observation.t(), cones, count, motion, info, terms)
+
+    def _assign_places(self, cars: Tensor, *, first: bool) -> tuple[Tensor, Tensor]:
+        """Choose where cars begin their episodes.
+
+        Args:
+            cars: [N], indices of the cars that are reset.
+            first: whether this is a reset of all cars, not of those whose episodes ended.
+
+        Returns:
+            The place of each car, and the number of steps of its time limit that are over, [N]
+            each.
+        """
+        count = len(self.start_track)
+        steps = torch.zeros_like(cars, dtype=self.steps.dtype)
+        if self.assignment == "cyclic":
+            return cars % count, steps
+        # One draw per car, reset or not, keeps the random sequence independent of the data.
+        drawn = torch.randint(count, self.batch_size, generator=self.generator)
+        place = drawn.to(self.device).index_select(0, cars)
+        if first and self.staggered:
+            over = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
+            steps = over.to(steps)
+        return place, steps
+
+    def _begin(self, cars: Tensor, steps: Tensor, start: Callable[[Tensor], Tensor]) -> None:
+        """Write the state at the start of an episode.
+
+        Args:
+            cars: [N], indices of the cars that are reset.
+            steps: [N], number of steps of the time limit that are over.
+            start: takes a table over all places [..., P] and returns the columns of the cars.
+        """
         kept = ("track", "pose", "samples", "sampled", "latest")
         copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
         copied |= {"steps": steps, "in_finish": start(self.start_in_finish)}
@@ -328,35 +352,28 @@ class ConeTrackEnv(SeededEnv):
         # Under either rule of the cone bonus, no cone was seen in the epoch before the new one.
         self.epoch = self.epoch.index_add(0, cars, torch.full_like(cars, 2, dtype=self.epoch.dtype))
         self.lap_epoch = self.lap_epoch.index_copy(0, cars, self.epoch.index_select(0, cars))
-        zero = torch.zeros_like(self.pose[0])
-        observation, cones, count = (
-            at.new_zeros(*at.shape[:-1], len(everyone)).index_copy_(-1, cars, start(at))
-            for at in (self.start_observation, self.start_cones, self.start_count)
-        )
-        flags = {"crashed": zero.bool(), "completed": zero.bool()}
-        info = {"lap_time": zero, **flags, "clearance": zero, "smoothness": zero}
-        motion, terms = torch.zeros_like(self.pose), dict.fromkeys(self.reward_terms, zero)
-        return self._output(observation.t(), cones, count, motion, info, terms)
 
     def compile_steps(
         self, compiled: Callable[[Callable[..., list[Tensor]]], Callable[..., Sequence[Tensor]]]
     ) -> None:
-        """Compile the steps by a function that compiles one of tensors; the last digits of the numbers change."""
+        """Compile the steps; the last digits of the numbers change.
+
+        Args:
+            compiled: compiles a function from tensors to tensors.
+        """
         self.compiled = compiled(self._step_on_tensors)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].detach().view(-1).clamp(-1, 1)
         if self.compiled is None:
             return self._advance(action)
-        values = self.compiled(
-            action, *(getattr(self, name) for name in self.state_names), *self.tables
-        )
-        entries = len(self.entries)
-        for name, value in zip(self.changed, values[entries:], strict=True):
+        state = [getattr(self, name) for name in self.state_names]
+        values = self.compiled(action, *state, *self.tables)
+        count = len(self.entries)
+        for name, value in zip(self.changed, values[count:], strict=True):
             setattr(self, name, value)
-        return TensorDict(
-            dict(zip(self.entries, values, strict=False)), self.batch_size, device=self.device
-        )
+        entries = dict(zip(self.entries, values[:count], strict=True))
+        return TensorDict(entries, self.batch_size, device=self.device)
 
     def _step_on_tensors(self, action: Tensor, *tensors: Tensor) -> list[Tensor]:
         """Return the entries after a step and the state that it replaces, for compilation."""
@@ -370,6 +387,7 @@ class ConeTrackEnv(SeededEnv):
         return [*(output[key] for key in self.entries), *(after[name] for name in self.changed)]
 
     def _advance(self, action: Tensor) -> TensorDict:
+        """Drive one step with actions [B], and return the entries after it."""
         if self.held_steps:
             action = action * (self.steps >= self.held_steps)
         roughness = (action - recent_mean(self.history)).abs_()
@@ -382,27 +400,75 @@ class ConeTrackEnv(SeededEnv):
         lap_time, finished = self._count_laps(location)
         visible, slots, cones = self._view(location, self.pose, frame)
         discovered, new = self._count_new_cones(visible, slots, finished)
+        observation = self._next_observation(frame, visible, cones, new)
+        outcome, clearance = self._outcome(
+            location, action, roughness, lap_time, finished, discovered
+        )
+        return self._judged(observation, visible, motion, outcome, clearance)
+
+    def _outcome(
+        self,
+        location: Location,
+        action: Tensor,
+        roughness: Tensor,
+        lap_time: Tensor,
+        finished: Tensor,
+        discovered: Tensor,
+    ) -> tuple[Outcome, Tensor]:
+        """Find out who crashed; return the outcome of the step, and the distance to a crash [B] m.
+
+        The arguments after the location are those of `Outcome`.
+        """
+        to_boundaries = self.map.to_boundaries(location)
+        clearance = self.map.clearance(location, to_boundaries)
+        crashed = clearance <= constant(0, clearance)
+        alive = (~crashed).to(action.dtype)
+        outcome = Outcome(
+            action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive
+        )
+        return outcome, clearance
+
+    def _next_observation(self, frame: Frame, visible: View, cones: Tensor, new: Tensor) -> Tensor:
+        """Estimate the boundaries, and return the observation to output [B, 20].
+
+        With `late_observation` that is the one of the step before.
+        """
         observed = self._observe(frame, visible, cones, new, self.samples, self.sampled)
         observation, self.samples, self.sampled = observed
         if self.late_observation:
             observation, self.latest = self.latest.t(), observation.t()
-        to_boundaries = self.map.to_boundaries(location)
-        clearance = self.map.clearance(location, to_boundaries)
+        return observation
 
-        crashed = clearance <= constant(0, clearance)
-        alive = (~crashed).to(action.dtype)
-        terms = self._reward(
-            Outcome(
-                action, roughness, lap_time, finished, discovered, to_boundaries, crashed, alive
-            )
-        )
+    def _judged(
+        self,
+        observation: Tensor,
+        visible: View,
+        motion: Tensor,
+        outcome: Outcome,
+        clearance: Tensor,
+    ) -> TensorDict:
+        """Return the entries after a step, with its reward and the ends of episodes.
+
+        Args:
+            observation: [B, 20].
+            visible: the cones in sight.
+            motion: [3, B], m ahead, m to the left, radians.
+            outcome: what happened in the step.
+            clearance: [B] m, distance to a crash.
+        """
+        crashed = outcome.crashed
+        terms = self._reward(outcome)
         completed = (self.lap >= constant(self.laps, self.lap)) & ~crashed
         terminated = crashed | completed
         truncated = (self.steps >= constant(self.max_steps, self.steps)) & ~terminated
-        reward = reduce(torch.add, terms.values()).to(action.dtype)
-        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        flags = {"crashed": crashed, "completed": completed}
-        info = {"lap_time": lap_time, **flags, "clearance": clearance, "smoothness": roughness}
+        reward = reduce(torch.add, terms.values()).to(outcome.action.dtype)
+        info = {
+            "lap_time": outcome.lap_time,
+            "crashed": crashed,
+            "completed": completed,
+            "clearance": clearance,
+            "smoothness": outcome.roughness,
+        }
         return self._output(
             observation,
             visible.cones,
@@ -411,22 +477,30 @@ class ConeTrackEnv(SeededEnv):
             info,
             terms,
             reward=reward,
-            **ends,
+            terminated=terminated,
+            truncated=truncated,
+            done=terminated | truncated,
         )
 
     def _move(self, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Return pose and motion by the bicycle model (equations 99-100): move along the heading, then turn."""
+        """Return pose and motion after a step of the bicycle model (equations 99-100).
+
+        A car moves along its heading and then turns. Both results are [3, B]: the new pose in m, m
+        and radians, and the way there in m ahead, m to the left and radians.
+        """
         heading = self.pose[2]
         turn = (action * constant(self.max_steering, action)).sin_()
         step = self.speed / self.rate
         strides = constant((step, step, step / self.car_length), self.pose)
         pose = torch.addcmul(self.pose, strides, torch.stack([heading.cos(), heading.sin(), turn]))
-        return pose, torch.cat(
-            [constant((step, 0.0), pose).expand(2, len(turn)), (turn * strides[2]).unsqueeze(0)]
-        )
+        forward = constant((step, 0.0), pose).expand(2, len(turn))
+        return pose, torch.cat([forward, (turn * strides[2]).unsqueeze(0)])
 
     def _count_laps(self, location: Location) -> tuple[Tensor, Tensor]:
-        """Count laps; return the lap time in s [B], 0 unless a lap was completed, and whether one was [B]."""
+        """Count laps; return lap time and whether a lap was completed, [B] each.
+
+        The lap time is in s, 0 unless a lap was completed.
+        """
         inside = _in_finish(location)
         entered = inside & ~self.in_finish
         finished = entered & (self.lap_start > constant(NEVER, self.lap_start))
@@ -450,54 +524,82 @@ class ConeTrackEnv(SeededEnv):
         samples: Tensor,
         sampled: Tensor,
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the observation [B, 20] and the new `samples` and `sampled`.
+        """Estimate the boundaries; return the observation and the new `samples` and `sampled`.
 
         A side with fewer than two visible cones keeps its last estimate. A held boundary is
-        estimated where a cone of the candidates is `new` [B] in sight.
+        estimated only where a cone came into sight.
+
+        Args:
+            frame: of the cars.
+            visible: the cones in sight.
+            cones: positions of all candidates, [2, N, 2, B] m in world coordinates.
+            new: [B], whether a cone of the candidates came into sight.
+            samples: last boundary estimate, [2, 5, 2, B] m in world coordinates.
+            sampled: [2, B], 1 for a side with an estimate.
+
+        Returns:
+            The observation [B, 20], `samples` and `sampled`.
         """
         if self.hold_boundary:
-            rows = rows_in_use(new)
-            if len(rows):
-                index = visible.index.view(visible.real.shape).index_select(-1, rows)
-                chosen = cones.flatten(1).index_select(1, index.flatten()).view(2, *index.shape)
-                estimate = self._estimate_distinct(chosen, visible.count.index_select(1, rows))
-                estimate = torch.where(
-                    new.index_select(0, rows), estimate, samples.index_select(-1, rows)
-                )
-                samples = samples.index_copy(-1, rows, estimate)
+            samples = self._held_samples(visible, cones, new, samples)
             sampled = torch.ones_like(sampled)
             return encode_samples(frame.to_car(samples), sampled, self.sight), samples, sampled
         fresh = visible.real[1]
         local = self.fit(visible.cones, visible.count).equidistant(SAMPLES)
         samples = torch.lerp(samples, frame.to_world(local), fresh)
         sampled = torch.maximum(sampled, fresh)
-        return (
-            encode_samples(torch.lerp(frame.to_car(samples), local, fresh), sampled, self.sight),
-            samples,
-            sampled,
-        )
+        # A fresh estimate is observed as it was made, without the detour over world coordinates.
+        local = torch.lerp(frame.to_car(samples), local, fresh)
+        return encode_samples(local, sampled, self.sight), samples, sampled
+
+    def _held_samples(self, visible: View, cones: Tensor, new: Tensor, samples: Tensor) -> Tensor:
+        """Estimate held boundaries where a cone came into sight; arguments as for `_observe`."""
+        rows = rows_in_use(new)
+        if not len(rows):
+            return samples
+        index = visible.index.view(visible.real.shape).index_select(-1, rows)
+        chosen = cones.flatten(1).index_select(1, index.flatten()).view(2, *index.shape)
+        estimate = self._estimate_distinct(chosen, visible.count.index_select(1, rows))
+        held = samples.index_select(-1, rows)
+        estimate = torch.where(new.index_select(0, rows), estimate, held)
+        return samples.index_copy(-1, rows, estimate)
 
     def _estimate_distinct(self, cones: Tensor, count: Tensor) -> Tensor:
-        """Return the samples of a held boundary in world coordinates [2, 5, 2, R], for cones [2, K, 2, R]."""
+        """Return samples of held boundaries, without cones that share x or y with a nearer one.
+
+        Args:
+            cones: visible cones, [2, K, 2, R] m in world coordinates, nearest first.
+            count: [2, R], number of real cones.
+
+        Returns:
+            Samples in world coordinates, [2, 5, 2, R] m.
+        """
         real = count > constant(range(cones.shape[1]), cones[0])
         distinct = first_come(real, (cones.unsqueeze(1) == cones.unsqueeze(2)).any(0))
-        points, count = append(
-            torch.zeros_like(cones), torch.zeros_like(count, dtype=torch.int64), cones, distinct
-        )
+        none = torch.zeros_like(count, dtype=torch.int64)
+        points, count = append(torch.zeros_like(cones), none, cones, distinct)
         return self.fit(points, count).equidistant(SAMPLES) * (count > 1)
 
     def _count_new_cones(
         self, visible: View, slots: Tensor, finished: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """Note the visible cones; return the number of sides with a rewarded one and whether one came into view."""
+        """Note the visible cones, and find those that count as new.
+
+        Args:
+            visible: the cones in sight.
+            slots: slots of all candidates, [N, 2, B].
+            finished: [B], whether a new lap began, in which all cones are new.
+
+        Returns:
+            The number of sides with a rewarded cone, and whether any cone came into view, [B] each.
+        """
         before = self.epoch
         self.epoch = before + constant(1, before)
         self.lap_epoch = torch.where(finished, self.epoch, self.lap_epoch)
         slots = slots.flatten().index_select(0, visible.index).view_as(visible.candidate)
         cars = len(self.epoch)
-        index = torch.add(
-            constant(range(cars), self.epoch, torch.int64), slots, alpha=cars
-        ).flatten()
+        columns = constant(range(cars), self.epoch, torch.int64)
+        index = torch.add(columns, slots, alpha=cars).flatten()
         last_seen = self.last_seen.view(-1)
         last = last_seen.index_select(0, index).view_as(slots)
         rewarded = visible.real * torch.lt(last, before if self.every_sighting else self.lap_epoch)
@@ -507,9 +609,8 @@ class ConeTrackEnv(SeededEnv):
 
     def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
         """Return the terms of the reward, [B] each."""
-        return weighted_terms(
-            outcome, dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True))
-        )
+        weights = dict(zip(RewardWeights._fields, self.weights.unbind(0), strict=True))
+        return weighted_terms(outcome, weights)
 
     def _output(
         self,
@@ -521,6 +622,17 @@ class ConeTrackEnv(SeededEnv):
         terms: dict[str, Tensor],
         **ends: Tensor,
     ) -> TensorDict:
+        """Put the entries of a reset or a step together, with the batch first.
+
+        Args:
+            observation: [B, 20].
+            cones: [2, at most K, 2, B] m.
+            count: [2, B].
+            motion: [3, B].
+            info: entries of `info` that this env does not hold itself, [B] each.
+            terms: terms of the reward, [B] each.
+            ends: reward and ends of episodes after a step, [B] each; none after a reset.
+        """
         missing = self.kept_cones - cones.shape[1]
         if missing > 0:
             cones = torch.cat([cones, cones.new_zeros(2, missing, *cones.shape[2:])], 1)
@@ -528,23 +640,21 @@ class ConeTrackEnv(SeededEnv):
             "observation": observation,
             "cones": cones.permute(3, 2, 1, 0),
             "cone_count": count.t(),
+            "motion": motion.t(),
+            "steering": self.history[0].unsqueeze(-1),
         }
-        data["motion"] = motion.t()
-        data |= {
-            key: value.unsqueeze(-1) for key, value in {"steering": self.history[0], **ends}.items()
-        }
+        data |= {key: value.unsqueeze(-1) for key, value in ends.items()}
         if self.info:
             info = {"track": self.track, "lap": self.lap.long(), **info}
             entries: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in info.items()}
             rewards = {key: value.to(self.dtype_).unsqueeze(-1) for key, value in terms.items()}
-            entries |= {
-                "pose": self.pose.t(),
-                "reward": TensorDict(rewards, self.batch_size, device=self.device),
-            }
+            entries["pose"] = self.pose.t()
+            entries["reward"] = TensorDict(rewards, self.batch_size, device=self.device)
             data["info"] = TensorDict(entries, self.batch_size, device=self.device)
         return TensorDict(data, self.batch_size, device=self.device)
 
 
 def _in_finish(location: Location) -> Tensor:
+    """Return whether each car is in the finish circle of its track, [B]."""
     square = (location.position - location.finish).square_().sum(0)
     return square < constant(FINISH_RADIUS**2, square)

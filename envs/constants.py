@@ -15,17 +15,30 @@ from torch import Tensor
 def constant(
     value: float | Sequence[float], like: Tensor, dtype: torch.dtype | None = None
 ) -> Tensor:
-    """Return a read-only constant that broadcasts against `like` [any, *batch], with its device and, by default, dtype.
+    """Return a constant tensor that broadcasts against another one; it must not be written to.
 
-    A number gives a tensor without dimensions; one number per row, as a tuple or a range, gives
-    [rows, 1, ...] with as many dimensions as `like`.
+    Args:
+        value: a number gives a tensor without dimensions; one number per row, as a tuple or a
+            range, gives [rows, 1, ...] with as many dimensions as `like`.
+        like: the other tensor, [any, *batch]; the constant is on its device.
+        dtype: of the constant; by default that of `like`.
     """
+    # Compiled code makes constants part of itself, so there is nothing to cache.
     make = _new if torch.compiler.is_compiling() else _cached
     return make(value, like.ndim - 1, dtype or like.dtype, like.device)
 
 
 def flat_index(rows: Tensor) -> Tensor:
-    """Return row indices [K, *batch] into a tensor [N, *batch] as indices into its flattened form, [K * batch]."""
+    """Convert row indices into a tensor to indices into its flattened form.
+
+    Args:
+        rows: [K, *batch], for each place of the batch the indices of K of the N rows of a tensor
+            [N, *batch].
+
+    Returns:
+        Indices into the flattened tensor [N * batch]: [K * batch], so that one `index_select` reads
+        other rows in each place of the batch.
+    """
     rows = rows.view(len(rows), -1)
     columns = rows.shape[1]
     make = _new if torch.compiler.is_compiling() else _cached

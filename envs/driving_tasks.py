@@ -6,7 +6,7 @@ of Dynamic COIL: one guide per task, and one agent that learns from all guides.
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -15,17 +15,25 @@ from torchrl.data import Binary, Composite, OneHot
 
 from coil_rl.envs.cone_track import ConeTrackEnv
 from coil_rl.envs.reward import TERMS, Outcome, RewardWeights, check_weights, weighted_terms
+from coil_rl.envs.sight import SIGHT
 from coil_rl.envs.track import Track
 
 
 class PositionWeights(NamedTuple):
-    """Weights of the lateral position: 1 at the left boundary, 0 in the middle, -1 at the right boundary."""
+    """Weights of the lateral position.
 
-    centre: float = 0.0  # per step and unit of |position|
-    left: float = 0.0  # per step and unit of position
-    inside: float = (
-        0.0  # per step and unit of position times action, positive on the inner side of a bend
-    )
+    The position is 1 at the left boundary, 0 in the middle and -1 at the right boundary.
+
+    Attributes:
+        centre: per step and unit of |position|.
+        left: per step and unit of position.
+        inside: per step and unit of position times action, which is positive on the inner side of a
+            bend.
+    """
+
+    centre: float = 0.0
+    left: float = 0.0
+    inside: float = 0.0
 
 
 WEIGHTS = (*RewardWeights._fields, *PositionWeights._fields)
@@ -39,17 +47,49 @@ class DrivingTasksEnv(ConeTrackEnv):
     in `reward` the terms of `PositionWeights`.
 
     Args:
-        tracks, num_envs, world: as for `ConeTrackEnv`.
-        tasks: name to weights, of `RewardWeights` and `PositionWeights`.
+        tracks: the tracks, at least one; cars refer to them by index.
+        num_envs: B, the number of cars, which are independent of each other.
+        tasks: name of each task to its weights, by the names of `RewardWeights` and
+            `PositionWeights`; at least one task.
         only: a task that all cars keep; by default they change between all tasks.
         duration: s, mean time until a task changes to another one, drawn every step with equal
-            probabilities.
-        reward: weights that a task does not set.
+            probabilities; at least one step.
+        reward: weights that a task does not set; those that are not here either are those of the
+            paper, and 0 for the lateral position.
+        rate: control steps per second.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
+            parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        cone_bonus: "first_sighting" rewards a cone once a lap, "every_sighting" whenever it comes
+            into sight.
+        laps: completed laps that end an episode.
+        time_limit: s, after which an episode is truncated; at least one step.
+        held_steps: number of steps at the start of an episode with steering 0.
+        starts: number of places where an episode may begin, as explained for `ConeTrackEnv`; None
+            for the starts of the tracks.
+        assignment: "random" draws a place at each reset, "cyclic" keeps car i on place i mod
+            places.
+        sight: m, range of view.
+        hold_boundary: whether the boundary estimate stays in place until a cone comes into view.
+        late_observation: whether `observation` is the one of the step before.
+        finish_in_sight: whether the finish line is between the first cones that are visible from
+            the track's start, in place of the first cones of the level file.
+        kept_cones: K, the nearest visible cones of each side that are written.
+        speed: m/s, constant.
+        car_length: m, distance between the axles.
+        max_steering: degrees of an action of 1, at most 90.
+        info: whether to write `info`, which takes time.
+        seed: of the draws of places and tasks, at least 0.
+        device: of all tensors.
+        dtype: of all floating-point tensors.
+
+    Raises:
+        ValueError: for a value outside its range, an unknown weight or an unknown task.
 
     Example:
         >>> from coil_rl.envs import DrivingTasksEnv, shipped_tracks
         >>> tasks = {"centred": {"centre": -1.0}, "left": {"left": 0.5}, "right": {"left": -0.5}}
-        >>> env = DrivingTasksEnv(shipped_tracks("train"), num_envs=8, tasks=tasks, reward={"alive": 0.5})
+        >>> env = DrivingTasksEnv(shipped_tracks("train"), num_envs=8, tasks=tasks)
         >>> env.rollout(3, break_when_any_done=False)["task"].shape
         torch.Size([8, 3, 3])
     """
@@ -65,7 +105,27 @@ class DrivingTasksEnv(ConeTrackEnv):
         only: str | None = None,
         duration: float = 10.0,
         reward: Mapping[str, float] | None = None,
-        **world: Any,
+        rate: float = 24.0,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 0.1,
+        cone_bonus: Literal["first_sighting", "every_sighting"] = "first_sighting",
+        laps: int = 2,
+        time_limit: float = 200.0,
+        held_steps: int = 0,
+        starts: int | None = None,
+        assignment: Literal["random", "cyclic"] = "random",
+        sight: float = SIGHT,
+        hold_boundary: bool = False,
+        late_observation: bool = False,
+        finish_in_sight: bool = False,
+        kept_cones: int = 16,
+        speed: float = 2.0,
+        car_length: float = 2.0,
+        max_steering: float = 80.0,
+        info: bool = True,
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+        dtype: torch.dtype = torch.float32,
     ) -> None:
         reward = reward or {}
         check_weights("reward", reward, WEIGHTS)
@@ -77,20 +137,51 @@ class DrivingTasksEnv(ConeTrackEnv):
             )
         if only is not None and only not in tasks:
             raise ValueError(f"only={only!r} must be one of {', '.join(tasks)}")
-        super().__init__(tracks, num_envs, **world)
+        # The weights of the base class stay unused: here they depend on the task of each car.
+        super().__init__(
+            tracks,
+            num_envs,
+            rate=rate,
+            spline=spline,
+            smoothing=smoothing,
+            cone_bonus=cone_bonus,
+            laps=laps,
+            time_limit=time_limit,
+            held_steps=held_steps,
+            starts=starts,
+            assignment=assignment,
+            sight=sight,
+            hold_boundary=hold_boundary,
+            late_observation=late_observation,
+            finish_in_sight=finish_in_sight,
+            kept_cones=kept_cones,
+            speed=speed,
+            car_length=car_length,
+            max_steering=max_steering,
+            info=info,
+            seed=seed,
+            device=device,
+            dtype=dtype,
+        )
         if not duration * self.rate >= 1:
             raise ValueError(f"duration={duration} must be at least one step of 1/{self.rate} s")
         self.tasks, self.duration = tuple(tasks), duration
         self.changing = only is None and len(tasks) > 1
-        common = RewardWeights()._asdict() | PositionWeights()._asdict() | dict(reward)
-        table = [[(common | dict(weights))[key] for weights in tasks.values()] for key in WEIGHTS]
-        options = {"dtype": self.dtype_, "device": self.device}
-        self.task_weights: Tensor = nn.Buffer(torch.tensor(table, **options), persistent=False)
-        self.one_hot: Tensor = nn.Buffer(torch.eye(len(tasks), **options), persistent=False)
+        table = _weight_table(tasks, reward)
+        self.task_weights: Tensor = nn.Buffer(
+            torch.tensor(table, dtype=dtype, device=self.device), persistent=False
+        )
+        self.one_hot: Tensor = nn.Buffer(
+            torch.eye(len(tasks), dtype=dtype, device=self.device), persistent=False
+        )
         first = 0 if only is None else self.tasks.index(only)
         self.task: Tensor = nn.Buffer(torch.full(self.batch_size, first, device=self.device))
+        self._declare_task_specs()
+
+    def _declare_task_specs(self) -> None:
+        count = len(self.tasks)
         self.observation_spec["task"] = OneHot(
-            len(tasks), (*self.batch_size, len(tasks)), **options
+            count, (*self.batch_size, count), dtype=self.dtype_, device=self.device
         )
         if self.info:
             flag = Binary(1, (*self.batch_size, 1), dtype=torch.bool, device=self.device)
@@ -109,24 +200,27 @@ class DrivingTasksEnv(ConeTrackEnv):
         return self._add_task(out, self.task)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        out, rewarded = super()._step(tensordict), self.task
+        out = super()._step(tensordict)
+        rewarded = self.task
         if self.changing:
             self.task = self._next_task()
         return self._add_task(out, rewarded)
 
     def _next_task(self) -> Tensor:
-        """Return the tasks of the next step [B]; one draw per car decides about the change and the new task."""
-        drawn = torch.rand(self.batch_size, generator=self.generator).to(
-            self.device, non_blocking=True
-        )
+        """Return the tasks of the next step, [B].
+
+        One draw per car decides both about the change and about the new task: its lowest values
+        stand for the other tasks, all higher ones for no change.
+        """
+        drawn = torch.rand(self.batch_size, generator=self.generator)
+        drawn = drawn.to(self.device, non_blocking=True)
         others = len(self.tasks) - 1
         shift = (drawn * (self.duration * self.rate * others)).floor_().to(self.task.dtype) + 1
         return torch.where(shift <= others, (self.task + shift) % len(self.tasks), self.task)
 
     def _reward(self, outcome: Outcome) -> dict[str, Tensor]:
-        weights = dict(
-            zip(WEIGHTS, self.task_weights.index_select(1, self.task).unbind(0), strict=True)
-        )
+        rows = self.task_weights.index_select(1, self.task).unbind(0)
+        weights = dict(zip(WEIGHTS, rows, strict=True))
         to_left, to_right = outcome.to_boundaries
         position = (to_right - to_left) / (to_right + to_left)
         terms = {"centre": position.abs(), "left": position, "inside": position * outcome.action}
@@ -141,3 +235,17 @@ class DrivingTasksEnv(ConeTrackEnv):
             entries = dict(zip(self.tasks, flags, strict=True))
             out["info", "task"] = TensorDict(entries, self.batch_size, device=self.device)
         return out
+
+
+def _weight_table(
+    tasks: Mapping[str, Mapping[str, float]], reward: Mapping[str, float]
+) -> list[list[float]]:
+    """Return the weights of all tasks, one row per weight and one column per task.
+
+    Args:
+        tasks: name to weights.
+        reward: weights that a task does not set.
+    """
+    common = RewardWeights()._asdict() | PositionWeights()._asdict() | dict(reward)
+    complete = [common | dict(weights) for weights in tasks.values()]
+    return [[weights[key] for weights in complete] for key in WEIGHTS]

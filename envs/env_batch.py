@@ -1,4 +1,9 @@
-"""Batches of single envs in one process, whose running episodes are saved as seeds and actions."""
+"""Batches of single envs in one process, whose running episodes are saved as seeds and actions.
+
+Most envs of other people are single and cannot save their state. But nearly all are deterministic
+once they are seeded. So every episode gets a seed of its own, and its actions are remembered: a
+resumed run begins the episode again and repeats the actions.
+"""
 
 import warnings
 from abc import abstractmethod
@@ -32,10 +37,14 @@ class SeededRows(SeededEnv):
     Args:
         rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or
             none if the episode is over; then the row stays as it is, with reward 0.
-        seed: of the draw of the episodes' seeds.
+        seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
-        cases: number of different episodes, by default that of the rows.
+        cases: number of different episodes, by default that of the rows; needs `first_seed`.
+        device: of all tensors.
+
+    Raises:
+        ValueError: for a seed or number out of range, and for `cases` without `first_seed`.
     """
 
     remedy: ClassVar[str] = ""  # what may help if running episodes cannot be repeated
@@ -77,7 +86,10 @@ class SeededRows(SeededEnv):
         if self.first_seed is None:
             seeds = torch.randint(SEEDS, (count,), generator=self.generator).tolist()
         self.seeds = self.seeds or seeds
-        for row in range(count) if mask is None else mask.view(-1).nonzero().view(-1).tolist():
+        ended = list(range(count))
+        if mask is not None:
+            ended = mask.view(-1).nonzero().view(-1).tolist()
+        for row in ended:
             self.rows[row].begin(seeds[row])
             self.seeds[row], self.ages[row] = seeds[row], 0
         while len(self.actions) > self.ages.max():
@@ -100,8 +112,10 @@ class SeededRows(SeededEnv):
         state: dict[str, Any] = {"generator": self.generator.get_state(), "seeds": list(self.seeds)}
         if self.seeds:
             state["ages"] = self.ages.tolist()
-            none = torch.empty(0, *self.action_spec.shape)
-            state["actions"] = torch.from_numpy(np.stack(self.actions)) if self.actions else none
+            if self.actions:
+                state["actions"] = torch.from_numpy(np.stack(self.actions))
+            else:
+                state["actions"] = torch.empty(0, *self.action_spec.shape)
             state["observed"] = self._observed().to_dict()
         return state
 
@@ -119,19 +133,24 @@ class SeededRows(SeededEnv):
         self.continues = longest >= self.ages.max()
         for row, (seed, age) in enumerate(zip(self.seeds, self.ages, strict=True)):
             self.rows[row].begin(seed)
-            for step in steps[longest - age :] if self.continues else ():
-                self.rows[row].step(step[row])
+            if self.continues:
+                for step in steps[longest - age :]:
+                    self.rows[row].step(step[row])
         self.continues = self.continues and _same(self._observed().to_dict(), state["observed"])
         if not self.continues:
-            problem = "the env cannot go on with its running episodes to the bit, so new ones begin"
-            warnings.warn(problem + self.remedy, stacklevel=2)
+            warnings.warn(
+                "the env cannot go on with its running episodes to the bit, so new ones begin"
+                f"{self.remedy}",
+                stacklevel=2,
+            )
 
 
 def _same(one: Any, other: Any) -> bool:
+    """Return whether two nested dictionaries of tensors are equal, NaN included."""
     if isinstance(one, dict):
-        return one.keys() == other.keys() and all(
-            _same(value, other[key]) for key, value in one.items()
-        )
+        if one.keys() != other.keys():
+            return False
+        return all(_same(value, other[key]) for key, value in one.items())
     return np.array_equal(one.cpu().numpy(), other.cpu().numpy(), equal_nan=one.is_floating_point())
 
 
@@ -164,11 +183,17 @@ class EnvBatch(SeededRows):
     global generator in its steps cannot be continued to the bit; see `continues` of `SeededRows`.
 
     Args:
-        of: makes one env, without a batch and with one action.
-        num_envs: B.
+        of: makes one env, without a batch and with one action; called once for each row.
+        num_envs: B, number of rows.
         max_steps: steps after which an episode is truncated, for an env that does not end by
-            itself.
-        seed, first_seed, cases: of the episodes, as for `SeededRows`.
+            itself; None for no limit.
+        seed: of the draw of the episodes' seeds, at least 0.
+        first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
+            draw the seeds.
+        cases: number of different episodes, by default `num_envs`; needs `first_seed`.
+
+    Raises:
+        ValueError: for an env with a batch or with several actions, and for a number out of range.
 
     Example:
         >>> from torchrl.envs import PendulumEnv
@@ -194,7 +219,8 @@ class EnvBatch(SeededRows):
         name = type(one).__name__
         if one.batch_size:
             raise ValueError(
-                f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without batch"
+                f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without "
+                "batch"
             )
         if len(one.action_keys) != 1:
             raise ValueError(
@@ -211,10 +237,8 @@ class EnvBatch(SeededRows):
         return torch.from_numpy(actions)
 
     def _output(self, *, stepped: bool) -> TensorDict:
-        specs = [
-            self.full_observation_spec,
-            self.full_done_spec,
-            *([self.full_reward_spec] if stepped else []),
-        ]
+        specs = [self.full_observation_spec, self.full_done_spec]
+        if stepped:
+            specs.append(self.full_reward_spec)
         keys = [key for spec in specs for key in spec.keys(True, True)]
         return torch.stack([row.after.select(*keys) for row in self.rows]).to(self.device)

@@ -28,15 +28,17 @@ Flags = NDArray[np.bool_]
 
 
 class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
-    """A batch of cars as a `gymnasium.vector.VectorEnv` that resets a car in the step that ends its episode.
+    """A batch of cars as a `gymnasium.vector.VectorEnv`.
 
-    One seed determines the tracks of all cars.
+    A car is reset in the step that ends its episode. One seed determines the tracks of all cars.
 
     Args:
-        num_envs: B.
+        num_envs: B, the number of cars.
         tracks: the tracks, or "train", "test" or "all" of the shipped tracks.
-        advice: a guide; its action is appended to the observation, as COIL needs.
-        options: any other argument of `ConeTrackEnv`.
+        advice: a guide; its action is appended to the observation, as COIL needs. None for no
+            advice.
+        options: any other argument of `ConeTrackEnv`. They are not spelt out, because
+            `gymnasium.make` passes on whatever it is given.
 
     Example:
         >>> import gymnasium
@@ -54,12 +56,10 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         advice: TensorDictModuleBase | None = None,
         **options: Any,
     ) -> None:
-        tracks = shipped_tracks(tracks) if isinstance(tracks, str) else tracks
-        self.num_envs, self.env, self.advice = (
-            num_envs,
-            ConeTrackEnv(tracks, num_envs, **options),
-            advice,
-        )
+        if isinstance(tracks, str):
+            tracks = shipped_tracks(tracks)
+        self.num_envs, self.advice = num_envs, advice
+        self.env = ConeTrackEnv(tracks, num_envs, **options)
         numbers = self.env.observation_spec["observation"].shape[-1] + (advice is not None)
         self.single_observation_space = Box(-1.0, 1.0, (numbers,), np.float32)
         self.single_action_space = Box(-1.0, 1.0, (1,), np.float32)
@@ -70,7 +70,15 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Put all cars on the starts of newly drawn tracks; a seed determines all draws from now on."""
+        """Put all cars on the starts of newly drawn tracks.
+
+        Args:
+            seed: determines all draws from now on; None to go on drawing.
+            options: ignored.
+
+        Returns:
+            Observations [B, 20] or, with advice, [B, 21]; and the entries of `info`, [B] or [B, n].
+        """
         first = self._np_random is None
         super().reset(seed=seed)
         if first or seed is not None:
@@ -80,7 +88,15 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
 
     @torch.no_grad()
     def step(self, actions: Floats) -> tuple[Floats, NDArray[Any], Flags, Flags, dict[str, Any]]:
-        """Drive one step and reset the cars whose episode ended."""
+        """Drive one step and reset the cars whose episode ended.
+
+        Args:
+            actions: [B, 1], steering angles as a fraction of 80 degrees.
+
+        Returns:
+            Observations, rewards, terminated, truncated and info, of all cars; the last observation
+            and info of an ended episode are in `final_obs` and `final_info`.
+        """
         step, state = self.env.step_and_maybe_reset(self.action(actions))
         after = step["next"]
         reward, terminated, truncated = (
@@ -108,14 +124,17 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         """Return the observations of a state, with the advice appended."""
         observation = state["observation"]
         if self.advice is not None:
-            observation = torch.cat(
-                [observation, self.advice(state.select(*self.advice.in_keys))["action"]], -1
-            )
+            advice = self.advice(state.select(*self.advice.in_keys))["action"]
+            observation = torch.cat([observation, advice], -1)
         return _numpy(observation.float())
 
 
 class ConeTrackGym(gymnasium.Env[Floats, Floats]):
-    """One car as a `gymnasium.Env`, with the arguments of `ConeTrackVectorGym` except `num_envs`.
+    """One car as a `gymnasium.Env`.
+
+    Args:
+        tracks: the tracks, or "train", "test" or "all" of the shipped tracks.
+        options: any other argument of `ConeTrackVectorGym`, such as `advice`.
 
     Example:
         >>> import gymnasium
@@ -135,7 +154,12 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Put the car on the start of a newly drawn track; a seed determines all draws from now on."""
+        """Put the car on the start of a newly drawn track.
+
+        Args:
+            seed: determines all draws from now on; None to go on drawing.
+            options: ignored.
+        """
         super().reset(seed=seed)
         observation, info = self.cars.reset(seed=seed)
         return observation[0], _first_row(info)
@@ -163,14 +187,15 @@ def _info(state: TensorDictBase) -> dict[str, Any]:
 
 def _first_row(info: dict[str, Any]) -> dict[str, Any]:
     """Return the first car's entries, scalars as Python numbers."""
-    rows = {
-        key: _first_row(entry) if isinstance(entry, dict) else entry[0]
-        for key, entry in info.items()
-    }
-    return {
-        key: row if isinstance(row, dict) or np.ndim(row) else row.item()
-        for key, row in rows.items()
-    }
+    rows: dict[str, Any] = {}
+    for key, entry in info.items():
+        if isinstance(entry, dict):
+            rows[key] = _first_row(entry)
+        elif np.ndim(entry) > 1:
+            rows[key] = entry[0]
+        else:
+            rows[key] = entry[0].item()
+    return rows
 
 
 if ID not in gymnasium.registry:

@@ -1,10 +1,15 @@
-"""Gymnasium envs as one batched TorchRL env, with controllers beside them."""
+"""Gymnasium envs as one batched TorchRL env, with controllers beside them.
+
+TorchRL has a wrapper of its own. This one is seeded episode by episode, so that it can go on after
+an interruption (see `SeededRows`), names what is missing in one sentence, and lets controllers act
+beside the env that need the env itself, not only its observation.
+"""
 
 import inspect
 import pkgutil
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -15,7 +20,7 @@ from gymnasium import error as errors
 from gymnasium import spaces
 from numpy.typing import NDArray
 from tensordict import TensorDict
-from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.envs.env_batch import SeededRows
 from coil_rl.envs.gymnasium_spaces import Entry, action_spec, leaves, start
@@ -29,7 +34,9 @@ Env = gymnasium.Env[Any, Any]
 
 
 class GymnasiumEnv(SeededRows):
-    """Gymnasium envs as one env of batch size [num_envs], stepped one after the other in this process.
+    """Gymnasium envs as one env of batch size [num_envs].
+
+    They are stepped one after the other in this process.
 
     Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation:
     `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
@@ -44,14 +51,14 @@ class GymnasiumEnv(SeededRows):
 
     Args:
         id: registered name; "MODULE:NAME" imports the module first.
-        num_envs: B.
+        num_envs: B, number of rows.
         options: keyword arguments of `gymnasium.make`.
         wrappers: callables that take an env and return one, applied in this order.
         max_steps: steps after which an episode is truncated, instead of the registered number.
-        seed: of the draw of the episodes' seeds.
+        seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
-        cases: number of different episodes, by default `num_envs`.
+        cases: number of different episodes, by default `num_envs`; needs `first_seed`.
         info: names of numbers in Gymnasium's info to write as ("info", NAME) [B, 1], 0 where
             missing.
         controllers: by name, a controller or its import path "PACKAGE.MODULE:THING". A class gets
@@ -66,6 +73,10 @@ class GymnasiumEnv(SeededRows):
         render: whether `render` gives pictures.
         device: of all tensors.
         dtype: of all floating-point tensors.
+
+    Raises:
+        ValueError: if the env cannot be made, has a space that is not supported or an entry with a
+            reserved name, or if a controller cannot be imported.
 
     Example:
         >>> from coil_rl import GymnasiumEnv
@@ -96,10 +107,9 @@ class GymnasiumEnv(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
-        settings = {
-            **(options or {}),
-            **({} if max_steps is None else {"max_episode_steps": max_steps}),
-        }
+        settings = dict(options or {})
+        if max_steps is not None:
+            settings["max_episode_steps"] = max_steps
         makes = [partial(_make, id, wrappers, settings)] * num_envs
         self.shown = render and "rgb_array" in makes[0]().metadata.get("render_modes", ())
         if self.shown:
@@ -111,34 +121,39 @@ class GymnasiumEnv(SeededRows):
         self.floats = torch.empty(0, dtype=dtype).numpy().dtype
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
-        action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
         self.entries = [
             Entry(id, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
         ]
+        self._declare_specs(id, makers, dtype)
+
+    def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
+        action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
         observation = Composite()
         for entry in self.entries:
-            if entry.key[0] in RESERVED:
+            name = entry.key[0]
+            if name in RESERVED:
                 raise ValueError(
-                    f"the observation of {id} has an entry {entry.key[0]!r}: rename it with a wrapper"
+                    f"the observation of {id} has an entry {name!r}: rename it with a wrapper"
                 )
             observation[entry.key] = entry.spec
         for name in self.info:
             observation["info", name] = number.clone()
-        for name in makers:
+        for name in controllers:
             # Advice is written as given, and may be out of bounds.
-            advice = (
-                Unbounded(action.shape, dtype=dtype)
-                if isinstance(action, Bounded)
-                else action.clone()
-            )
+            advice = action.clone()
+            if isinstance(action, Bounded):
+                advice = Unbounded(action.shape, dtype=dtype)
             observation["controller", name] = advice
-        ends = Composite(
-            {name: Binary(1, dtype=torch.bool) for name in ("done", "terminated", "truncated")}
-        )
-        self.observation_spec, self.done_spec, self.action_spec, self.reward_spec = (
-            spec.to(self.device).expand(*self.batch_size, *spec.shape)
-            for spec in (observation, ends, action, number)
-        )
+        flag = Binary(1, dtype=torch.bool)
+        ends = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")})
+        self.observation_spec = self._of_all_rows(observation)
+        self.done_spec = self._of_all_rows(ends)
+        self.action_spec = self._of_all_rows(action)
+        self.reward_spec = self._of_all_rows(number)
+
+    def _of_all_rows(self, spec: TensorSpec) -> TensorSpec:
+        """Return the spec of a batch from that of one row."""
+        return spec.to(self.device).expand(*self.batch_size, *spec.shape)
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of row 0, [height, width, 3]; None if there are none."""
@@ -157,12 +172,10 @@ class GymnasiumEnv(SeededRows):
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
         if isinstance(self.space, spaces.Box):
-            shaped = (
-                actions.astype(self.space.dtype)
-                if self.space.shape
-                else actions.astype(self.space.dtype)[..., 0]
-            )
-            return np.clip(shaped, self.space.low, self.space.high)
+            typed = actions.astype(self.space.dtype)
+            if not self.space.shape:
+                typed = typed[..., 0]
+            return np.clip(typed, self.space.low, self.space.high)
         return actions + start(self.space)
 
     def _output(self, *, stepped: bool) -> TensorDict:
@@ -170,9 +183,9 @@ class GymnasiumEnv(SeededRows):
         terminated = np.array([[row.terminated] for row in rows], dtype=bool)
         truncated = np.array([[row.truncated] for row in rows], dtype=bool)
         ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        data = TensorDict(
-            {name: torch.from_numpy(end) for name, end in ends.items()}, self.batch_size
-        )
+        data = TensorDict({}, self.batch_size)
+        for name, end in ends.items():
+            data[name] = torch.from_numpy(end)
         if stepped:
             data["reward"] = self._numbers([row.reward for row in rows])
         for entry in self.entries:
@@ -243,26 +256,27 @@ class _Row:
 
 
 def _make(id: str, wrappers: Sequence[Callable[[Env], Env]], settings: Mapping[str, Any]) -> Env:
-    """Return an env of Gymnasium in its wrappers; raises a `ValueError` of one sentence if it cannot be made."""
+    """Return an env of Gymnasium in its wrappers; a `ValueError` says why it cannot be made."""
     try:
         env: Env = gymnasium.make(id, **{"disable_env_checker": True, **settings})
     except (errors.Error, ImportError, TypeError, AssertionError, OSError, ValueError) as error:
-        reason = (
-            re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
-            or type(error).__name__
-        )
-        extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
-        if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
-            reason = f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
-        elif (
-            isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound))
-            and "mean" not in reason
-        ):
-            reason += f"; if a package registers it, write PACKAGE:{id}"
-        raise ValueError(f"the env {id} cannot be made: {reason}") from error
+        raise ValueError(f"the env {id} cannot be made: {_reason(id, error)}") from error
     for wrapper in wrappers:
         env = wrapper(env)
     return env
+
+
+def _reason(id: str, error: Exception) -> str:
+    """Return in a few words why an env cannot be made, with a remedy where one is known."""
+    extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
+    if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
+        return f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+    first_line = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
+    unknown = isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound))
+    # Gymnasium may have a suggestion of its own: "Did you mean ...".
+    if unknown and "mean" not in first_line:
+        return f"{first_line}; if a package registers it, write PACKAGE:{id}"
+    return first_line or type(error).__name__
 
 
 def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
@@ -272,14 +286,24 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
     try:
         return pkgutil.resolve_name(thing)
     except (ImportError, AttributeError, ValueError) as error:
-        problem = f"controller {name}: {thing!r} cannot be imported ({error})"
-        raise ValueError(f"{problem}; write PACKAGE.MODULE:THING") from error
+        raise ValueError(
+            f"controller {name}: {thing!r} cannot be imported ({error}); write PACKAGE.MODULE:THING"
+        ) from error
 
 
 def _controller(
     name: str, maker: Callable[..., Any], env: Env
 ) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
-    """Return what gives the action for an observation, and what to call at the start of an episode."""
+    """Make a controller for an env.
+
+    Args:
+        name: of the controller, for messages.
+        maker: a class, a function or a `functools.partial` of either.
+        env: beside which the controller acts.
+
+    Returns:
+        What gives the action for an observation, and what to call at the start of an episode.
+    """
     if not inspect.isclass(getattr(maker, "func", maker)):
         return partial(maker, env), lambda: None
     try:

@@ -1,4 +1,8 @@
-"""Gymnasium's spaces as specs and entries of TorchRL."""
+"""Gymnasium's spaces as specs and entries of TorchRL.
+
+A guide or policy of this project reads tensors of numbers. So a choice becomes a one-hot vector,
+and nested Dict and Tuple spaces become nested keys.
+"""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -19,7 +23,7 @@ from torchrl.data import (
 
 
 class Entry:
-    """One entry of the observation: where it is in a Gymnasium observation, its spec, and its conversion.
+    """One entry of the observation: where it is found, its spec, and its conversion to numbers.
 
     Args:
         id: of the env, for the `ValueError` about a space that is not supported.
@@ -34,7 +38,8 @@ class Entry:
         self.path, self.dtype, self.start = path, floats, start(space)
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
         whole = not path or isinstance(path[0], int)
-        self.key: tuple[str, ...] = (*(("observation",) if whole else ()), *map(str, path))
+        names = [str(part) for part in path]
+        self.key: tuple[str, ...] = ("observation", *names) if whole else tuple(names)
         self.choices = _choices(space)
         dtype = torch.from_numpy(np.empty(0, floats)).dtype
         if self.choices:
@@ -42,29 +47,27 @@ class Entry:
             # Places of the first choices in the vector.
             self.first = np.cumsum([0, *self.choices[:-1]])
         elif isinstance(space, spaces.Box) and space.dtype == np.uint8:
-            self.dtype, self.spec = (
-                np.dtype(np.uint8),
-                Unbounded(space.shape or (1,), dtype=torch.uint8),
-            )
+            self.dtype = np.dtype(np.uint8)
+            self.spec = Unbounded(space.shape or (1,), dtype=torch.uint8)
         elif isinstance(space, spaces.Box):
             self.spec = Unbounded(space.shape or (1,), dtype=dtype)
         elif isinstance(space, spaces.MultiBinary):
             self.spec = Bounded(0, 1, space.shape, dtype=dtype)
         else:
             raise ValueError(
-                f"the observation of {id} has a {type(space).__name__} space: replace it with a wrapper"
+                f"the observation of {id} has a {type(space).__name__} space: replace it with a "
+                "wrapper"
             )
 
     def __call__(self, observations: Sequence[Any]) -> NDArray[Any]:
         """Return this entry of observations, [B, *shape]."""
         for part in self.path:
             observations = [observation[part] for observation in observations]
+        count = len(observations)
         if not self.choices:
-            return np.array(observations, dtype=self.dtype).reshape(
-                len(observations), *self.spec.shape
-            )
-        chosen = (np.array(observations) - self.start).reshape(len(observations), -1) + self.first
-        vectors = np.zeros((len(observations), *self.spec.shape), self.dtype)
+            return np.array(observations, dtype=self.dtype).reshape(count, *self.spec.shape)
+        chosen = (np.array(observations) - self.start).reshape(count, -1) + self.first
+        vectors = np.zeros((count, *self.spec.shape), self.dtype)
         np.put_along_axis(vectors, chosen, 1, 1)
         return vectors
 
@@ -72,11 +75,18 @@ class Entry:
 def leaves(
     space: spaces.Space[Any], path: tuple[str | int, ...] = ()
 ) -> Iterator[tuple[Any, spaces.Space[Any]]]:
-    """Yield the path and the space of all entries but texts."""
-    if isinstance(space, (spaces.Dict, spaces.Tuple)):
-        parts = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        for name, part in parts:
+    """Yield the path and the space of all entries but texts.
+
+    Args:
+        space: of the observation, or of a part of it.
+        path: of that part: keys of Dict spaces and indices of Tuple spaces.
+    """
+    if isinstance(space, spaces.Dict):
+        for name, part in space.spaces.items():
             yield from leaves(part, (*path, name))
+    elif isinstance(space, spaces.Tuple):
+        for index, part in enumerate(space.spaces):
+            yield from leaves(part, (*path, index))
     elif space.dtype is None or space.dtype.kind != "U":
         yield path, space
 
@@ -93,7 +103,13 @@ def start(space: spaces.Space[Any]) -> Any:
 
 
 def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
-    """Return the spec of an action of one env; raises a `ValueError` with its id for a space that is not supported."""
+    """Return the spec of an action of one env.
+
+    Args:
+        id: of the env, for the `ValueError` about a space that is not supported.
+        space: of the action.
+        dtype: of actions that are real numbers.
+    """
     if isinstance(space, spaces.Box):
         shape = space.shape or (1,)
         if not space.is_bounded():

@@ -23,12 +23,17 @@ COLUMNS = ("Cone_Type", "Cone_X", "Cone_Y")
 
 
 def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> Track:
-    """Read a level file: CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down).
+    """Read a level file.
+
+    It is a CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down).
 
     Args:
-        path: the file; extra columns, blank lines and case are ignored. A `TrackError` names it and
-            its fault.
+        path: the file; extra columns, blank lines and case are ignored.
         start: x in m, y in m (pointing up), heading in degrees; see `Track` for the default.
+
+    Raises:
+        TrackError: for a file that cannot be read or is no valid track; it names the file, the line
+            and the fault.
     """
     path = Path(path)
     sides: dict[str, list[tuple[float, float]]] = {"LEFT": [], "RIGHT": []}
@@ -40,8 +45,10 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
         try:
             x, y = np.asarray_chkfinite(cells, dtype=np.float64)
         except ValueError:
-            fault = f"Cone_X, Cone_Y are {cells}; they must be finite numbers in m"
-            raise TrackError(f"{path}, line {line}: {fault}.") from None
+            raise TrackError(
+                f"{path}, line {line}: Cone_X, Cone_Y are {cells}; they must be finite numbers in "
+                "m."
+            ) from None
         sides[side.upper()].append((x, -y))
     left, right = (np.reshape(cones, (-1, 2)) for cones in sides.values())
     pose = None
@@ -49,8 +56,10 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
         try:
             x, y, degrees = map(float, start)
         except (TypeError, ValueError):
-            pattern = "three numbers: x and y (up) in m, heading in degrees"
-            raise TrackError(f"{path}: the start is {start!r}; give {pattern}.") from None
+            raise TrackError(
+                f"{path}: the start is {start!r}; give three numbers: x and y (up) in m, heading "
+                "in degrees."
+            ) from None
         pose = x, y, math.radians(degrees)
     try:
         return Track(path.stem, left, right, pose)  # type: ignore[arg-type]
@@ -59,36 +68,49 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
 
 
 def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> list[Track]:
-    """Read a level file, or all *.csv of a folder in natural order, with one `start` for all; see `load_track`."""
+    """Read a level file, or all level files of a folder.
+
+    Args:
+        path: a level file, or a folder, whose *.csv are read in natural order.
+        start: of all tracks: x in m, y in m (pointing up), heading in degrees; see `Track` for the
+            default.
+
+    Raises:
+        TrackError: for a folder without level files, and as for `load_track`.
+    """
     if not os.path.isdir(path):
         return [load_track(path, start)]
-    files = [
-        file
-        for file in Path(path).glob("*")
-        if file.suffix.lower() == ".csv" and not file.name.startswith(".")
-    ]
+    visible = [file for file in Path(path).glob("*") if not file.name.startswith(".")]
+    files = [file for file in visible if file.suffix.lower() == ".csv"]
     if not files:
         raise TrackError(
             f"The folder {path} holds no level files (*.csv); give a folder with some, or one file."
         )
-    # MAP_2 comes before MAP_10: every second part of the split is a number.
-    files.sort(
-        key=lambda file: [
-            int(x) if i % 2 else x for i, x in enumerate(re.split(r"([0-9]+)", file.name))
-        ]
-    )
+    files.sort(key=_natural_order)
     return [load_track(file, start) for file in files]
 
 
+def _natural_order(file: Path) -> list[str | int]:
+    """Return a key that sorts MAP_2 before MAP_10: the name in parts, its numbers as numbers."""
+    parts: list[str | int] = []
+    # Every second part of the split is a number.
+    for index, part in enumerate(re.split(r"([0-9]+)", file.name)):
+        parts.append(int(part) if index % 2 else part)
+    return parts
+
+
 def save_track(track: Track, path: str | os.PathLike[str]) -> None:
-    """Write a level file for `load_track`; the format does not include the start pose."""
+    """Write a level file for `load_track`; the format does not include the start pose.
+
+    Args:
+        track: the track.
+        path: of the file; its folder is made if it is missing, and an existing file is replaced.
+    """
     cones = [("LEFT", *cone) for cone in track.left] + [("RIGHT", *cone) for cone in track.right]
     lines = [",".join(["", *COLUMNS])]
-    # Adding zero turns -0.0 into 0.0.
-    lines += [
-        f"{k},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}"
-        for k, (side, x, y) in enumerate(cones)
-    ]
+    for number, (side, x, y) in enumerate(cones):
+        # Adding zero turns -0.0 into 0.0.
+        lines.append(f"{number},{side},{round(x, 5) + 0.0},{round(-y, 5) + 0.0}")
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f".{path.name}.unfinished")
@@ -97,23 +119,36 @@ def save_track(track: Track, path: str | os.PathLike[str]) -> None:
 
 
 def shipped_tracks(split: Split) -> list[Track]:
-    """Return the project's own tracks: seven to "train" on, three to "test" on, or "all" ten."""
+    """Return the project's own tracks.
+
+    Args:
+        split: "train" for the seven to train on, "test" for the three to test on, or "all" ten;
+            else a `ValueError`.
+    """
     if split not in ("train", "test", "all"):
         raise ValueError(
             f"There is no split {split!r} of the shipped tracks; give 'train', 'test' or 'all'."
         )
-    return [
-        track for part in ("train", "test") if split in (part, "all") for track in _shipped(part)
-    ]
+    if split == "all":
+        return [*_shipped("train"), *_shipped("test")]
+    return list(_shipped(split))
 
 
 def track_names(tracks: Sequence[Track]) -> list[str]:
-    """Return the names of tracks, which are the cases of an evaluation."""
+    """Return the names of tracks, which are the cases of an evaluation.
+
+    Args:
+        tracks: the tracks.
+    """
     return [track.name for track in tracks]
 
 
 def shipped_track(name: str) -> Track:
-    """Return one of the project's own tracks by name, such as test_1."""
+    """Return one of the project's own tracks.
+
+    Args:
+        name: such as "test_1"; another than those of `shipped_tracks("all")` is a `ValueError`.
+    """
     tracks = {track.name: track for track in shipped_tracks("all")}
     if name not in tracks:
         raise ValueError(f"There is no shipped track {name!r}; there are {', '.join(tracks)}.")
@@ -128,7 +163,32 @@ def _shipped(split: str) -> list[Track]:
 
 
 def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the cells under `COLUMNS` of each row that is not blank; missing cells are empty."""
+    """Yield the line number and the cells under `COLUMNS` of each row that is not blank.
+
+    Missing cells are empty.
+    """
+    text = _read(path)
+    reader = csv.reader(io.StringIO(text))
+    try:
+        header = [name.strip() for name in next(reader)]
+        columns = [name.casefold() for name in header]
+        for column in COLUMNS:
+            if column.casefold() not in columns:
+                raise TrackError(
+                    f"{path} has no column {column}; the columns of its first line are {header}."
+                )
+        order = [columns.index(column.casefold()) for column in COLUMNS]
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in order]
+    except csv.Error as error:
+        raise TrackError(
+            f"{path}, line {reader.line_num}: {error}; save the level as plain CSV."
+        ) from None
+
+
+def _read(path: Path) -> str:
+    """Return the text of a level file; a `TrackError` says why it cannot be read."""
     try:
         status = path.stat()
         # Pipes and devices may never end.
@@ -149,20 +209,4 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         raise TrackError(
             f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}."
         )
-    reader = csv.reader(io.StringIO(text))
-    try:
-        header = [name.strip() for name in next(reader)]
-        columns = [name.casefold() for name in header]
-        for column in COLUMNS:
-            if column.casefold() not in columns:
-                raise TrackError(
-                    f"{path} has no column {column}; the columns of its first line are {header}."
-                )
-        order = [columns.index(column.casefold()) for column in COLUMNS]
-        for row in reader:
-            if any(cell.strip() for cell in row):
-                yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in order]
-    except csv.Error as error:
-        raise TrackError(
-            f"{path}, line {reader.line_num}: {error}; save the level as plain CSV."
-        ) from None
+    return text

@@ -10,20 +10,29 @@ LARGEST_STARTS = 10**5  # places of a world where an episode may begin
 def check_range(
     low: float, high: float = math.inf, *, above: bool = False, **values: float
 ) -> None:
-    """Raise a `ValueError` for the first value outside of [low, high], and for NaN and infinity.
+    """Raise a `ValueError` for the first value out of range; NaN and infinity always are.
 
-    `above` excludes `low` itself.
+    Args:
+        low: smallest allowed value.
+        high: largest allowed value; infinity for none.
+        above: whether `low` itself is excluded.
+        values: the values to check, by the name that the message gives them.
     """
+    lower = "more than" if above else "at least"
     upper = f"and at most {high}" if high < math.inf else "and finite"
     for name, value in values.items():
-        if not (low < value if above else low <= value) or value > high or math.isinf(value):
-            raise ValueError(
-                f"{name}={value} must be {'more than' if above else 'at least'} {low} {upper}"
-            )
+        large_enough = low < value if above else low <= value
+        if not large_enough or value > high or math.isinf(value):
+            raise ValueError(f"{name}={value} must be {lower} {low} {upper}")
 
 
 def check_choice(choices: tuple[str, ...], **values: str) -> None:
-    """Raise a `ValueError` for the first value that is not one of the choices."""
+    """Raise a `ValueError` for the first value that is not one of the choices.
+
+    Args:
+        choices: the allowed values.
+        values: the values to check, by the name that the message gives them.
+    """
     for name, value in values.items():
         if value not in choices:
             raise ValueError(f"{name}={value!r} must be one of {', '.join(choices)}")

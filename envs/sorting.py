@@ -1,4 +1,8 @@
-"""Batched selection: the smallest entries of each column, entries without a conflict, and lists that grow.
+"""Batched selection: the smallest entries, entries without a conflict, and lists that grow.
+
+The cone world and the spline guides choose among candidates in every step: the nearest visible
+cones, the nearest midpoints, the targets that are far enough apart. All functions here do that for
+every column of a batch at once, without a branch on the data.
 
 `Tensor.topk` processes one column after another, up to a microsecond each. A sorting network of
 minima and maxima applies a few dozen operations to all columns at once, which is faster for many
@@ -47,17 +51,17 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
 
 
 def _bitonic_sort(keys: Tensor, rows_padded: int, k: int) -> Tensor:
-    """Return the first k rows of [N, *batch], sorted by Batcher's bitonic network of a power of two of rows.
+    """Return the first k rows of keys [N, *batch], sorted by Batcher's bitonic network.
 
-    A pair of sorted runs is merged by comparing the first run with the reversed second one, which
-    separates the smaller from the larger half, and by splitting each half in the same way down to
-    single rows. Rows beyond k are dropped.
+    The network has a power of two of rows, `rows_padded`. A pair of sorted runs is merged by
+    comparing the first run with the reversed second one, which separates the smaller from the
+    larger half, and by splitting each half in the same way down to single rows. Rows beyond k are
+    dropped.
     """
     batch = keys.shape[1:]
     if rows_padded > len(keys):
-        keys = torch.cat(
-            [keys, keys.new_full((rows_padded - len(keys), *batch), torch.iinfo(keys.dtype).max)]
-        )
+        largest = torch.iinfo(keys.dtype).max
+        keys = torch.cat([keys, keys.new_full((rows_padded - len(keys), *batch), largest)])
     keys = keys.view(rows_padded, -1)
     run = 1
     while run < len(keys):
@@ -84,9 +88,14 @@ def _compare(first: Tensor, second: Tensor) -> Tensor:
 
 
 def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
-    """Select each eligible entry [N, *batch] that is in conflict [N, N, *batch] with no selected one before it.
+    """Select each eligible entry that is in conflict with no selected one before it.
 
-    Both are bool, and the conflicts symmetric.
+    Args:
+        eligible: [N, *batch], bool.
+        conflict: [N, N, *batch], bool and symmetric, whether two entries exclude each other.
+
+    Returns:
+        Whether each entry is selected, [N, *batch].
     """
     selected = list(eligible.unbind(0))
     for i in range(1, len(selected)):
@@ -95,10 +104,16 @@ def first_come(eligible: Tensor, conflict: Tensor) -> Tensor:
 
 
 def append(points: Tensor, count: Tensor, more: Tensor, selected: Tensor) -> tuple[Tensor, Tensor]:
-    """Append the selected ones of `more` [D, M, *batch] to lists of points in order, as far as there is room.
+    """Append selected points to lists of points, in order, as far as there is room.
 
-    The lists `points` are [D, N, *batch], of which `count` [*batch], integers, are in use;
-    `selected` is [M, *batch], bool. Returns the new lists and counts.
+    Args:
+        points: the lists, [D, N, *batch].
+        count: [*batch], integers, number of points of each list that are in use.
+        more: the points to choose from, [D, M, *batch].
+        selected: [M, *batch], bool, which of them to append.
+
+    Returns:
+        The new lists and their counts.
     """
     room = points.shape[1]
     slot = torch.where(selected, count + selected.cumsum(0) - 1, room).clamp_(max=room)
@@ -107,7 +122,11 @@ def append(points: Tensor, count: Tensor, more: Tensor, selected: Tensor) -> tup
 
 
 def rows_in_use(mask: Tensor) -> Tensor:
-    """Return the rows to compute for a mask [B]: those in it where reading the data is cheap, as on a CPU, else all."""
+    """Return the rows to compute for a mask [B]: those in it, or all where reading it is expensive.
+
+    On a CPU reading the mask is cheap. On a GPU it would wait for the device, and compiled code
+    needs fixed shapes.
+    """
     if mask.device.type != "cpu" or torch.compiler.is_compiling():
         return torch.arange(len(mask), device=mask.device)
     return mask.nonzero().squeeze(-1)

@@ -30,13 +30,17 @@ from coil_rl.envs.limits import check_choice
 
 @dataclass(frozen=True)
 class Spline:
-    """A batch of parametric splines; padding slots repeat the last real entry."""
+    """A batch of parametric splines; padding slots repeat the last real entry.
 
-    knots: Tensor  # [K, *batch], m, chord length up to each point
-    values: Tensor  # [D, K, *batch], m, positions at the knots
-    bends: (
-        Tensor  # [D, K, *batch], 1/m, second derivatives at the knots, linear between two of them
-    )
+    Attributes:
+        knots: [K, *batch] m, chord length up to each point.
+        values: [D, K, *batch] m, positions at the knots.
+        bends: [D, K, *batch] 1/m, second derivatives at the knots, linear between two of them.
+    """
+
+    knots: Tensor
+    values: Tensor
+    bends: Tensor
 
     @property
     def polyline_length(self) -> Tensor:
@@ -45,11 +49,11 @@ class Spline:
         return _total(_total(step * step, 0).sqrt(), 0)
 
     def along(self, fraction: Tensor) -> Tensor:
-        """Evaluate at fractions of the last knot: [S, *batch], from 0 to 1; returns [D, S, *batch], m."""
+        """Evaluate at fractions [S, *batch] of the last knot, from 0 to 1: [D, S, *batch], m."""
         return self._at(self.knots[-1] * fraction)
 
     def equidistant(self, samples: int) -> Tensor:
-        """Evaluate from first to last point in equal steps of the parameter: [D, samples, *batch], m."""
+        """Evaluate from first to last point in equal steps: [D, samples, *batch], m."""
         ends = self.values[:, :1], self.values[:, -1:]
         if samples <= 2:
             return torch.cat(ends[:samples], 1)
@@ -57,13 +61,8 @@ class Spline:
         return torch.cat([ends[0], self.along(inner), ends[1]], 1)
 
     def _at(self, u: Tensor) -> Tensor:
-        dim, rows = len(self.values), self.knots[0].numel()
-        # Strict comparison places the end of the spline in the last real interval instead of the
-        # padding.
-        inner = self.knots.detach()[1:-1].unsqueeze(1)
-        below = torch.gt(u.detach(), inner, out=u.new_empty(len(inner), *u.shape))
-        start = flat_index(below.sum(0).long())
-        ends = torch.add(start, constant((0, rows), start.unsqueeze(0))).flatten()
+        """Evaluate at parameters u [S, *batch] m, from 0 to the last knot: [D, S, *batch], m."""
+        ends, dim = self._interval_ends(u), len(self.values)
         x0, x1 = self.knots.flatten().index_select(0, ends).view(2, *u.shape).unbind(0)
         y0, y1 = self.values.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
         g0, g1 = self.bends.flatten(1).index_select(1, ends).view(dim, 2, *u.shape).unbind(1)
@@ -75,44 +74,55 @@ class Spline:
         chord = torch.lerp(y0, y1, t)
         return torch.addcmul(chord, before * after, torch.lerp(g0, g1, t) + g0 + g1, value=-1 / 6)
 
+    def _interval_ends(self, u: Tensor) -> Tensor:
+        """Return the knots before and after parameters u [S, *batch].
+
+        They are indices into the flattened knots, [2 * S * batch], first all of the knots before.
+        """
+        rows = self.knots[0].numel()
+        # Strict comparison places the end of the spline in the last real interval instead of the
+        # padding.
+        inner = self.knots.detach()[1:-1].unsqueeze(1)
+        below = torch.gt(u.detach(), inner, out=u.new_empty(len(inner), *u.shape))
+        start = flat_index(below.sum(0).long())
+        return torch.add(start, constant((0, rows), start.unsqueeze(0))).flatten()
+
 
 def spline_fit(
     spline: Literal["cubic", "quadratic"], smoothing: float
 ) -> Callable[[Tensor, Tensor], Spline]:
-    """Return the fit of that name, else a `ValueError`; the least-squares parabola has no `smoothing`."""
+    """Return the fit of that name, a function of points and their count.
+
+    Args:
+        spline: "cubic" for the smoothing spline, "quadratic" for the least-squares parabola; else a
+            `ValueError`.
+        smoothing: lambda of the smoothing spline, m^3; the parabola has none.
+    """
     check_choice(("cubic", "quadratic"), spline=spline)
-    return (
-        partial(smoothing_spline, smoothing=smoothing)
-        if spline == "cubic"
-        else least_squares_parabola
-    )
+    if spline == "quadratic":
+        return least_squares_parabola
+    return partial(smoothing_spline, smoothing=smoothing)
 
 
 def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     """Fit a natural cubic smoothing spline, parametric in chord length (appendix A.2).
 
     Minimises sum |y_i - f(u_i)|^2 + smoothing * integral |f''|^2 du by Reinsch's system for the
-    second derivatives g, (R + smoothing Q'Q) g = Q'y and f = y - smoothing Q g. `smoothing` is in
-    m^3; 0 interpolates.
+    second derivatives g, (R + smoothing Q'Q) g = Q'y and f = y - smoothing Q g.
+
+    Args:
+        points: [D, K, *batch] m, in order, K >= 2.
+        count: [*batch], number of real points of each row.
+        smoothing: lambda, m^3; 0 interpolates.
     """
     if not 0 <= smoothing < math.inf:
         raise ValueError(f"smoothing={smoothing} must be a finite number of at least 0")
     real, knots, step, h = _chords(points, count)
     per_m = h.reciprocal()
-    # R = tridiag(h/6, (h+h)/3, h/6) and the columns of Q are (1/h, -1/h - 1/h', 1/h'), scaled by
-    # sqrt(smoothing).
-    side = per_m * constant(math.sqrt(smoothing), h)
-    left, right = side[:-1], side[1:]
-    middle, far, span = left + right, left * right, h[:-1] + h[1:]
-    # Minus half the sum of the squares of the three entries of a column.
-    squares = torch.addcmul(far, middle, middle, value=-1)
-    diagonal = torch.add(span * constant(1 / 3, h), squares, alpha=-2)
-    near = torch.addcmul(
-        h[1:-1] * constant(1 / 6, h), side[1:-1], middle[:-1] + middle[1:], value=-1
-    )
+    diagonal, near, far, span = _reinsch_matrix(h, per_m, smoothing)
     slope = step * per_m
     turns = slope[:, 1:] - slope[:, :-1]  # at each inner point, Q'y: [D, K-2, *batch], at most 2
-    bends = _solve(diagonal, near, far[1:-1], turns, real[2:-1], span * constant(1 / 4, h))
+    bends = _solve(diagonal, near, far, turns, real[2:-1], span * constant(1 / 4, h))
 
     # Third derivative of each interval; its jumps at the knots are Q g.
     jerk = (bends[:, 1:] - bends[:, :-1]) * per_m
@@ -122,35 +132,98 @@ def smoothing_spline(points: Tensor, count: Tensor, smoothing: float) -> Spline:
     return Spline(knots, _repeat_last(values, real), bends)
 
 
-def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
-    """Fit a least-squares parabola, parametric in chord length, as FITPACK's quadratic spline without inner knots.
+def _reinsch_matrix(
+    h: Tensor, per_m: Tensor, smoothing: float
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the diagonals of R + smoothing Q'Q for the intervals between the knots.
 
-    The `values` are the fitted points; all `bends` are equal.
+    Args:
+        h: lengths of the intervals, [K-1, *batch] m.
+        per_m: their reciprocals, 1/m.
+        smoothing: lambda, m^3.
+
+    Returns:
+        The main diagonal [K-2, *batch], the one next to it [K-3, *batch], the one beyond
+        [K-4, *batch], and the length of each pair of neighbouring intervals [K-2, *batch] m.
+    """
+    # R = tridiag(h/6, (h+h)/3, h/6) and the columns of Q are (1/h, -1/h - 1/h', 1/h'), scaled by
+    # sqrt(smoothing).
+    side = per_m * constant(math.sqrt(smoothing), h)
+    left, right = side[:-1], side[1:]
+    middle, far, span = left + right, left * right, h[:-1] + h[1:]
+    # Minus half the sum of the squares of the three entries of a column.
+    squares = torch.addcmul(far, middle, middle, value=-1)
+    diagonal = torch.add(span * constant(1 / 3, h), squares, alpha=-2)
+    sixth = h[1:-1] * constant(1 / 6, h)
+    near = torch.addcmul(sixth, side[1:-1], middle[:-1] + middle[1:], value=-1)
+    return diagonal, near, far[1:-1], span
+
+
+def least_squares_parabola(points: Tensor, count: Tensor) -> Spline:
+    """Fit a least-squares parabola, parametric in chord length.
+
+    It is FITPACK's quadratic spline without inner knots. The `values` are the fitted points; all
+    `bends` are equal.
+
+    Args:
+        points: [D, K, *batch] m, in order, K >= 2.
+        count: [*batch], number of real points of each row.
     """
     padded_real, knots, _, h = _chords(points, count)
     real = padded_real[:-1]
-    n = count.clamp(min=1).to(points.dtype)
-    two, three = ((count - k).clamp(0, 1).to(points.dtype) for k in (1, 2))
     scale = torch.maximum(knots[-1], h[0])
-    # Polynomials orthogonal on the knots, each coefficient fitted to the residual of the previous
-    # ones, are well conditioned in float32 too. A polynomial that too few points determine is 0,
-    # its norm 1.
-    t = knots / scale
+    origin = points[:, :1] * real[0]
+    fitted, curvature = _fit_parabola((points - origin) * real, knots / scale, real, count)
+    values = _repeat_last(origin + fitted, padded_real)
+    return Spline(knots, values, (2 * curvature / scale.square()).expand_as(points))
+
+
+def _fit_parabola(offset: Tensor, t: Tensor, real: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
+    """Fit parabolas by least squares.
+
+    Args:
+        offset: values to fit, [D, K, *batch], 0 in the padding.
+        t: parameters, [K, *batch], at most 1.
+        real: [K, *batch], 1 for a real point, else 0.
+        count: [*batch], number of real points.
+
+    Returns:
+        The fitted values [D, K, *batch], and the coefficient of t^2 [D, 1, *batch].
+    """
+    n = count.clamp(min=1).to(t.dtype)
+    p1, n1, p2, n2 = _orthogonal_polynomials(t, real, count, n)
+    c0 = (_total(offset, 1) / n).unsqueeze(1)
+    left = offset - c0
+    c1 = (_total(left * p1, 1) / n1).unsqueeze(1)
+    c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
+    return c0 + c1 * p1 + c2 * p2, c2
+
+
+def _orthogonal_polynomials(
+    t: Tensor, real: Tensor, count: Tensor, n: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return the polynomials of degree 1 and 2 that are orthogonal on the knots of a parabola.
+
+    With each coefficient fitted to the residual of the previous ones, the least-squares problem is
+    well conditioned in float32 too. A polynomial that too few points determine is 0, its norm 1.
+
+    Args:
+        t: scaled knots, [K, *batch].
+        real: [K, *batch], 1 for a real knot, else 0.
+        count: [*batch], number of real knots.
+        n: `count` as a real number, at least 1.
+
+    Returns:
+        Values at the knots [K, *batch] and squared norm [*batch] of the polynomial of degree 1,
+        then those of the polynomial of degree 2.
+    """
+    two, three = ((count - k).clamp(0, 1).to(t.dtype) for k in (1, 2))
     p1 = (t - _total(t * real, 0) / n) * real
     n1 = _total(p1 * p1, 0) + (1 - two)
     p2 = (p1 * p1 - n1 / n) * real
     p2 = (p2 - _total(p2 * p1, 0) / n1 * p1) * three
     n2 = _total(p2 * p2, 0) + (1 - three)
-    origin = points[:, :1] * real[0]
-    left = (points - origin) * real
-    c0 = (_total(left, 1) / n).unsqueeze(1)
-    left = left - c0
-    c1 = (_total(left * p1, 1) / n1).unsqueeze(1)
-    c2 = (_total((left - c1 * p1) * p2, 1) / n2).unsqueeze(1)
-    fitted = origin + (c0 + c1 * p1 + c2 * p2)
-    return Spline(
-        knots, _repeat_last(fitted, padded_real), (2 * c2 / scale.square()).expand_as(points)
-    )
+    return p1, n1, p2, n2
 
 
 def slots_in_use(count: Tensor, slots: int) -> int:
@@ -170,15 +243,20 @@ def _total(x: Tensor, dim: int) -> Tensor:
 
 
 def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return masks of real slots [K+1, *batch], knots [K, *batch], steps [D, K-1, *batch] and their lengths, m.
+    """Return which slots are real, and the chords between neighbouring points.
 
-    The last of the K+1 slots is never real. Lengths have a floor of eps^(1/3) times 1 m or the
-    longest step (1 cm in float32, 10 um in float64), which keeps quotients finite and Q'Q precise
-    for coincident points and in the padding.
+    The lengths have a floor of eps^(1/3) times 1 m or the longest step (1 cm in float32, 10 um in
+    float64), which keeps quotients finite and Q'Q precise for coincident points and in the padding.
+
+    Returns:
+        Masks of real slots [K+1, *batch], of which the last one is never real; knots [K, *batch] m;
+        steps from each point to the next one [D, K-1, *batch] m; and their lengths [K-1, *batch] m.
     """
     if points.ndim < 2 or points.shape[1] < 2 or points.shape[2:] != count.shape:
-        given = f"points {list(points.shape)} and count {list(count.shape)}"
-        raise ValueError(f"{given} must be [D, K, *batch] and [*batch], K >= 2")
+        raise ValueError(
+            f"points {list(points.shape)} and count {list(count.shape)} must be [D, K, *batch] and "
+            "[*batch], K >= 2"
+        )
     real = (count - constant(range(points.shape[1] + 1), points[0])).clamp_(0, 1)
     second = real[1:-1]
     step = (points[:, 1:] - points[:, :-1]) * second
@@ -191,7 +269,10 @@ def _chords(points: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor, Tens
 
 
 def _repeat_last(x: Tensor, real: Tensor) -> Tensor:
-    """Fill the padding of x [D, K, *batch] with its last real entry, or zeros; real is [K+1, *batch]."""
+    """Fill the padding of x [D, K, *batch] with its last real entry; `real` is [K+1, *batch].
+
+    A row without a real entry becomes zeros.
+    """
     real, last = real[:-1], real[:-1] - real[1:]
     return torch.lerp((x * last).sum(1, keepdim=True), x, real)
 
@@ -199,13 +280,22 @@ def _repeat_last(x: Tensor, real: Tensor) -> Tensor:
 def _solve(
     diagonal: Tensor, near: Tensor, far: Tensor, turns: Tensor, real: Tensor, least: Tensor
 ) -> Tensor:
-    """Solve the symmetric pentadiagonal systems for the second derivatives at inner points by L D L', slot by slot.
+    """Solve the symmetric pentadiagonal systems for the second derivatives at the inner points.
 
-    The main diagonal is [K-2, *batch], the off-diagonals `near` and `far` one and two shorter, the
-    right-hand side `turns` [D, K-2, *batch]. Unknowns that are not `real` are 0. Pivots fall below
-    `least` only by rounding errors of nearly coincident points: those of R alone are at least (h +
-    h') / 4, and Q'Q adds to them. The result is [D, K, *batch], zeros in the first and the last
-    slot.
+    The method is the factorisation L D L', slot by slot.
+
+    Args:
+        diagonal: main diagonals, [K-2, *batch].
+        near: the diagonals next to them, [K-3, *batch].
+        far: the diagonals beyond, [K-4, *batch].
+        turns: right-hand sides, [D, K-2, *batch].
+        real: [K-2, *batch], 0 for unknowns that are left out and become 0, else 1.
+        least: lower bounds of the pivots, [K-2, *batch]. Pivots fall below them only by rounding
+            errors of nearly coincident points: those of R alone are at least (h + h') / 4, and Q'Q
+            adds to them.
+
+    Returns:
+        The second derivatives at all points, [D, K, *batch], zeros at the first and the last one.
     """
     nears, fars = list(near.unbind(0)), far.unbind(0)
     lower, lowest, right, inverse = list[Tensor](), list[Tensor](), list[Tensor](), list[Tensor]()

@@ -1,4 +1,8 @@
-"""Cone tracks: two closed rings of cones and the boundary curves through them."""
+"""Cone tracks: two closed rings of cones and the boundary curves through them.
+
+A `Track` that exists is one that can be driven: the constructor checks all that the worlds rely on.
+The same class serves the cone world and, in its own metres, the simulated robot.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,16 +31,27 @@ MAX_PAIRS = 2 * 10**7  # of boundary segments tested for crossings
 
 
 class TrackError(ValueError):
-    """An invalid track or level file; the message names the fault and the remedy in one sentence."""
+    """An invalid track or level file; one sentence names the fault and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
 class Track:
     """A closed track between two rings of cones.
 
-    A `TrackError` is raised for too few, too many, coincident or non-finite cones, sides beyond the
-    limits, boundaries that cross themselves or each other, a left side that is not on the left, or
-    a start or finish off the track.
+    Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon
+    through the cones.
+
+    Args:
+        name: for display.
+        left: the cones of the left side in driving order, [N, 2] m, x right and y up.
+        right: the cones of the right side in driving order, [M, 2] m.
+        start: x in m, y in m, heading in radians anticlockwise from +x; by default the midpoint of
+            the last left and the last right cone, heading for the finish.
+
+    Raises:
+        TrackError: for too few, too many, coincident or non-finite cones, sides beyond the limits,
+            boundaries that cross themselves or each other, a left side that is not on the left, or
+            a start or finish off the track.
 
     Example:
         >>> import numpy as np
@@ -47,15 +62,11 @@ class Track:
         63
     """
 
-    name: str  # for display
-    left: Array  # [N, 2] m, the cones of the left side in driving order, x right and y up
-    right: Array  # [M, 2] m, the cones of the right side
-    # x in m, y in m, heading in rad anticlockwise from +x; by default the midpoint of the last left
-    # and the last right cone, heading for the finish.
+    name: str
+    left: Array
+    right: Array
     start: tuple[float, float, float] = None  # type: ignore[assignment]  # set in __post_init__
 
-    # Cars crash into the boundary curves, so all checks use these; they may overshoot the polygon
-    # through the cones.
     def __post_init__(self) -> None:
         for side in SIDES:
             cones = np.array(getattr(self, side), dtype=np.float64)
@@ -64,20 +75,25 @@ class Track:
             object.__setattr__(self, side, cones)
         rings = {side: self.boundary(side, 0.1) for side in SIDES}
         self._check_boundaries(rings)
-        start = (self.left[-1] + self.right[-1]) / 2
-        forward = self.finish - start
-        default = (*start, np.arctan2(forward[1], forward[0]))
-        pose = tuple(float(value) for value in (default if self.start is None else self.start))
+        if self.start is None:
+            start = (self.left[-1] + self.right[-1]) / 2
+            forward = self.finish - start
+            pose = (float(start[0]), float(start[1]), float(np.arctan2(forward[1], forward[0])))
+        else:
+            pose = tuple(float(value) for value in self.start)
         if len(pose) != 3 or not (np.abs(pose) <= MAX_COORDINATE).all():
-            remedy = f"give three finite numbers x, y, heading, of at most {MAX_COORDINATE:.0f}"
-            raise TrackError(f"The start of track {self.name!r} is {self.start}; {remedy}.")
+            raise TrackError(
+                f"The start of track {self.name!r} is {self.start}; give three finite numbers x, "
+                f"y, heading, of at most {MAX_COORDINATE:.0f}."
+            )
         object.__setattr__(self, "start", pose)
         for name, point in (("start", np.array(pose[:2])), ("finish", self.finish)):
             if _encloses(rings["left"], point) == _encloses(rings["right"], point):
-                place = np.round(point, 2).tolist()
-                fault = f"The {name} of track {self.name!r} at {place} is not between its two sides"
-                remedy = "give a start on the track, y pointing up, and list both sides from the same place on"
-                raise TrackError(f"{fault}; {remedy}.")
+                raise TrackError(
+                    f"The {name} of track {self.name!r} at {np.round(point, 2).tolist()} is not "
+                    "between its two sides; give a start on the track, y pointing up, and list "
+                    "both sides from the same place on."
+                )
 
     @property
     def finish(self) -> Array:
@@ -87,15 +103,17 @@ class Track:
     @property
     def length(self) -> float:
         """Return the length of a lap in m: the mean length of the two boundaries."""
-        return float(
-            np.mean([np.linalg.norm(_edges(self.boundary(side)), axis=1).sum() for side in SIDES])
-        )
+        edges = [_edges(self.boundary(side)) for side in SIDES]
+        return float(np.mean([np.linalg.norm(edge, axis=1).sum() for edge in edges]))
 
     def boundary(self, side: Side, spacing: float = 0.05) -> Array:
-        """Sample a boundary, the closed cubic spline through a side's cones by chord length: [P, 2], m.
+        """Sample a boundary: [P, 2] m, from the first cone on, which is not repeated at the end.
 
-        Points are at most `spacing` m apart along the chords, from the first cone on, which is not
-        repeated at the end.
+        A boundary is the closed cubic spline through the cones of a side by chord length.
+
+        Args:
+            side: "left" or "right".
+            spacing: m, largest distance of two points along the chords.
         """
         cones: Array = getattr(self, side)
         chord = np.concatenate([[0.0], np.linalg.norm(_edges(cones), axis=1).cumsum()])
@@ -103,28 +121,34 @@ class Track:
         return curve(np.linspace(0, chord[-1], int(np.ceil(chord[-1] / spacing)), endpoint=False))
 
     def middle(self, spacing: float = 0.05) -> Array:
-        """Return the midpoints of left boundary points and their nearest right boundary points: [P, 2], m."""
+        """Return the middle of the track: [P, 2] m.
+
+        Each point is the midpoint of a left boundary point and its nearest right one.
+
+        Args:
+            spacing: m, largest distance of two boundary points along the chords.
+        """
         left, right = self.boundary("left", spacing), self.boundary("right", spacing)
         return np.asarray((left + right[cKDTree(right).query(left)[1]]) / 2)
 
     def _check_boundaries(self, rings: dict[Side, Array]) -> None:
+        """Raise a `TrackError` for boundaries [P, 2] m that are no valid track."""
         for side, ring in rings.items():
             if not np.isfinite(ring).all() or np.ptp(ring, axis=0).max() > 2 * MAX_EXTENT:
-                fault = (
-                    f"The {side} boundary of track {self.name!r} swings far out between its cones"
+                raise TrackError(
+                    f"The {side} boundary of track {self.name!r} swings far out between its cones; "
+                    "space them evenly, in driving order."
                 )
-                raise TrackError(f"{fault}; space them evenly, in driving order.")
         crossing = _first_crossing(rings)
         if crossing is not None:
             sides, point = crossing
-            fault = (
-                "two sides cross each other"
-                if len(sides) == 2
-                else f"{sides.pop()} side crosses itself"
-            )
-            remedy = "list each side's cones in driving order and keep the two sides apart"
+            if len(sides) == 2:
+                subject = "two sides cross each other"
+            else:
+                subject = f"{sides.pop()} side crosses itself"
             raise TrackError(
-                f"The {fault} near {np.round(point, 2).tolist()} on track {self.name!r}; {remedy}."
+                f"The {subject} near {np.round(point, 2).tolist()} on track {self.name!r}; list "
+                "each side's cones in driving order and keep the two sides apart."
             )
         # By the sign of the enclosed areas.
         lines = [rings[side] @ AS_COMPLEX for side in SIDES]
@@ -132,15 +156,15 @@ class Track:
         # The left ring is the inner one of a track driven anticlockwise.
         inner, outer = SIDES if anticlockwise[0] else SIDES[::-1]
         if anticlockwise[0] != anticlockwise[1] or not _encloses(rings[outer], rings[inner][0]):
-            fault = (
-                f"The left side of track {self.name!r} is not on the left of its driving direction"
+            raise TrackError(
+                f"The left side of track {self.name!r} is not on the left of its driving "
+                "direction; list both sides in driving order, or swap LEFT and RIGHT."
             )
-            raise TrackError(f"{fault}; list both sides in driving order, or swap LEFT and RIGHT.")
 
 
 @lru_cache(maxsize=1024)  # tables of tracks are shared by identity
 def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
-    """Return a track whose sides begin with the first cones that are visible from its start, as does its finish line.
+    """Return a track whose sides and finish line begin with the first cones seen from its start.
 
     Args:
         track: a side of which no cone is visible stays as it is.
@@ -157,10 +181,14 @@ def begin_in_sight(track: Track, sight: float, half_angle: float) -> Track:
 
 
 def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64], Array, Array]:
-    """Choose places where an episode may begin: place i is on track i mod len(tracks), in the middle of its width.
+    """Choose places where an episode may begin.
 
-    The places of a track are spread along the lap, also if only the first ones are used; None gives
-    the tracks' starts.
+    Place i is on track i mod len(tracks), in the middle of its width. The places of a track are
+    spread along the lap, also if only the first ones are used.
+
+    Args:
+        tracks: the tracks.
+        count: P, number of places; None for the tracks' starts.
 
     Returns:
         Index of the track, [P]; pose, [P, 3], m, m and heading in rad; and the way from the finish
@@ -169,14 +197,14 @@ def places(tracks: Sequence[Track], count: int | None) -> tuple[NDArray[np.int64
     if count is None:
         starts = np.array([track.start for track in tracks])
         return np.arange(len(tracks)), starts, np.full(len(tracks), np.nan)
-    poses, driven = zip(
-        *(_spread(track, -(-count // len(tracks))) for track in tracks), strict=True
-    )
+    of_each_track = -(-count // len(tracks))  # rounded up
+    poses, driven = zip(*(_spread(track, of_each_track) for track in tracks), strict=True)
     index = np.arange(count) % len(tracks)
     return index, np.stack(poses, 1).reshape(-1, 3)[:count], np.stack(driven, 1).ravel()[:count]
 
 
 def _spread(track: Track, count: int) -> tuple[Array, Array]:
+    """Return poses [count, 3] along a track, and the way from its finish to each of them in m."""
     middle = track.middle()
     middle = np.roll(middle, -int(((middle - track.finish) ** 2).sum(1).argmin()), axis=0)
     middle = resample(middle, PLACE_SPACING)
@@ -187,7 +215,12 @@ def _spread(track: Track, count: int) -> tuple[Array, Array]:
 
 
 def resample(ring: Array, spacing: float) -> Array:
-    """Resample a closed line [P, 2] m at equal steps of about `spacing` m, at least 8; the first point is kept."""
+    """Resample a closed line at equal steps, at least 8; the first point is kept.
+
+    Args:
+        ring: the line, [P, 2] m.
+        spacing: m, approximate length of a step.
+    """
     closed = np.vstack([ring, ring[:1]])
     travelled = np.concatenate([[0.0], np.linalg.norm(np.diff(closed, axis=0), axis=1).cumsum()])
     at = np.linspace(0, travelled[-1], max(8, round(travelled[-1] / spacing)), endpoint=False)
@@ -195,31 +228,35 @@ def resample(ring: Array, spacing: float) -> Array:
 
 
 def _check_cones(side: str, cones: Array) -> None:
+    """Raise a `TrackError` for the cones of a side that make no ring; `side` is for the message."""
     if cones.ndim != 2 or cones.shape[1] != 2 or not MIN_CONES <= len(cones) <= MAX_CONES:
-        remedy = f"give {MIN_CONES} to {MAX_CONES}, of shape [N, 2]"
         raise TrackError(
-            f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; {remedy}."
+            f"The {side} has {len(cones)} cones, of shape {list(cones.shape)}; give {MIN_CONES} to "
+            f"{MAX_CONES}, of shape [N, 2]."
         )
     outside = np.flatnonzero(~(np.abs(cones) <= MAX_COORDINATE).all(axis=1))
     if len(outside):
-        remedy = f"give finite coordinates in m, at most {MAX_COORDINATE:.0f} from the origin"
         raise TrackError(
-            f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; {remedy}."
+            f"Cone {outside[0]} of the {side} lies at {cones[outside[0]].tolist()}; give finite "
+            f"coordinates in m, at most {MAX_COORDINATE:.0f} from the origin."
         )
     lengths = np.linalg.norm(_edges(cones), axis=1)
     if np.ptp(cones, axis=0).max() > MAX_EXTENT or lengths.sum() > MAX_LENGTH:
-        limits = f"{MAX_EXTENT:.0f} m across and {MAX_LENGTH:.0f} m long"
-        raise TrackError(f"The {side} is too large; the limits are {limits}.")
+        raise TrackError(
+            f"The {side} is too large; the limits are {MAX_EXTENT:.0f} m across and "
+            f"{MAX_LENGTH:.0f} m long."
+        )
     coincident = np.flatnonzero(lengths < 1e-6)
     if len(coincident):
         first, second = coincident[0], (coincident[0] + 1) % len(cones)
-        remedy = "remove one of them (the ring closes by itself, its first cone is not repeated)"
         raise TrackError(
-            f"Cones {first} and {second} of the {side} lie on the same spot; {remedy}."
+            f"Cones {first} and {second} of the {side} lie on the same spot; remove one of them "
+            "(the ring closes by itself, its first cone is not repeated)."
         )
 
 
 def _edges(ring: Array) -> Array:
+    """Return the way from each point of a ring [P, 2] to the next one."""
     return np.roll(ring, -1, axis=0) - ring
 
 
@@ -230,7 +267,7 @@ def _encloses(ring: Array, point: Array) -> bool:
 
 
 def _first_crossing(rings: dict[Side, Array]) -> tuple[set[Side], Array] | None:
-    """Return the sides and the place of the first crossing of the closed polylines [P, 2], or None."""
+    """Return the sides and the place of the first crossing of closed polylines [P, 2], or None."""
     begin = np.concatenate([rings[side] for side in SIDES])
     edge = np.concatenate([_edges(rings[side]) for side in SIDES])
     count = len(rings["left"])

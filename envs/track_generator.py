@@ -18,31 +18,40 @@ from coil_rl.envs.track import Array, Track, TrackError
 Line = NDArray[np.complex128]
 
 # Requirements.
-LAP = (59.0, 146.0)
-WIDTH = (1.9, 2.9)
-RADIUS, INNER_RADIUS = 2.5, 1.6
-FREE_SPACE = 2.0
+LAP = (59.0, 146.0)  # length of a lap
+WIDTH = (1.9, 2.9)  # of the track
+RADIUS, INNER_RADIUS = 2.5, 1.6  # smallest ones of the middle line and of the inner boundary
+FREE_SPACE = 2.0  # between two parts of the track
 # distance along the lap within which the radius alone keeps two points apart, half a hairpin
 NEIGHBOURS = 8.0
-CONE_GAP = 1.62
+CONE_GAP = 1.62  # mean distance of two cones of a side
 # Parameters of the draw.
-CELL = (5.8, 8.8)
-CELLS_PER_METRE = (
-    0.078  # an outline of n cells has up to 2 n + 2 edges, some of which the corners remove
-)
-SMOOTHING = 1.0
-STEP, FINE_STEP = 0.25, 0.1
-TRIES = 5000
+CELL = (5.8, 8.8)  # width of the rows and columns of the grid
+# An outline of n cells has up to 2 n + 2 edges, some of which the corners remove.
+CELLS_PER_METRE = 0.078
+SMOOTHING = 1.0  # standard deviation of the filter
+STEP, FINE_STEP = 0.25, 0.1  # between two points of the middle line, at the end and before
+TRIES = 5000  # draws until one makes a track
 MAX_TRACKS = 10_000  # takes minutes
 
 
 def random_track(seed: int, name: str | None = None) -> Track:
-    """Return the track of a seed, an integer of at least 0; its name is "random_SEED" by default."""
+    """Return the random track of a seed.
+
+    Args:
+        seed: an integer of at least 0, else a `ValueError`.
+        name: of the track, "random_SEED" by default.
+    """
     return _draw(seed, 0, name or f"random_{seed}")
 
 
 def random_tracks(count: int, seed: int) -> list[Track]:
-    """Return the first `count` tracks of a seed, beginning with `random_track(seed)`."""
+    """Return random tracks of a seed, the first one of which is like `random_track(seed)`.
+
+    Args:
+        count: number of tracks, from 1 to 10,000, else a `ValueError`.
+        seed: an integer of at least 0; the first tracks of a seed are the same for any `count`.
+    """
     if not 1 <= count <= MAX_TRACKS:
         raise ValueError(f"count={count} of random_tracks must be from 1 to {MAX_TRACKS}")
     return [_draw(seed, k, f"random_{seed}_{k}") for k in range(count)]
@@ -51,6 +60,7 @@ def random_tracks(count: int, seed: int) -> list[Track]:
 # Tracks are immutable, so they can be shared. Untyped, the cache would take True for 1.
 @lru_cache(maxsize=256, typed=True)
 def _draw(seed: int, k: int, name: str) -> Track:
+    """Return track number `k` of a seed, drawn again until a draw makes a track."""
     if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
         raise ValueError(f"seed={seed!r} of a random track must be an integer of at least 0")
     rng = np.random.default_rng([seed, k])
@@ -61,7 +71,10 @@ def _draw(seed: int, k: int, name: str) -> Track:
         if rng.random() < 0.5:
             line = line[::-1]
         width = _width(rng, len(line))
-        if not _drivable(line, width) or (first := _start(line)) is None:
+        if not _drivable(line, width):
+            continue
+        first = _start(line)
+        if first is None:
             continue
         line, width = np.roll(line, -first), np.roll(width, -first)
         heading = (line[1] - line[-1]) / abs(line[1] - line[-1])
@@ -85,7 +98,12 @@ def _centre_line(rng: np.random.Generator, lap: float) -> Line:
 
 
 def _rounded(edges: Line, cut: Array) -> Line:
-    """Replace the corners of a closed polygon of `edges` [C] by arcs that begin and end `cut` [C] from the corner."""
+    """Replace the corners of a closed polygon by arcs; return points at equal steps.
+
+    Args:
+        edges: of the polygon, [C].
+        cut: distance of both ends of an arc from its corner, [C].
+    """
     turns = np.angle(np.roll(edges, -1) / edges)
     straights = np.abs(edges) - cut - np.roll(cut, 1)
     # The radius is cut / tan(turn / 2); without a turn, any small angle gives the right length, 2
@@ -113,21 +131,15 @@ def _outline(rng: np.random.Generator, size: int) -> list[tuple[int, int]]:
         taken = [(cell[0] + i, cell[1] + j) in cells for i, j in ring]
         # Contiguous neighbours leave no hole and no corner at which the outline touches itself.
         # Thin branches make the hairpins, so cells with several neighbours are accepted less often.
-        contiguous = (
-            sum(
-                now and not before
-                for now, before in zip(taken, taken[-1:] + taken[:-1], strict=True)
-            )
-            == 1
-        )
-        if cell not in cells and contiguous and rng.random() < 0.15 ** (sum(taken[::2]) - 1):
+        groups = sum(taken[i] and not taken[i - 1] for i in range(len(taken)))
+        if cell not in cells and groups == 1 and rng.random() < 0.15 ** (sum(taken[::2]) - 1):
             cells.add(cell)
     square = [(0, 0), (1, 0), (1, 1), (0, 1)]
-    edges = {
-        ((x + a[0], y + a[1]), (x + b[0], y + b[1]))
-        for x, y in cells
-        for a, b in zip(square, square[1:] + square[:1], strict=True)
-    }
+    edges: set[tuple[tuple[int, int], tuple[int, int]]] = set()
+    for x, y in cells:
+        corners = [(x + i, y + j) for i, j in square]
+        edges.update(zip(corners, corners[1:] + corners[:1], strict=True))
+    # An edge between two cells is there in both directions, and not part of the outline.
     successor = {a: b for a, b in edges if (b, a) not in edges}
     path = [min(successor)]
     while successor[path[-1]] != path[0]:
@@ -149,15 +161,21 @@ def _width(rng: np.random.Generator, points: int) -> Array:
     """Draw a track width that varies slowly along the lap: [points]."""
     turn = np.linspace(0, 2 * np.pi, points, endpoint=False)
     waves = np.arange(1, 2 + points * STEP // 20)
-    wave = np.cos(np.outer(turn, waves) + rng.uniform(0, 2 * np.pi, len(waves))) @ rng.normal(
-        size=len(waves)
-    )
+    phases = rng.uniform(0, 2 * np.pi, len(waves))
+    wave = np.cos(np.outer(turn, waves) + phases) @ rng.normal(size=len(waves))
     middle = rng.uniform(0.3, 0.7)
     return WIDTH[0] + (WIDTH[1] - WIDTH[0]) * (middle + 0.3 * wave / np.abs(wave).max())
 
 
 def _drivable(line: Line, width: Array) -> bool:
-    """Return whether no turn is too tight, the track turns both ways and keeps its distance from itself."""
+    """Return whether a line makes a track.
+
+    No turn may be too tight, and the track must turn both ways and keep its distance from itself.
+
+    Args:
+        line: the middle of the track, [points].
+        width: of the track, [points].
+    """
     bend = _curvature(line)
     tight = np.abs(bend).max() * RADIUS > 1 or (np.abs(bend) * (INNER_RADIUS + width / 2)).max() > 1
     if tight or min(bend.max(), -bend.min()) < 0.15:
@@ -186,11 +204,13 @@ def _cones(rng: np.random.Generator, side: Line) -> Array:
 
 
 def _resampled(line: Line, fractions: Array) -> Line:
+    """Return the points of a closed line at fractions of its length."""
     closed = np.append(line, line[0])
     travelled = np.concatenate([[0.0], np.abs(np.diff(closed)).cumsum()])
     return np.interp(fractions * travelled[-1], travelled, closed)
 
 
 def _curvature(line: Line) -> Array:
+    """Return the curvature at each point of a closed line with steps of `STEP`."""
     edge = np.roll(line, -1) - line
     return np.angle(edge / np.roll(edge, 1)) / STEP

@@ -23,7 +23,7 @@ from coil_rl.envs.track import SIDES, Track
 CONE_RADIUS = 0.4  # m, crash distance between a car's centre and a cone
 BOUNDARY_MARGIN = 0.25  # m, crash distance between a car's centre and a boundary
 EXACT = 1.0  # m, clearances up to this include all cones
-SECTORS = 12
+SECTORS = 12  # of headings, 30 degrees each
 MAX_DISTANCE = 3.0  # m, limit of the distance field, wider than any track
 CELL = 1.0  # m, edge of a cell of candidate cones
 FIELD_CELL = 0.1  # m, edge of a cell of the distance field; the interpolation error is below 2 mm
@@ -34,18 +34,37 @@ Numbers = NDArray[np.int16]
 
 
 class Location(NamedTuple):
-    """The positions of cars in the tables of a `TrackMap`."""
+    """The positions of cars in the tables of a `TrackMap`.
 
-    track: Tensor  # [B], index
-    position: Tensor  # [2, B] m
-    finish: Tensor  # [2, B] m, the middle of the finish line of the car's track
-    cell: Tensor  # [B], of candidate cones
-    nodes: Tensor  # [2, B], the lower left and the upper left node of the distance field
-    fraction: Tensor  # [2, B], from 0 at the lower left node to 1 at the upper right one
+    Attributes:
+        track: [B], index of the car's track.
+        position: [2, B] m.
+        finish: [2, B] m, the middle of the finish line of the car's track.
+        cell: [B], the cell of candidate cones.
+        nodes: [2, B], the lower left and the upper left node of the distance field.
+        fraction: [2, B], place between the nodes, from 0 at the lower left one to 1 at the upper
+            right one.
+    """
+
+    track: Tensor
+    position: Tensor
+    finish: Tensor
+    cell: Tensor
+    nodes: Tensor
+    fraction: Tensor
 
 
 class TrackMap(nn.Module):
-    """The static geometry of several tracks on one device, for a batch of cars that refer to tracks by index."""
+    """The static geometry of several tracks on one device.
+
+    A batch of cars refers to the tracks by index. All tables are buffers that are not saved, as
+    they follow from the tracks.
+
+    Args:
+        tracks: at least one, else a `ValueError`.
+        sight: m, range of view of the cars.
+        dtype: of positions and distances.
+    """
 
     cones: Tensor  # [2, slots of all sides of all tracks] m
     starts: Tensor  # [3, tracks]
@@ -95,11 +114,8 @@ class TrackMap(nn.Module):
             Slot of each candidate among its track's cones [N, 2, B], ascending, the right side from
             `slots` on, and its position [2, N, 2, B] in m; padding is 10 km away.
         """
-        sector = (
-            (heading * constant(SECTORS / (2 * np.pi), heading))
-            .floor_()
-            .remainder_(constant(SECTORS, heading))
-        )
+        sector = (heading * constant(SECTORS / (2 * np.pi), heading)).floor_()
+        sector = sector.remainder_(constant(SECTORS, heading))
         row = torch.add(sector.long(), self.block.index_select(0, location.cell), alpha=SECTORS)
         most = slots_in_use(self.candidate_count.index_select(0, row), self.most)
         slot = _batch_last(self.candidate.index_select(0, row)[:, : 2 * most]).view(most, 2, -1)
@@ -121,9 +137,8 @@ class TrackMap(nn.Module):
 
         Exact up to 1 m; beyond that, cones may be missing from the table.
         """
-        cones = self._positions(
-            location.track, _batch_last(self.near.index_select(0, location.cell))
-        )
+        slot = _batch_last(self.near.index_select(0, location.cell))
+        cones = self._positions(location.track, slot)
         to_cone = (cones - location.position.unsqueeze(1)).square_().sum(0).amin(0).sqrt_()
         nearer = to_boundaries.amin(0)
         return torch.minimum(
@@ -131,12 +146,19 @@ class TrackMap(nn.Module):
         )
 
     def _positions(self, track: Tensor, slot: Tensor) -> Tensor:
+        """Return the positions [2, *slots, B] m of cones by their slots on tracks [B]."""
         index = torch.add(slot, track, alpha=2 * self.slots).flatten()
         return self.cones.index_select(1, index).view(2, *slot.shape)
 
 
 class Grid:
-    """Square cells over the area of a track, numbered row by row from the corner `low` on, in columns and rows."""
+    """Square cells over the area of a track, numbered row by row from the corner `low` on.
+
+    Args:
+        track: the track.
+        cell: m, edge of a cell.
+        dtype: to which the corner is rounded, so that all tables have the same one.
+    """
 
     def __init__(self, track: Track, cell: float, dtype: torch.dtype) -> None:
         points = np.vstack([track.left, track.right, [track.start[:2]]])
@@ -146,10 +168,8 @@ class Grid:
 
     def nodes(self) -> NDArray[np.float64]:
         """Return the lower left corners of the cells, [cells, 2] m."""
-        x, y = (
-            low + self.cell * np.arange(count)
-            for low, count in zip(self.low, self.shape, strict=True)
-        )
+        x = self.low[0] + self.cell * np.arange(self.shape[0])
+        y = self.low[1] + self.cell * np.arange(self.shape[1])
         return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
@@ -158,12 +178,8 @@ class Grid:
 @lru_cache(maxsize=8)
 def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict[str, Tensor]:
     """Return the buffers of a `TrackMap` by name."""
-    slots = max(len(ring) for track in tracks for ring in (track.left, track.right)) + 1
-    cones = np.full((2, len(tracks), 2, slots), FAR)
-    for index, track in enumerate(tracks):
-        for side, ring in enumerate((track.left, track.right)):
-            cones[:, index, side, : len(ring)] = ring.T
-
+    cones = _cone_table(tracks)
+    slots = cones.shape[-1]
     used, visible, near = zip(*(nearby_cones(track, sight, dtype) for track in tracks), strict=True)
     filled = np.concatenate(used)
     candidate = _stack([np.full((1, SECTORS, 2, 1), -1), *visible])
@@ -171,12 +187,8 @@ def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict
     lefts = [len(track.left) for track in tracks]
     decisive = _stack([np.where(n < k, n, n - k + slots) for n, k in zip(near, lefts, strict=True)])
 
-    # Numbers of each track, one column per track: points in m, and integers.
-    grids = [[Grid(track, edge, dtype) for track in tracks] for edge in (CELL, FIELD_CELL)]
-    finish = np.stack([track.finish for track in tracks], axis=1)
-    low = np.stack([grid.low for grid in grids[0]], axis=1)
-    shapes = [np.array([grid.shape for grid in row]).T for row in grids]
-    offsets = [np.cumsum(shape.prod(axis=0)) - shape.prod(axis=0) for shape in shapes]
+    points, counts = _grid_numbers(tracks, dtype)
+    field = np.concatenate([boundary_distances(track, dtype) for track in tracks])
     numbers: dict[str, tuple[NDArray[np.generic], torch.dtype]] = {
         "cones": (cones.reshape(2, -1), dtype),
         "starts": (np.array([track.start for track in tracks]).T, dtype),
@@ -184,12 +196,9 @@ def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict
         "candidate": (slot.swapaxes(-1, -2).reshape(-1, 2 * candidate.shape[-1]), torch.int16),
         "candidate_count": ((candidate >= 0).sum(-1).max(-1).ravel(), torch.int16),
         "near": (np.where(decisive < 0, slots - 1, decisive), torch.int32),
-        "field": (
-            np.concatenate([boundary_distances(track, dtype) for track in tracks]).ravel(),
-            dtype,
-        ),
-        "points": (np.vstack([finish, low, *[shape - 2 for shape in shapes]]), dtype),
-        "counts": (np.stack([*[shape[0] for shape in shapes], *offsets]), torch.int64),
+        "field": (field.ravel(), dtype),
+        "points": (points, dtype),
+        "counts": (counts, torch.int64),
     }
     return {
         name: torch.tensor(np.ascontiguousarray(table), dtype=kind)
@@ -197,12 +206,47 @@ def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict
     }
 
 
+def _cone_table(tracks: Sequence[Track]) -> NDArray[np.float64]:
+    """Return the cones of all tracks, [2, tracks, 2, slots] m, padded by cones far away.
+
+    Each side has at least one slot of padding, the last one.
+    """
+    slots = max(max(len(track.left), len(track.right)) for track in tracks) + 1
+    cones = np.full((2, len(tracks), 2, slots), FAR)
+    for index, track in enumerate(tracks):
+        for side, ring in enumerate((track.left, track.right)):
+            cones[:, index, side, : len(ring)] = ring.T
+    return cones
+
+
+def _grid_numbers(
+    tracks: Sequence[Track], dtype: torch.dtype
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return the numbers that locate a position in the two grids, one column per track.
+
+    Returns:
+        `points` and `counts` of a `TrackMap`, [8, tracks] and [4, tracks].
+    """
+    grids = [[Grid(track, edge, dtype) for track in tracks] for edge in (CELL, FIELD_CELL)]
+    finish = np.stack([track.finish for track in tracks], axis=1)
+    low = np.stack([grid.low for grid in grids[0]], axis=1)
+    shapes = [np.array([grid.shape for grid in row]).T for row in grids]
+    offsets = [np.cumsum(shape.prod(axis=0)) - shape.prod(axis=0) for shape in shapes]
+    points = np.vstack([finish, low, *[shape - 2 for shape in shapes]])
+    return points, np.stack([*[shape[0] for shape in shapes], *offsets])
+
+
 # Cached, because some sets of tracks have tracks in common.
 @lru_cache(maxsize=64)
 def nearby_cones(
     track: Track, sight: float, dtype: torch.dtype
 ) -> tuple[NDArray[np.bool_], Numbers, Numbers]:
-    """Return the relevant cones of each cell of a track, by number, ascending, then -1; `sight` is in m.
+    """Return the relevant cones of each cell of a track, by number, ascending, then -1.
+
+    Args:
+        track: the track.
+        sight: m, range of view.
+        dtype: of the corner of the grid.
 
     Returns:
         Whether any cone may be visible, [cells]; the cones of the left and of the right side that
@@ -235,22 +279,28 @@ def nearby_cones(
 
 @lru_cache(maxsize=64)
 def boundary_distances(track: Track, dtype: torch.dtype) -> NDArray[np.float64]:
-    """Return the distances of the grid nodes from the left and the right boundary: [nodes, 2] m, at most 3."""
+    """Return the distances of the grid nodes from both boundaries: [nodes, 2] m, at most 3.
+
+    Args:
+        track: the track.
+        dtype: of the corner of the grid.
+    """
     nodes = Grid(track, FIELD_CELL, dtype).nodes()
-    # For points this dense along a line, a plain tree is twice as fast as a compact and balanced
-    # one.
-    trees = [
-        cKDTree(track.boundary(side, 0.02), compact_nodes=False, balanced_tree=False)
-        for side in SIDES
-    ]
-    distances = [
-        tree.query(nodes, distance_upper_bound=MAX_DISTANCE, workers=-1)[0] for tree in trees
-    ]
+    distances = []
+    for side in SIDES:
+        # For points this dense along a line, a plain tree is twice as fast as a compact and
+        # balanced one.
+        boundary = track.boundary(side, 0.02)
+        tree = cKDTree(boundary, compact_nodes=False, balanced_tree=False)
+        distances.append(tree.query(nodes, distance_upper_bound=MAX_DISTANCE, workers=-1)[0])
     return np.minimum(np.stack(distances, axis=1), MAX_DISTANCE)
 
 
 def _true_columns(mask: NDArray[np.bool_]) -> Numbers:
-    """Return the columns of the True entries of each row [..., N], ascending, padded with -1: [..., most]."""
+    """Return the columns of the True entries of each row [..., N]: [..., most].
+
+    They are ascending and padded with -1 to the length of the longest row.
+    """
     counts = mask.sum(axis=-1)
     columns = np.full((*mask.shape[:-1], max(1, int(counts.max()))), -1, dtype=np.int16)
     *row, column = np.nonzero(mask)
@@ -267,7 +317,8 @@ def _batch_last(rows: Tensor) -> Tensor:
 def _stack(tables: Sequence[NDArray[np.integer]]) -> NDArray[np.integer]:
     """Concatenate tables [rows, ..., N], the narrower ones filled up with -1."""
     most = max(table.shape[-1] for table in tables)
-    ends = [[*[(0, 0)] * (table.ndim - 1), (0, most - table.shape[-1])] for table in tables]
-    return np.concatenate(
-        [np.pad(t, end, constant_values=-1) for t, end in zip(tables, ends, strict=True)]
-    )
+    filled = []
+    for table in tables:
+        ends = [(0, 0)] * (table.ndim - 1) + [(0, most - table.shape[-1])]
+        filled.append(np.pad(table, ends, constant_values=-1))
+    return np.concatenate(filled)

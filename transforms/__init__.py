@@ -1,4 +1,8 @@
-"""TorchRL transforms for guides in any env: advice, combined actions, reward coupling, degraded advice."""
+"""TorchRL transforms that bring guides to any env.
+
+`GuideActions` writes advice into the observation. The others use it: they combine the actions of
+agent and guide, couple the reward to the advice, leave the advice out or degrade it.
+"""
 
 from coil_rl.transforms.advice_dropout import AdviceDropout as AdviceDropout
 from coil_rl.transforms.combined_actions import AdaptiveMixedAction as AdaptiveMixedAction

@@ -1,4 +1,9 @@
-"""Conversion between the actions of an env and vectors of numbers."""
+"""Conversion between the actions of an env and vectors of numbers.
+
+Guides, networks and losses compute with vectors. The env may take a vector, the index of a choice,
+or several choices at once, for one agent or for several. This is the only file that knows about
+these kinds of actions.
+"""
 
 from __future__ import annotations
 
@@ -30,11 +35,15 @@ def nested_key(key: Key) -> Key:
 
 
 class ActionSpace:
-    """Actions of an env as vectors [*batch, *agents, A], by its action spec and number of batch dimensions.
+    """Actions of an env as vectors [*batch, *agents, A].
 
     A discrete action is one-hot, A is the number of choices. Several discrete actions
-    (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side. A single action
-    without a dimension of its own, or one of whole numbers that are no choices, is a `ValueError`.
+    (MultiCategorical, MultiOneHot, Binary) are their one-hot vectors side by side.
+
+    Args:
+        spec: of the action. A single action without a dimension of its own, or one of whole numbers
+            that are no choices, is a `ValueError`.
+        batch_dims: number of batch dimensions of the env.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
@@ -53,10 +62,10 @@ class ActionSpace:
         self.indexed = bool(self.choices) and not self.one_hot
         own = not self.indexed or len(self.choices) > 1 or self.event[-1:] == (1,)
         self.agents = self.event[:-1] if own else self.event
-        first = (0,) * batch_dims
-        self.bounds = (
-            (spec.space.low[first], spec.space.high[first]) if isinstance(spec, Bounded) else None
-        )
+        self.bounds: tuple[Tensor, Tensor] | None = None
+        if isinstance(spec, Bounded):
+            first = (0,) * batch_dims
+            self.bounds = spec.space.low[first], spec.space.high[first]
 
     def vectors(self, action: Tensor) -> Tensor:
         """Convert env actions to vectors [*batch, *agents, A]."""
@@ -68,15 +77,24 @@ class ActionSpace:
     def advice(self, action: Tensor, batch: torch.Size) -> Tensor:
         """Convert the action of a guide to a vector within the bounds of the env's action.
 
-        It is [*batch, *agents, A], for choices also their indices; raises a `ValueError` for
-        another shape.
+        Args:
+            action: [*batch, *agents, A], for choices also their indices; another shape is a
+                `ValueError`.
+            batch: of the action.
         """
         indices = self._indices(action, batch)
         vectors = action if indices is None else self._encoded(indices)
         return self.clamp(vectors.to(self.dtype))
 
     def check_advice(self, action: Tensor, batch: torch.Size) -> None:
-        """Raise a `ValueError` for a guide's action of another shape, or with numbers that no action has."""
+        """Raise a `ValueError` for a guide's action that does not fit the env.
+
+        It has another shape, or numbers that no action of the env has.
+
+        Args:
+            action: of the guide.
+            batch: of the action.
+        """
         indices = self._indices(action, batch)
         if not action.isfinite().all():
             raise ValueError("holds a number that is not finite")
@@ -90,7 +108,10 @@ class ActionSpace:
                 )
 
     def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
-        """Return the choices of a guide as indices [*batch, *agents, n], None if they are vectors already."""
+        """Return the choices of a guide as indices [*batch, *agents, n].
+
+        None if they are vectors already.
+        """
         lead = (*batch, *self.agents)
         if action.shape == (*lead, self.size):
             return None
@@ -106,9 +127,8 @@ class ActionSpace:
         best = torch.stack([part.argmax(-1) for part in vectors.split(self.choices, -1)], -1)
         if self.one_hot:
             return self._encoded(best).to(self.spec.dtype)
-        return best.reshape(
-            (*vectors.shape[: vectors.ndim - 1 - len(self.agents)], *self.event)
-        ).to(self.spec.dtype)
+        batch = vectors.shape[: vectors.ndim - 1 - len(self.agents)]
+        return best.reshape((*batch, *self.event)).to(self.spec.dtype)
 
     def _encoded(self, indices: Tensor) -> Tensor:
         """Return the one-hot vectors of indices [..., n] side by side."""
@@ -123,7 +143,14 @@ class ActionSpace:
         return vectors if self.bounds is None else vectors.clamp(*self.bounds)
 
     def advice_spec(self, batch: torch.Size, guides: int) -> TensorSpec:
-        """Return the spec of advice [*batch, *agents, guides, A]: bounds of the action, 0 and 1 for one-hot vectors."""
+        """Return the spec of advice [*batch, *agents, guides, A].
+
+        Its bounds are those of the action, or 0 and 1 for one-hot vectors.
+
+        Args:
+            batch: of the env.
+            guides: number of guides.
+        """
         shape, device = (*batch, *self.agents, guides, self.size), self.spec.device
         if not self.continuous:
             return Bounded(0, 1, shape, device=device, dtype=self.dtype)
@@ -150,11 +177,13 @@ class ActionTransform(Transform):
 
 
 def choices_of(spec: TensorSpec) -> list[int]:
-    """Return the number of choices of each discrete action of a spec, an empty list if there is none."""
+    """Return the number of choices of each discrete action of a spec; an empty list without any."""
     if isinstance(spec, Binary):
         return [2] * spec.shape[-1]
     if isinstance(spec, MultiCategorical):
         return spec.nvec.reshape(-1, spec.nvec.shape[-1])[0].tolist()
     if isinstance(spec, MultiOneHot):
         return list(spec.nvec)
-    return [int(spec.space.n)] if isinstance(spec, (Categorical, OneHot)) else []
+    if isinstance(spec, (Categorical, OneHot)):
+        return [int(spec.space.n)]
+    return []

@@ -9,10 +9,9 @@ learners with replay learn from the executed action where the agent could have c
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import NestedKey, TensorDictBase
 from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
@@ -23,20 +22,28 @@ EXECUTED = "executed_action"
 
 
 class CombinedAction(GuideTransform):
-    """Base class: executes another action than the agent's, and writes it as `executed_action`, 0 after a reset.
+    """Base class: executes another action than the agent's, and writes it as `executed_action`.
 
-    The options of all subclasses are `guide`, `action_key` and `advice_key`, as for
-    `GuideTransform`.
+    After a reset that entry is 0.
+
+    Args:
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written: tuple[str, ...] = (EXECUTED,)
     adds = False  # whether the guide's action is added to the agent's, not put in its place
 
-    def __init__(self, **options: Any) -> None:
-        super().__init__(**options)
-        self.taken: Tensor = nn.Buffer(
-            torch.zeros((), dtype=torch.int64)
-        )  # steps in training, over all rows
+    def __init__(
+        self,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(guide, action_key, advice_key)
+        # Steps in training, over all rows.
+        self.taken: Tensor = nn.Buffer(torch.zeros((), dtype=torch.int64))
 
     def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         executed = self._executed(tensordict)
@@ -44,6 +51,7 @@ class CombinedAction(GuideTransform):
         return tensordict.set(self.action_key, executed).set(EXECUTED, executed)
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the action to execute, [*batch, *A], by the observation and the agent's action."""
         raise NotImplementedError
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -58,11 +66,11 @@ class CombinedAction(GuideTransform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add what it writes; raises a `ValueError` if discrete actions would have to be added."""
         if self.adds and not self.action_space.continuous:
-            problem = (
-                f"needs continuous actions, but this env has {self.action_space.size} discrete ones"
+            raise ValueError(
+                f"{type(self).__name__} needs continuous actions, but this env has "
+                f"{self.action_space.size} discrete ones; use Takeover, which replaces the agent's "
+                "action in some steps"
             )
-            remedy = "use Takeover, which replaces the agent's action in some steps"
-            raise ValueError(f"{type(self).__name__} {problem}; {remedy}")
         return super().transform_observation_spec(observation_spec).update(self._specs())
 
     def _specs(self) -> dict[str, TensorSpec]:
@@ -73,23 +81,39 @@ class CombinedAction(GuideTransform):
     def _spec_of_rows(
         self, kind: Callable[..., TensorSpec], *bounds: float, dtype: torch.dtype
     ) -> TensorSpec:
-        """Return the spec of one number a row, [*batch, 1]."""
-        return kind(
-            *bounds, shape=(*self.parent.batch_size, 1), device=self.parent.device, dtype=dtype
-        )
+        """Return the spec of one number a row, [*batch, 1].
+
+        Args:
+            kind: class of the spec.
+            bounds: its arguments.
+            dtype: of the number.
+        """
+        shape = (*self.parent.batch_size, 1)
+        return kind(*bounds, shape=shape, device=self.parent.device, dtype=dtype)
 
 
 class ResidualAction(CombinedAction):
     """Residual policy: the env action is g + scale * a, clamped (Johannink et al. 2019).
 
-    The scale is a number or a schedule over the run. With 0 the guide acts alone.
+    Args:
+        scale: a number or a schedule over the run; with 0 the guide acts alone.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "scale"
     adds = True
 
-    def __init__(self, scale: float | Schedule = 1.0, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        scale: float | Schedule = 1.0,
+        *,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(guide, action_key, advice_key)
         self.scale = scale
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
@@ -100,41 +124,56 @@ class ResidualAction(CombinedAction):
 class MixedAction(CombinedAction):
     """Weighted mean: the env action is weight * a + (1 - weight) * g, clamped.
 
-    The weight is a number or a schedule over the run. With 1 the agent acts alone.
+    Args:
+        weight: of the agent, a number or a schedule over the run; with 1 the agent acts alone.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "weight"
     adds = True
 
-    def __init__(self, weight: float | Schedule, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        weight: float | Schedule,
+        *,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(guide, action_key, advice_key)
         self.weight = weight
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
         weight = self.current(self.weight)
-        return self.action_space.clamp(
-            weight * tensordict[self.action_key] + (1 - weight) * self.advice(tensordict)
-        )
+        action, advice = tensordict[self.action_key], self.advice(tensordict)
+        return self.action_space.clamp(weight * action + (1 - weight) * advice)
 
 
 class AdaptiveMixedAction(CombinedAction):
-    """Weighted mean in which the agent weighs more the surer its critics are: CHEQ (Cramer et al. 2024).
+    """Weighted mean in which the agent weighs more the surer its critics are.
 
-    The weight is observed as `agent_weight` [*batch, 1], so stored steps remain valid. It is `low`
-    in the first step of an episode, then a linear function of `("next", "uncertainty")` [*batch,
-    1], which the policy wrote in the step before: `high` up to `certain`, and `low` from
-    `uncertain` on, or if the policy writes none. Weights that are not in order within [0, 1], or
-    uncertainties not in order, are a `ValueError`.
+    This is CHEQ (Cramer et al. 2024). The weight is observed as `agent_weight` [*batch, 1], so
+    stored steps remain valid. It is `low` in the first step of an episode, then a linear function
+    of `("next", "uncertainty")` [*batch, 1], which the policy wrote in the step before: `high` up
+    to `certain`, and `low` from `uncertain` on, or if the policy writes none.
 
     Args:
-        low: smallest weight of the agent.
-        high: largest weight of the agent.
-        certain: uncertainty up to which the weight is `high`.
-        uncertain: uncertainty from which on the weight is `low`.
+        low: smallest weight of the agent, at least 0.
+        high: largest weight of the agent, at most 1.
+        certain: uncertainty up to which the weight is `high`, at least 0.
+        uncertain: uncertainty from which on the weight is `low`, more than `certain`.
         warm_up: number of steps at the start of the run, over all rows, in which the weight is
             drawn from `low` to `warm_up_high` instead.
-        warm_up_high: see `warm_up`.
+        warm_up_high: largest weight of the warm-up, from `low` to `high`.
         seed: of the draws.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
+
+    Raises:
+        ValueError: for weights that are not in order within [0, 1], or uncertainties not in order.
     """
 
     written = (EXECUTED, "agent_weight")
@@ -149,13 +188,16 @@ class AdaptiveMixedAction(CombinedAction):
         warm_up: int = 10_000,
         warm_up_high: float = 0.3,
         seed: int = 0,
-        **options: Any,
+        *,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
     ) -> None:
-        super().__init__(**options)
+        super().__init__(guide, action_key, advice_key)
         if not (0 <= low <= warm_up_high <= high <= 1 and 0 <= certain < uncertain):
-            weights = f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, from 0 to 1"
             raise ValueError(
-                f"{weights}, and certain={certain} at least 0 and less than uncertain={uncertain}"
+                f"low={low}, warm_up_high={warm_up_high} and high={high} must be in this order, "
+                f"from 0 to 1, and certain={certain} at least 0 and less than uncertain={uncertain}"
             )
         self.low, self.high, self.certain, self.uncertain = low, high, certain, uncertain
         self.warm_up, self.warm_up_high, self.rng = warm_up, warm_up_high, SeededGenerator(seed)
@@ -169,11 +211,8 @@ class AdaptiveMixedAction(CombinedAction):
         doubt = next_tensordict.pop("uncertainty", None)
         weight = torch.full_like(tensordict["agent_weight"], self.low)
         if doubt is not None:
-            share = (
-                ((doubt - self.certain) / (self.uncertain - self.certain))
-                .clamp(0, 1)
-                .to(weight.dtype)
-            )
+            share = (doubt - self.certain) / (self.uncertain - self.certain)
+            share = share.clamp(0, 1).to(weight.dtype)
             weight = self.high - (self.high - self.low) * share
         if self.learns:
             draw = torch.rand(weight.shape, generator=self.rng.generator).to(weight)
@@ -193,12 +232,25 @@ class AdaptiveMixedAction(CombinedAction):
 
 
 class _ActionSwitch(CombinedAction):
-    """Base class: the env gets the guide's action where `agent_acts` is false."""
+    """Base class: the env gets the guide's action where `agent_acts` is false.
+
+    Args:
+        seed: of the draws.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
+    """
 
     written: tuple[str, ...] = (EXECUTED, "agent_acts")
 
-    def __init__(self, seed: int = 0, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        seed: int = 0,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(guide, action_key, advice_key)
         self.rng = SeededGenerator(seed)
 
     def _draw(self) -> Tensor:
@@ -224,41 +276,47 @@ class _ActionSwitch(CombinedAction):
         raise NotImplementedError
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return (
-            super()
-            ._step(tensordict, next_tensordict)
-            .set("agent_acts", self._agent_acts(next_tensordict))
-        )
+        after = super()._step(tensordict, next_tensordict)
+        return after.set("agent_acts", self._agent_acts(next_tensordict))
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
-        return (
-            super()
-            ._reset(tensordict, tensordict_reset)
-            .set("agent_acts", self._agent_acts(tensordict_reset))
-        )
+        after = super()._reset(tensordict, tensordict_reset)
+        return after.set("agent_acts", self._agent_acts(tensordict_reset))
 
     def _specs(self) -> dict[str, TensorSpec]:
         return super()._specs() | {"agent_acts": self._spec_of_rows(Binary, 1, dtype=torch.bool)}
 
 
 class Takeover(_ActionSwitch):
-    """Random takeover by the guide in each step: the mixture of DAgger (Ross et al. 2011; paper algorithm 7).
+    """Random takeover by the guide in each step.
 
-    In evaluation the agent always acts.
+    This is the mixture of DAgger (Ross et al. 2011; paper algorithm 7). In evaluation the agent
+    always acts.
 
     Args:
-        probability: probability of the guide (beta in DAgger), a number or a schedule over the run.
+        probability: probability of the guide (beta in DAgger), from 0 to 1, a number or a schedule
+            over the run.
         frames: number of steps at the start of the run, over all rows, after which the agent always
-            acts, as in RLPD and WSRL; None: no limit.
-        options: `seed` of the draws, and those of `CombinedAction`.
+            acts, as in RLPD and WSRL; None for no limit.
+        seed: of the draws.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     def __init__(
-        self, probability: float | Schedule = 1.0, frames: int | None = None, **options: Any
+        self,
+        probability: float | Schedule = 1.0,
+        frames: int | None = None,
+        *,
+        seed: int = 0,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
     ) -> None:
-        super().__init__(**options)
+        super().__init__(seed, guide, action_key, advice_key)
         self.probability, self.frames = probability, frames
 
     def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
@@ -266,24 +324,50 @@ class Takeover(_ActionSwitch):
         if not self.learns:
             return torch.ones_like(draw, dtype=torch.bool)
         agent = draw >= self.current(self.probability)
-        return (
-            agent if self.frames is None else agent | (self.taken >= self.frames).to(agent.device)
-        )
+        if self.frames is None:
+            return agent
+        return agent | (self.taken >= self.frames).to(agent.device)
 
 
 class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 
     The env action is g with a probability that decreases over the run, else g + scale * a, clamped;
-    in evaluation always the latter. The scale is a number or a schedule over the run; the
-    `probability` of g alone and the other arguments are those of `Takeover`.
+    in evaluation always the latter.
+
+    Args:
+        scale: of the agent's action, a number or a schedule over the run.
+        probability: of the guide's action alone, from 0 to 1, a number or a schedule over the run.
+        frames: number of steps at the start of the run, over all rows, after which the agent's
+            action is always added; None for no limit.
+        seed: of the draws.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     mdp_parameter = "scale"
     adds = True
 
-    def __init__(self, scale: float | Schedule = 0.2, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        scale: float | Schedule = 0.2,
+        *,
+        probability: float | Schedule = 1.0,
+        frames: int | None = None,
+        seed: int = 0,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(
+            probability,
+            frames,
+            seed=seed,
+            guide=guide,
+            action_key=action_key,
+            advice_key=advice_key,
+        )
         self.scale = scale
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
@@ -292,22 +376,34 @@ class GradualResidual(Takeover):
 
 
 class JumpStart(_ActionSwitch):
-    """Jump start: the guide acts in the first steps of each episode, then the agent (Uchendu et al. 2023).
+    """Jump start: the guide acts in the first steps of each episode, then the agent.
 
-    In evaluation the agent always acts. `guide_steps` [*batch, 1] counts the remaining steps of the
-    guide.
+    It is due to Uchendu et al. 2023. In evaluation the agent always acts. `guide_steps` [*batch, 1]
+    counts the remaining steps of the guide.
 
     Args:
         horizon: steps of the guide, a number or a schedule over the run; a decreasing schedule is a
             curriculum.
         random: draw the horizon of each episode uniformly from 0 to `horizon`.
-        options: `seed` of the draws, and those of `CombinedAction`.
+        seed: of the draws.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written = (EXECUTED, "agent_acts", "guide_steps")
 
-    def __init__(self, horizon: float | Schedule, random: bool = False, **options: Any) -> None:
-        super().__init__(**options)
+    def __init__(
+        self,
+        horizon: float | Schedule,
+        random: bool = False,
+        *,
+        seed: int = 0,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
+    ) -> None:
+        super().__init__(seed, guide, action_key, advice_key)
         self.horizon, self.random = horizon, random
 
     def _agent_acts(self, tensordict: TensorDictBase) -> Tensor:
@@ -318,10 +414,11 @@ class JumpStart(_ActionSwitch):
     ) -> TensorDictBase:
         draw = self._draw()
         horizon = max(self.current(self.horizon), 0.0) if self.learns else 0.0
-        # Rounded down, so that 0, 1 ... horizon are equally likely.
-        steps = (
-            (draw * (horizon + 1)).long() if self.random else torch.full_like(draw, horizon).long()
-        )
+        if self.random:
+            # Rounded down, so that 0, 1 ... horizon are equally likely.
+            steps = (draw * (horizon + 1)).long()
+        else:
+            steps = torch.full_like(draw, horizon).long()
         return super()._reset(tensordict, tensordict_reset.set("guide_steps", steps))
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:

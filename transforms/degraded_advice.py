@@ -20,12 +20,13 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class DegradedAdvice(Transform):
-    """Base class: applies `degrade` to the advice of all guides and clamps the result to the bounds of the advice.
+    """Base class: applies `degrade` to the advice of all guides.
 
-    `transform(tensordict)` does the same for stored data; outside an env there are no bounds.
+    The result is clamped to the bounds of the advice. `transform(tensordict)` does the same for
+    stored data; outside an env there are no bounds.
 
     Args:
-        key: (of all subclasses) entry of the advice, [*batch, n_guides, A] in action units.
+        key: entry of the advice, [*batch, n_guides, A] in action units.
         memory_key: entry for advice of the past, [*batch, slots, n_guides, A].
         slots: length of the memory; 0 for none.
     """
@@ -36,7 +37,8 @@ class DegradedAdvice(Transform):
         self, key: NestedKey = "guide_action", memory_key: NestedKey | None = None, slots: int = 0
     ) -> None:
         key, memory_key = nested_key(key), nested_key(memory_key)
-        super().__init__(in_keys=[key], out_keys=[key, memory_key] if slots else [key])
+        out_keys = [key, memory_key] if slots else [key]
+        super().__init__(in_keys=[key], out_keys=out_keys)
         self.key, self.memory_key, self.slots = key, memory_key, slots
         self._bounds: tuple[Tensor, Tensor] | None = None
         self._bounds_known = False
@@ -54,7 +56,7 @@ class DegradedAdvice(Transform):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Degrade the advice in stored data; raises a `RuntimeError` if the transform needs previous steps."""
+        """Degrade the advice in stored data; RuntimeError if that takes previous steps."""
         if self.needs_past:
             raise RuntimeError(
                 f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"
@@ -62,20 +64,17 @@ class DegradedAdvice(Transform):
         return DegradedAdvice._call(self, tensordict)
 
     def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
+        """Write the advice within its bounds."""
+        # Only once, as `self.parent` is as slow as an env step.
         if not self._bounds_known and self.parent is not None:
-            spec, first = (
-                self.parent.full_observation_spec[self.key],
-                (0,) * len(self.parent.batch_size),
-            )
-            self._bounds = (
-                (spec.space.low[first], spec.space.high[first])
-                if isinstance(spec, Bounded)
-                else None
-            )
-            self._bounds_known = True  # `self.parent` is as slow as an env step
-        return tensordict.set(
-            self.key, advice if self._bounds is None else advice.clamp(*self._bounds)
-        )
+            spec = self.parent.full_observation_spec[self.key]
+            if isinstance(spec, Bounded):
+                first = (0,) * len(self.parent.batch_size)
+                self._bounds = spec.space.low[first], spec.space.high[first]
+            self._bounds_known = True
+        if self._bounds is not None:
+            advice = advice.clamp(*self._bounds)
+        return tensordict.set(self.key, advice)
 
     def _memory_spec(self, advice: TensorSpec) -> dict[NestedKey, TensorSpec]:
         *batch, guides, size = advice.shape
@@ -85,9 +84,10 @@ class DegradedAdvice(Transform):
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory; raises a `KeyError` without advice."""
         if self.key not in observation_spec.keys(True, True):
-            problem = f"{type(self).__name__} changes {self.key!r}"
-            written = sorted(map(str, observation_spec))
-            raise KeyError(f"{problem}, but the env writes {written}; put it behind GuideActions")
+            raise KeyError(
+                f"{type(self).__name__} changes {self.key!r}, but the env writes "
+                f"{sorted(map(str, observation_spec))}; put it behind GuideActions"
+            )
         return observation_spec.update(self._memory_spec(observation_spec[self.key]))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -102,7 +102,12 @@ class DegradedAdvice(Transform):
 
 
 class BiasedAdvice(DegradedAdvice):
-    """Advice with a constant, finite offset in action units."""
+    """Advice with a constant offset.
+
+    Args:
+        offset: in action units, finite.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(self, offset: float = 0.2, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -114,7 +119,13 @@ class BiasedAdvice(DegradedAdvice):
 
 
 class ScaledAdvice(DegradedAdvice):
-    """Advice multiplied by a finite constant: 0.5 for an undertuned guide, 0 for no advice, -1 for an adversary."""
+    """Advice multiplied by a constant.
+
+    Args:
+        gain: the constant, finite: 0.5 for an undertuned guide, 0 for no advice, -1 for an
+            adversary.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(self, gain: float, key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -126,7 +137,12 @@ class ScaledAdvice(DegradedAdvice):
 
 
 class PartialAdvice(DegradedAdvice):
-    """Advice to one side only, 0 for the other side: "left" keeps positive values, "right" negative values."""
+    """Advice to one side only, 0 for the other side.
+
+    Args:
+        side: "left" keeps positive values, "right" negative values; else a `ValueError`.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(self, side: Literal["left", "right"], key: NestedKey = "guide_action") -> None:
         super().__init__(key)
@@ -140,7 +156,12 @@ class PartialAdvice(DegradedAdvice):
 
 
 class _DrawnAdvice(DegradedAdvice):
-    """Base class of advice changed by random numbers, drawn anew at every step by a generator with the given seed."""
+    """Base class of advice changed by random numbers, drawn anew at every step.
+
+    Args:
+        seed: of the draws.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(self, seed: int, key: NestedKey) -> None:
         super().__init__(key)
@@ -152,6 +173,11 @@ class _DrawnAdvice(DegradedAdvice):
         A step draws two and uses the first. A partial reset uses the second of the next step,
         without advancing the generator: later draws then do not depend on when other rows are
         reset.
+
+        Args:
+            sample: draws a tensor of a shape with a generator, such as `torch.randn`.
+            advice: the advice.
+            after_reset: whether this is a partial reset.
         """
         state = self.rng.generator.get_state() if after_reset else None
         draws = sample(2, *advice.shape, generator=self.rng.generator)
@@ -171,7 +197,13 @@ class _DrawnAdvice(DegradedAdvice):
 
 
 class NoisyAdvice(_DrawnAdvice):
-    """Advice with Gaussian noise, independent at every step; `sigma` is its standard deviation in action units."""
+    """Advice with Gaussian noise, independent at every step.
+
+    Args:
+        sigma: standard deviation in action units, finite and at least 0.
+        seed: of the draws.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(self, sigma: float = 0.3, seed: int = 0, key: NestedKey = "guide_action") -> None:
         super().__init__(seed, key)
@@ -185,7 +217,14 @@ class NoisyAdvice(_DrawnAdvice):
 
 
 class RandomAdvice(_DrawnAdvice):
-    """Placebo: uniform random numbers from `low` to `high` in action units, drawn at every step, instead of advice."""
+    """Placebo: uniform random numbers instead of advice, drawn at every step.
+
+    Args:
+        low: smallest number, in action units, finite.
+        high: largest number, in action units, finite and more than `low`.
+        seed: of the draws.
+        key: entry of the advice, [*batch, n_guides, A].
+    """
 
     def __init__(
         self, low: float = -1.0, high: float = 1.0, seed: int = 0, key: NestedKey = "guide_action"
@@ -205,8 +244,12 @@ class ShuffledAdvice(DegradedAdvice):
 
     At every step all rows are shifted by the same random number. In a partial reset, a new episode
     gets the previous advice of another row. When the env builds its specs, a batch of one row is a
-    `ValueError`. The seed is that of the draws, and `memory_key` the entry for the original advice,
-    [*batch, 1, n_guides, A].
+    `ValueError`.
+
+    Args:
+        seed: of the draws.
+        key: entry of the advice, [*batch, n_guides, A].
+        memory_key: entry for the original advice, [*batch, 1, n_guides, A].
     """
 
     def __init__(
@@ -222,14 +265,14 @@ class ShuffledAdvice(DegradedAdvice):
         """Return the advice for other rows."""
         rows = advice.flatten(0, -3) if advice.ndim > 2 else advice.unsqueeze(0)
         self._check_rows(len(rows))
-        return rows.roll(
-            int(torch.randint(1, len(rows), (), generator=self.rng.generator)), 0
-        ).view_as(advice)
+        shift = int(torch.randint(1, len(rows), (), generator=self.rng.generator))
+        return rows.roll(shift, 0).view_as(advice)
 
     def _check_rows(self, rows: int) -> None:
         if rows < 2:
             raise ValueError(
-                "ShuffledAdvice gives a row the advice of another row, but the batch is one row; use more"
+                "ShuffledAdvice gives a row the advice of another row, but the batch is one row; "
+                "use more"
             )
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -252,10 +295,13 @@ class ShuffledAdvice(DegradedAdvice):
 
 
 class DelayedAdvice(DegradedAdvice):
-    """Advice of an earlier step, by a delay of `steps`, 0 for none; at first the first advice of the episode.
+    """Advice of an earlier step; at first the first advice of the episode.
 
-    `memory_key` is the entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
-    first.
+    Args:
+        steps: the delay, 0 for none; less is a `ValueError`.
+        key: entry of the advice, [*batch, n_guides, A].
+        memory_key: entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
+            first.
     """
 
     needs_past = True
@@ -287,9 +333,11 @@ class DelayedAdvice(DegradedAdvice):
 
 
 class RemovedAdvice(DegradedAdvice, ActionTransform):
-    """Placebo: the agent's previous action in place of the advice; zeros at the start of an episode.
+    """Placebo: the agent's previous action in place of the advice; zeros in the first step.
 
-    `action_key` is the entry of the action; a discrete action becomes one-hot.
+    Args:
+        key: entry of the advice, [*batch, n_guides, A].
+        action_key: entry of the action; a discrete action becomes one-hot.
     """
 
     needs_past = True
@@ -309,6 +357,7 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
 
 
 def _finite(name: str, value: float) -> float:
+    """Return a value; raise a `ValueError` if it is not finite."""
     if not math.isfinite(value):
         raise ValueError(f"{name}={value} must be a finite number")
     return value

@@ -1,4 +1,8 @@
-"""Discrete actions for an env with one bounded continuous action."""
+"""Discrete actions for an env with one bounded continuous action.
+
+DQN and other methods choose among a few actions. The guides of a continuous env go on to advise
+numbers; only the agent sees choices.
+"""
 
 import itertools
 import math
@@ -21,9 +25,6 @@ class DiscreteActions(ActionTransform):
     the transforms before it and the env work in action units, with the advice as given, not
     rounded.
 
-    Fewer than two choices, and values that are not finite and increasing, are a `ValueError`; in an
-    env also an action of another kind, and values outside its bounds.
-
     Args:
         choices: number of choices, equally spaced from bound to bound, or the values in action
             units.
@@ -32,10 +33,15 @@ class DiscreteActions(ActionTransform):
             n], 0 or 1.
         number_key: entry for the advice in action units, [*batch, n_guides, 1].
 
+    Raises:
+        ValueError: for fewer than two choices, and for values that are not finite and increasing;
+            in an env also for an action of another kind, and for values outside its bounds.
+
     Example:
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_envs=8), DiscreteActions(5))
+        >>> cars = ConeTrackEnv(shipped_tracks("train"), num_envs=8)
+        >>> env = TransformedEnv(cars, DiscreteActions(5))
         >>> env.action_spec.n, env.transform.values.tolist()
         (5, [-1.0, -0.5, 0.0, 0.5, 1.0])
     """
@@ -63,21 +69,24 @@ class DiscreteActions(ActionTransform):
         """[n], values of the choices in action units; RuntimeError outside an env."""
         spec = self.action_space.spec
         size = spec.shape[self.parent.batch_dims :].numel()
-        if not isinstance(spec, Bounded) or not spec.dtype.is_floating_point or size != 1:
-            kind = (
-                f"{size} numbers"
-                if spec.dtype.is_floating_point and size != 1
-                else type(spec).__name__
-            )
+        real = spec.dtype.is_floating_point
+        if real and size != 1:
             raise ValueError(
-                f"DiscreteActions needs an action of one bounded number, but this env's action is {kind}"
+                "DiscreteActions needs an action of one bounded number, but this env's action is "
+                f"{size} numbers"
+            )
+        if not real or not isinstance(spec, Bounded) or size != 1:
+            raise ValueError(
+                "DiscreteActions needs an action of one bounded number, but this env's action is "
+                f"{type(spec).__name__}"
             )
         low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
         if isinstance(self.choices, int):
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
         if self.choices[0] < low or self.choices[-1] > high:
             raise ValueError(
-                f"choices={list(self.choices)} must lie between the action's bounds {low} and {high}"
+                f"choices={list(self.choices)} must lie between the action's bounds {low} and "
+                f"{high}"
             )
         return torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
 
@@ -102,9 +111,8 @@ class DiscreteActions(ActionTransform):
         numbers = tensordict.get(self.number_key, None)
         if numbers is not None:
             tensordict.set(self.advice_key, numbers)
-        return tensordict.set(
-            self.action_key, self.values[tensordict[self.action_key]].unsqueeze(-1)
-        )
+        chosen = self.values[tensordict[self.action_key]]
+        return tensordict.set(self.action_key, chosen.unsqueeze(-1))
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
         """Replace the action spec."""

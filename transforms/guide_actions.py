@@ -1,9 +1,14 @@
-"""Advice: the actions of guides as an additional observation, as in COIL (paper section 3, equation 97)."""
+"""Advice: the actions of guides as an additional observation, as in COIL.
+
+It is the central idea of the paper (section 3, equation 97): the agent sees what its guides would
+do and learns by reward when to listen. `Guides` runs several guides as one module, `GuideCache`
+keeps the advice for the states in which episodes begin, and `GuideActions` is the transform.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -17,7 +22,12 @@ from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
 
 
 class UnfitActionError(ValueError):
-    """The action of a guide does not fit the env; `problem` says why."""
+    """The action of a guide does not fit the env.
+
+    Args:
+        guide: name of the guide.
+        problem: says why, as the end of a sentence.
+    """
 
     def __init__(self, guide: str, problem: str) -> None:
         super().__init__(f"the action of guide {guide!r} {problem}")
@@ -33,9 +43,11 @@ class Guides(TensorDictModuleBase):
         out_key: entry for the advice, [*batch, n_guides, A].
         trainable: require parameters and no memory in each guide.
 
-    Guides that are no mapping are a `TypeError`; none, an invalid name, or a guide without
-    `action_key` or parameters, or with a memory that is not as in `GuideMemory`, are a
-    `ValueError`.
+    Raises:
+        TypeError: if `guides` is not a mapping.
+        ValueError: without a guide, for an invalid name, for a guide that does not write
+            `action_key`, for one that cannot be trained although it has to be, and for a memory
+            that `GuideMemory` refuses.
     """
 
     def __init__(
@@ -63,20 +75,19 @@ class Guides(TensorDictModuleBase):
                 )
             if trainable and next(guide.parameters(), None) is None:
                 raise ValueError(
-                    f"guide {name!r} has no parameters to train; imitate it with a network (coil-distill)"
+                    f"guide {name!r} has no parameters to train; imitate it with a network "
+                    "(coil-distill)"
                 )
-        self.memories = {
-            name: memory
-            for name, guide in guides.items()
-            if (memory := GuideMemory(name, guide)).specs
-        }
-        if trainable and self.memories:
-            raise ValueError(
-                f"guide {next(iter(self.memories))!r} has a memory, and such a guide cannot be trained"
-            )
-        self.in_keys = list(
-            dict.fromkeys(key for guide in guides.values() for key in guide.in_keys)
-        )
+        memories = {name: GuideMemory(name, guide) for name, guide in guides.items()}
+        self.memories = {name: memory for name, memory in memories.items() if memory.specs}
+        for name in self.memories:
+            if trainable:
+                raise ValueError(f"guide {name!r} has a memory, and such a guide cannot be trained")
+        self.in_keys: list[NestedKey] = []
+        for guide in guides.values():
+            for key in guide.in_keys:
+                if key not in self.in_keys:
+                    self.in_keys.append(key)
         self.out_keys = [out_key]
         super().__init__()
         self.guides = nn.ModuleDict(guides)
@@ -109,10 +120,8 @@ class Guides(TensorDictModuleBase):
         rows = []
         for name, guide in self.guides.items():
             data = tensordict.select(*self._in_keys_of[name], strict=False)
-            if dtype := self._input_dtype.get(name):
-                data = data.apply(
-                    lambda value, to=dtype: value.to(to) if value.is_floating_point() else value
-                )
+            if name in self._input_dtype:
+                data = data.apply(partial(_converted, dtype=self._input_dtype[name]))
             if memory is not None and name in self.memories:
                 data = guide(data.update(memory[name]))
                 memory.set(name, data["next"].select(*self.memories[name].specs))
@@ -123,23 +132,31 @@ class Guides(TensorDictModuleBase):
         return torch.stack(rows, -2)
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
-        """Convert from here on what a guide reads to the dtype of its parameters, if they differ."""
+        """Convert from here on what a guide reads to the dtype of its parameters.
+
+        Args:
+            tensordict: an example of the observations, which may have another dtype.
+        """
         for name, guide in self.guides.items():
-            dtypes = {
-                parameter.dtype for parameter in guide.parameters() if parameter.is_floating_point()
-            }
+            of_guide = {each.dtype for each in guide.parameters() if each.is_floating_point()}
             read = tensordict.select(*self._in_keys_of[name], strict=False).values(True, True)
-            if len(dtypes) == 1 and any(
-                value.is_floating_point() and value.dtype not in dtypes for value in read
-            ):
-                self._input_dtype[name] = dtypes.pop()
+            of_entries = {each.dtype for each in read if each.is_floating_point()}
+            if len(of_guide) == 1 and of_entries - of_guide:
+                self._input_dtype[name] = of_guide.pop()
+
+
+def _converted(value: Tensor, dtype: torch.dtype) -> Tensor:
+    """Convert floating-point numbers to another dtype, and leave other entries as they are."""
+    return value.to(dtype) if value.is_floating_point() else value
 
 
 class GuideCache:
     """Cache of advice by observation, for the first states of episodes.
 
-    Episodes start in few states, and a lookup is much faster than a guide on one row. Beyond
-    `max_rows` new rows are not cached.
+    Episodes start in few states, and a lookup is much faster than a guide on one row.
+
+    Args:
+        max_rows: number of observations to keep; once there are more, no new ones are cached.
     """
 
     def __init__(self, max_rows: int = 256) -> None:
@@ -148,11 +165,14 @@ class GuideCache:
         self.advice: Tensor | None = None
 
     def __call__(self, data: TensorDictBase, advise: Callable[[TensorDictBase], Tensor]) -> Tensor:
-        """Return `advise(data)`, [N, ...], from data [N]; `advise` is called on new rows only."""
-        columns = [
-            leaf.reshape(len(data), leaf.shape[1:].numel()).double()
-            for leaf in data.values(True, True)
-        ]
+        """Return the advice for data.
+
+        Args:
+            data: observations, [N].
+            advise: returns the advice [N, ...] for data [N]; called on new rows only.
+        """
+        leaves = data.values(True, True)
+        columns = [each.reshape(len(data), each.shape[1:].numel()).double() for each in leaves]
         keys = [row.tobytes() for row in torch.cat(columns, 1).cpu().numpy()]
         new: dict[bytes, int] = {}
         for row, key in enumerate(keys):
@@ -164,9 +184,9 @@ class GuideCache:
             advice = advise(data[list(new.values())])
             self.advice = advice if self.advice is None else torch.cat([self.advice, advice])
             self.index.update(zip(new, range(len(self.index), len(self.advice)), strict=True))
-        return (
-            advise(data) if self.advice is None else self.advice[[self.index[key] for key in keys]]
-        )
+        if self.advice is None:
+            return advise(data)
+        return self.advice[[self.index[key] for key in keys]]
 
 
 class GuideActions(ActionTransform):
@@ -202,7 +222,8 @@ class GuideActions(ActionTransform):
         >>> from torchrl.envs import TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")), GuideActions({"middle": SplineGuide()}))
+        >>> cars = ConeTrackEnv(shipped_tracks("train"))
+        >>> env = TransformedEnv(cars, GuideActions({"middle": SplineGuide()}))
         >>> env.reset()["guide_action"].shape
         torch.Size([64, 1, 1])
     """
@@ -217,10 +238,8 @@ class GuideActions(ActionTransform):
         self.supplied = [key for key in SUPPLIED if key in module.in_keys]
         super().__init__(in_keys=module.in_keys, out_keys=module.out_keys)
         self.guides, self.action_key = module, module.action_key
-        pure = (
-            all(getattr(guide, "pure", False) for guide in guides.values()) and not self.needs_past
-        )
-        self._cache = GuideCache() if pure else None
+        pure = all(getattr(guide, "pure", False) for guide in guides.values())
+        self._cache = GuideCache() if pure and not self.needs_past else None
         self._checked: set[str] = set()
 
     @cached_property
@@ -262,17 +281,23 @@ class GuideActions(ActionTransform):
         return {"names": self.names}
 
     def set_extra_state(self, state: dict[str, list[str]]) -> None:
-        """Raise a `ValueError` for a state of other guides, or of another order, on which a policy depends."""
+        """Raise a `ValueError` for a state of other guides, or of another order of them.
+
+        A policy depends on both.
+        """
         if state["names"] != self.names:
             raise ValueError(
-                f"the state is of the guides {', '.join(state['names'])}, not {', '.join(self.names)}"
+                f"the state is of the guides {', '.join(state['names'])}, not "
+                f"{', '.join(self.names)}"
             )
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the advice for stored data; raises a `ValueError` if a guide depends on earlier steps."""
+        """Write the advice for stored data; a `ValueError` if a guide depends on earlier steps."""
         if self.needs_past:
-            problem = f"the guides {', '.join(self.names)} need the previous steps, which stored data do not have"
-            raise ValueError(f"{problem}; use them in a TransformedEnv")
+            raise ValueError(
+                f"the guides {', '.join(self.names)} need the previous steps, which stored data do "
+                "not have; use them in a TransformedEnv"
+            )
         return self._call(tensordict)
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -285,9 +310,8 @@ class GuideActions(ActionTransform):
         action = self.given_space.vectors(tensordict[self.action_key])
         data = next_tensordict.select(*self.in_keys, strict=False)
         memory = tensordict.select(*(("guide_state", name) for name in self.guides.memories))
-        return self._write(
-            next_tensordict, *self._advice_with_past(data, memory, self.rows, action)
-        )
+        advice, memory = self._advice_with_past(data, memory, self.rows, action)
+        return self._write(next_tensordict, advice, memory)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -297,19 +321,21 @@ class GuideActions(ActionTransform):
             if not self.needs_past:
                 return self._call(tensordict_reset)
             data = tensordict_reset.select(*self.in_keys, strict=False)
-            return self._write(tensordict_reset, *self._advice_with_past(data, None, self.rows))
+            advice, memory = self._advice_with_past(data, None, self.rows)
+            return self._write(tensordict_reset, advice, memory)
         # TorchRL discards the other rows; in a large batch nearly every step resets a few rows.
         rows: tuple[Tensor, ...] = mask.reshape(tensordict.batch_size).nonzero(as_tuple=True)
         data, memory = tensordict_reset.select(*self.in_keys, strict=False)[rows], None
         if self.needs_past:
             advice, memory = self._advice_with_past(data, None, self.rows[rows])
+        elif self._cache is not None:
+            advice = self._cache(data, self._advice)
         else:
-            advice = self._advice(data) if self._cache is None else self._cache(data, self._advice)
+            advice = self._advice(data)
 
         def full(part: Tensor) -> Tensor:
-            return part.new_zeros((*tensordict_reset.batch_size, *part.shape[1:])).index_put(
-                rows, part
-            )
+            whole = part.new_zeros((*tensordict_reset.batch_size, *part.shape[1:]))
+            return whole.index_put(rows, part)
 
         if memory is not None:
             memory = memory.apply(full, batch_size=tensordict_reset.batch_size)
@@ -318,6 +344,7 @@ class GuideActions(ActionTransform):
     def _write(
         self, tensordict: TensorDictBase, advice: Tensor, memory: TensorDictBase | None
     ) -> TensorDictBase:
+        """Write the advice and, if there is one, the memory of the guides."""
         if memory is not None:
             for name in self.guides.memories:
                 tensordict.set(("guide_state", name), memory[name])
@@ -325,9 +352,10 @@ class GuideActions(ActionTransform):
 
     @torch.no_grad()
     def _advice(self, tensordict: TensorDictBase, memory: TensorDictBase | None = None) -> Tensor:
+        """Return the advice within the bounds of the action; the memory is replaced by the next."""
         if not self._checked:
             self.guides.match_dtypes(tensordict)
-        return self.guides.advice(tensordict, self._converted, memory)
+        return self.guides.advice(tensordict, self._fitted, memory)
 
     def _advice_with_past(
         self,
@@ -336,14 +364,22 @@ class GuideActions(ActionTransform):
         rows: Tensor,
         action: Tensor | None = None,
     ) -> tuple[Tensor, TensorDictBase]:
-        """Return advice and memory; without a memory for the first step of episodes."""
+        """Return the advice of guides that depend on earlier steps, and their memory.
+
+        Args:
+            data: what the guides read of the env, [*batch].
+            memory: what they wrote in the step before; None for the first step of episodes.
+            rows: numbers of the rows, [*batch, 1].
+            action: the last action that the env was given, as vectors [*batch, *agents, A]; None
+                for the first step.
+        """
         batch = data.batch_size
         state = TensorDict({}, batch, device=data.device)
         for name, own in self.guides.memories.items():
-            state.set(
-                name,
-                own.start(batch, data.device) if memory is None else memory["guide_state", name],
-            )
+            if memory is None:
+                state.set(name, own.start(batch, data.device))
+            else:
+                state.set(name, memory["guide_state", name])
         if action is None:
             space = self.given_space
             action = rows.new_zeros((*batch, *space.agents, space.size), dtype=space.dtype)
@@ -354,7 +390,8 @@ class GuideActions(ActionTransform):
                 data.set(key, supplied[key])
         return self._advice(data, state), state
 
-    def _converted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
+    def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
+        """Return the action of a guide within the bounds; in the first step, check it."""
         try:
             if name not in self._checked:
                 self.action_space.check_advice(action, batch)
@@ -369,9 +406,8 @@ class GuideActions(ActionTransform):
         Two guides of one name with a memory, or one in an env that resets its agents one by one,
         are a `ValueError`.
         """
-        observation_spec[self.out_keys[0]] = self.action_space.advice_spec(
-            self.parent.batch_size, len(self.names)
-        )
+        advice = self.action_space.advice_spec(self.parent.batch_size, len(self.names))
+        observation_spec[self.out_keys[0]] = advice
         return self._add_memory(observation_spec)
 
     def transform_input_spec(self, input_spec: Composite) -> Composite:
@@ -384,6 +420,7 @@ class GuideActions(ActionTransform):
         return input_spec
 
     def _add_memory(self, spec: Composite) -> Composite:
+        """Add the memory of the guides to a spec."""
         for name, memory in self.guides.memories.items():
             if ("guide_state", name) in spec.keys(True):
                 raise ValueError(f"two guides {name!r} have a memory; give them different names")

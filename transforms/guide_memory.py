@@ -1,4 +1,8 @@
-"""Memory of guides by TorchRL's convention, carried from step to step by the env's data."""
+"""Memory of guides by TorchRL's convention, carried from step to step by the env's data.
+
+As the memory is in the data, a guide is a function without a state of its own: it works for any
+number of rows, and a restored env restores its guides.
+"""
 
 import torch
 from tensordict import TensorDict, TensorDictBase, unravel_key
@@ -11,42 +15,49 @@ SUPPLIED = ("is_init", "row", "last_action")  # what a guide may read besides th
 
 
 class GuideMemory:
-    """What a guide reads as `k` and writes as `("next", k)`, declared by its `make_tensordict_primer()`.
+    """What a guide reads as `k` and writes as `("next", k)`.
 
-    The `name` of the guide is for messages; a guide without a declaration has no memory. An entry
-    that is not declared, or one without a fixed value at the start of an episode, is a
-    `ValueError`.
+    The guide declares it by its `make_tensordict_primer()`; a guide without a declaration has no
+    memory.
+
+    Args:
+        name: of the guide, for messages.
+        guide: the guide.
+
+    Raises:
+        ValueError: for an entry that is not declared, or one without a fixed value at the start of
+            an episode.
     """
 
     def __init__(self, name: str, guide: TensorDictModuleBase) -> None:
         primers = get_primers_from_module(guide, warn=False)
-        parts = primers.transforms if isinstance(primers, Compose) else [primers] if primers else []
-        written = {
-            unravel_key(key[1:])
-            for key in guide.out_keys
-            if isinstance(key, tuple) and key[0] == "next"
-        }
+        if isinstance(primers, Compose):
+            parts = list(primers.transforms)
+        else:
+            parts = [primers] if primers else []
+        nested = [key for key in guide.out_keys if isinstance(key, tuple)]
+        written = {unravel_key(key[1:]) for key in nested if key[0] == "next"}
         self.specs, self.first = {}, {}
         for primer in parts:
             if primer.random or primer.single_default_value:
                 raise ValueError(
-                    f"the memory of guide {name!r} must begin with a number or function for each entry"
+                    f"the memory of guide {name!r} must begin with a number or function for each "
+                    "entry"
                 )
             row = (0,) * len(primer.primers.shape)
             for key, spec in primer.primers.items(True, True):
                 if key in written:
-                    self.specs[key], self.first[key] = (
-                        spec[row] if row else spec,
-                        primer.default_value[key],
-                    )
-        if undeclared := written - self.specs.keys():
-            problem = f"guide {name!r} writes {sorted(map(str, undeclared))} for its next step"
+                    self.specs[key] = spec[row] if row else spec
+                    self.first[key] = primer.default_value[key]
+        undeclared = written - self.specs.keys()
+        if undeclared:
             raise ValueError(
-                f"{problem}, but nothing says how they begin; give it make_tensordict_primer()"
+                f"guide {name!r} writes {sorted(map(str, undeclared))} for its next step, but "
+                "nothing says how they begin; give it make_tensordict_primer()"
             )
 
     def spec(self, batch: torch.Size, device: torch.device | None) -> Composite:
-        """Return the spec of the memory of all rows of an env, given their batch size and device."""
+        """Return the spec of the memory of all rows of an env, by their batch size and device."""
         rows = {key: row.to(device) if device else row for key, row in self.specs.items()}
         specs = {key: row.expand(*batch, *row.shape) for key, row in rows.items()}
         return Composite(specs, shape=batch, device=device)
@@ -56,10 +67,9 @@ class GuideMemory:
         memory = TensorDict({}, batch, device=device)
         for key, spec in self.specs.items():
             first = self.first[key]
-            value = (
-                first()
-                if callable(first)
-                else torch.full(spec.shape, first, dtype=spec.dtype, device=device)
-            )
+            if callable(first):
+                value = first()
+            else:
+                value = torch.full(spec.shape, first, dtype=spec.dtype, device=device)
             memory.set(key, value.expand(*batch, *spec.shape).clone())
         return memory

@@ -16,12 +16,16 @@ Schedule = Callable[[float], float]
 
 
 class GuideTransform(ActionTransform):
-    """Base class of transforms that use the advice observed by the agent; place them after `GuideActions`.
+    """Base class of transforms that use the advice observed by the agent.
 
-    Call `env.train()` or `env.eval()` before the first step, with any collector. In evaluation a
-    schedule returns its final value, and changes that serve learning only are off. In training,
-    `set_progress` moves the schedules. `guide` is the row of the advice, [*batch, n_guides, A]; the
-    keys are the entries of action and advice.
+    Place them after `GuideActions`. Call `env.train()` or `env.eval()` before the first step, with
+    any collector. In evaluation a schedule returns its final value, and changes that serve learning
+    only are off. In training, `set_progress` moves the schedules.
+
+    Args:
+        guide: row of the advice, the index of the guide; at least 0, else a `ValueError`.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
     """
 
     written: tuple[str, ...] = ()  # entries that the transform adds
@@ -39,9 +43,8 @@ class GuideTransform(ActionTransform):
             raise ValueError(f"guide={guide} must be at least 0: it is a row of the advice")
         super().__init__(in_keys=[], out_keys=list(self.written))
         self.guide = guide
-        self.progress: float | None = (
-            None  # completed fraction of the run, for schedules; see `set_progress`
-        )
+        # Completed fraction of the run, for schedules; see `set_progress`.
+        self.progress: float | None = None
         self._mode_is_set = False
         self.action_key, self.advice_key = nested_key(action_key), nested_key(advice_key)
 
@@ -51,31 +54,36 @@ class GuideTransform(ActionTransform):
         # TorchRL calls `eval` itself while it puts a transform into an env, and it is no part of
         # the env until then.
         whole = getattr(self.container, "transform", None)
-        self._mode_is_set = mode or (
-            whole is not None and any(self is part for part in whole.modules())
-        )
+        inside = whole is not None and any(self is part for part in whole.modules())
+        self._mode_is_set = mode or inside
         return self
 
     @property
     def learns(self) -> bool:
-        """Whether the env is used for training; RuntimeError before `env.train()` or `env.eval()`."""
+        """Whether the env is used for training; RuntimeError while the mode is not set."""
         if not self._mode_is_set:
-            remedy = "call env.train() or env.eval() first, on the env that has the transform"
-            inside = "for an env inside SerialEnv or ParallelEnv in the function that makes it"
-            raise RuntimeError(f"{type(self).__name__} acts in training only: {remedy}; {inside}")
+            raise RuntimeError(
+                f"{type(self).__name__} acts in training only: call env.train() or env.eval() "
+                "first, on the env that has the transform; for an env inside SerialEnv or "
+                "ParallelEnv in the function that makes it"
+            )
         return self.training
 
     def current(self, value: float | Schedule) -> float:
-        """Return the current value of a number or a schedule; RuntimeError in training before `set_progress`."""
+        """Return the current value of a number or a schedule.
+
+        A schedule in training before `set_progress` is a RuntimeError.
+        """
         if not callable(value):
             return value
         if not self.learns:
             return value(1.0)
         if self.progress is None:
-            problem = f"{type(self).__name__} has a schedule, but nothing tells it the progress of the run"
-            remedy = "call coil_rl.transforms.set_progress(env, FRACTION) before each batch"
-            around = "for SerialEnv or ParallelEnv put the transform around it, not inside"
-            raise RuntimeError(f"{problem}: {remedy}; {around}")
+            raise RuntimeError(
+                f"{type(self).__name__} has a schedule, but nothing tells it the progress of the "
+                "run: call coil_rl.transforms.set_progress(env, FRACTION) before each batch; for "
+                "SerialEnv or ParallelEnv put the transform around it, not inside"
+            )
         return value(self.progress)
 
     def advice(self, tensordict: TensorDictBase) -> Tensor:
@@ -87,8 +95,10 @@ class GuideTransform(ActionTransform):
         spec = observation_spec.get(self.advice_key, None)
         if spec is None or self.guide >= spec.shape[-2]:
             found = "no advice" if spec is None else f"advice of {spec.shape[-2]} guides"
-            problem = f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is {found}"
-            raise KeyError(f"{problem}; put GuideActions with enough guides before it")
+            raise KeyError(
+                f"{type(self).__name__} reads row {self.guide} of {self.advice_key}, but there is "
+                f"{found}; put GuideActions with enough guides before it"
+            )
         return observation_spec
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -100,14 +110,23 @@ class GuideTransform(ActionTransform):
 
 
 def set_progress(env: EnvBase, progress: float) -> None:
-    """Set the finished share of the run, in [0, 1], for the schedules of all transforms of an env in this process."""
+    """Set the finished share of the run, for the schedules of all transforms of an env.
+
+    Args:
+        env: the env, in this process.
+        progress: from 0 to 1.
+    """
     for module in env.modules():
         if isinstance(module, GuideTransform):
             module.progress = progress
 
 
 class SeededGenerator(nn.Module):
-    """Random generator on the CPU with its state in `state_dict()`."""
+    """Random generator on the CPU with its state in `state_dict()`.
+
+    Args:
+        seed: of the generator.
+    """
 
     def __init__(self, seed: int) -> None:
         super().__init__()

@@ -1,7 +1,11 @@
-"""Reward coupling (RFC): a penalty on the distance between the actions of agent and guide (paper equation 93)."""
+"""Reward coupling (RFC): a penalty on the distance between the actions of agent and guide.
+
+It is equation 93 of the paper. The agent is not told the advice; it finds out by the reward that it
+pays to act like the guide.
+"""
 
 from functools import cached_property
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -20,9 +24,11 @@ class RewardCoupling(GuideTransform):
 
     Args:
         beta: weight of the distance, a number or a schedule over the run.
-        norm: of the distance; another is a `ValueError`. Discrete actions are one-hot: l1 is 0 or
-            2, l2 is 0 or the root of 2.
-        options: `guide`, `action_key` and `advice_key`, as for `GuideTransform`.
+        norm: of the distance, "l1", "l2" or "linf"; another is a `ValueError`. Discrete actions are
+            one-hot: l1 is 0 or 2, l2 is 0 or the root of 2.
+        guide: row of the advice, the index of the guide.
+        action_key: entry of the env's action.
+        advice_key: entry of the advice, [*batch, n_guides, A].
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -39,11 +45,17 @@ class RewardCoupling(GuideTransform):
     written = ("task_reward", "guide_distance")
 
     def __init__(
-        self, beta: float | Schedule, norm: Literal["l1", "l2", "linf"] = "l2", **options: Any
+        self,
+        beta: float | Schedule,
+        norm: Literal["l1", "l2", "linf"] = "l2",
+        *,
+        guide: int = 0,
+        action_key: NestedKey = "action",
+        advice_key: NestedKey = "guide_action",
     ) -> None:
         if norm not in NORMS:
             raise ValueError(f"norm={norm!r} must be one of {', '.join(NORMS)}")
-        super().__init__(**options)
+        super().__init__(guide, action_key, advice_key)
         self.beta, self.order = beta, NORMS[norm]
 
     @cached_property
@@ -53,12 +65,10 @@ class RewardCoupling(GuideTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict[self.reward_key]
-        difference = self.action_space.vectors(tensordict[self.action_key]) - self.advice(
-            tensordict
-        )
-        distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True).to(
-            reward.dtype
-        )
+        action = self.action_space.vectors(tensordict[self.action_key])
+        difference = action - self.advice(tensordict)
+        distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True)
+        distance = distance.to(reward.dtype)
         next_tensordict.set("task_reward", reward).set("guide_distance", distance)
         if self.learns:
             next_tensordict.set(self.reward_key, reward - self.current(self.beta) * distance)

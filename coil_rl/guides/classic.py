@@ -1,4 +1,9 @@
-"""Public controllers of well-known envs of Gymnasium, to compare with."""
+"""Public controllers of well-known envs of Gymnasium, to compare with.
+
+They are what a user of such an env would find first: heuristics that Gymnasium ships, textbook
+feedback, a planner. Those that are functions work on a whole batch and are chosen by the name of
+`ClassicGuide`. The others are objects with a state, one for each row of the env.
+"""
 
 import importlib
 from collections.abc import Mapping, Sequence
@@ -18,9 +23,15 @@ from coil_rl.envs.limits import check_choice
 
 
 def lander(observation: Tensor, continuous: bool = False) -> Tensor:
-    """Return the action of Gymnasium's `lunar_lander.heuristic` for observations of LunarLander-v3, [*batch, 8].
+    """Land in LunarLander-v3, as Gymnasium's `lunar_lander.heuristic` does.
 
-    It is an index, [*batch], and with `continuous` the power of both engines, [*batch, 2].
+    Args:
+        observation: [*batch, 8].
+        continuous: whether the env has continuous actions.
+
+    Returns:
+        The index of an engine, [*batch], and with `continuous` the power of both engines,
+        [*batch, 2].
     """
     x, y, speed, climb_rate, angle, spin, left_leg, right_leg = observation.unbind(-1)
     touches = (left_leg != 0) | (right_leg != 0)
@@ -34,34 +45,57 @@ def lander(observation: Tensor, continuous: bool = False) -> Tensor:
 
 
 def energy_pump(observation: Tensor, power: float = 1.0) -> Tensor:
-    """Push with all power in the direction of motion: [*batch, 2] of MountainCarContinuous-v0 to [*batch, 1].
+    """Push the car of MountainCarContinuous-v0 in the direction of its motion.
 
-    A negative power brakes, so that the car never leaves the valley.
+    Args:
+        observation: [*batch, 2].
+        power: of the push, from -1 to 1. A negative power brakes, so that the car never leaves the
+            valley.
+
+    Returns:
+        The power with its sign, [*batch, 1].
     """
     speed = observation[..., 1:]
     return torch.where(speed < 0, -power, power).to(observation)
 
 
 def swing_up(observation: Tensor, gain: float = 5.0) -> Tensor:
-    """Swing Pendulum-v1 up by its energy, and hold it there by linear feedback: [*batch, 3] to [*batch, 1]."""
+    """Swing Pendulum-v1 up by its energy, and hold it there by linear feedback.
+
+    Args:
+        observation: [*batch, 3].
+        gain: torque per joule of missing energy.
+
+    Returns:
+        The torque, [*batch, 1].
+    """
     cos, sin, speed = observation.unbind(-1)
-    missing = (
-        5 * (1 - cos) - speed.square() / 6
-    )  # J, to the energy at rest at the top: m g l / 2 = 5, inertia 1 / 3
+    # J, to the energy at rest at the top: m g l / 2 = 5, inertia 1 / 3.
+    missing = 5 * (1 - cos) - speed.square() / 6
     pump = gain * missing * torch.where(speed < 0, -1.0, 1.0)
     hold = -(10 * torch.atan2(sin, cos) + 2 * speed)
     return torch.where(cos > 0.9, hold, pump).clamp(-2, 2).unsqueeze(-1)
 
 
 def linear_feedback(observation: Tensor, weights: Sequence[float] = (0.1, 0.3, 1.0, 0.5)) -> Tensor:
-    """Balance CartPole-v1 by the sign of a weighted sum of position, speed, angle, spin: [*batch, 4] to [*batch]."""
+    """Balance CartPole-v1 by the sign of a weighted sum.
+
+    Args:
+        observation: [*batch, 4], position, speed, angle and spin.
+        weights: of these four numbers.
+
+    Returns:
+        The index of a direction, [*batch].
+    """
     return ((observation * observation.new_tensor(weights)).sum(-1) > 0).long()
 
 
 class ClassicGuide(TensorDictModule):
-    """Guide that acts by one of the functions above: lander, energy_pump, swing_up or linear_feedback.
+    """Guide that acts by one of the functions above.
 
-    The `options` are arguments of the function after the observation.
+    Args:
+        controller: "lander", "energy_pump", "swing_up" or "linear_feedback"; else a `ValueError`.
+        options: arguments of the function after the observation, by name.
     """
 
     pure = True
@@ -77,16 +111,17 @@ class ClassicGuide(TensorDictModule):
 
 
 class Oscillator(TensorDictModuleBase):
-    """Sines that the two joints of Swimmer-v5 follow; the number of the step is its memory.
+    """Guide of Swimmer-v5: sines that its two joints follow.
 
-    Raffin et al. (2024), An open-loop baseline for reinforcement learning locomotion tasks.
+    The number of the step is its memory. It is due to Raffin et al. (2024), An open-loop baseline
+    for reinforcement learning locomotion tasks.
 
     Args:
         frequency: Hz; 0.3 is detuned, and slow.
         phases: of both joints, as a fraction of a turn.
-        amplitude: rad.
-        kp: torque per rad.
-        kd: torque per rad/s.
+        amplitude: radians.
+        kp: torque per radian of missing angle.
+        kd: torque per radian/s.
     """
 
     in_keys, out_keys = ["observation", "swum_steps"], ["action", ("next", "swum_steps")]
@@ -101,13 +136,8 @@ class Oscillator(TensorDictModuleBase):
         kd: float = 0.5,
     ) -> None:
         super().__init__()
-        self.frequency, self.phases, self.amplitude, self.kp, self.kd = (
-            frequency,
-            list(phases),
-            amplitude,
-            kp,
-            kd,
-        )
+        self.frequency, self.phases, self.amplitude = frequency, list(phases), amplitude
+        self.kp, self.kd = kp, kd
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write both torques, and the number of the next step."""
@@ -125,7 +155,10 @@ class Oscillator(TensorDictModuleBase):
 
 
 class Walker:
-    """`BipedalWalkerHeuristics` of Gymnasium for BipedalWalker-v3, a state machine; `PerRow` makes it a guide."""
+    """Controller of BipedalWalker-v3: the state machine `BipedalWalkerHeuristics` of Gymnasium.
+
+    `PerRow` makes it a guide.
+    """
 
     memory = ("state", "moving_leg", "supporting_leg", "supporting_knee_angle")
 
@@ -140,9 +173,8 @@ class Walker:
 
     def act(self, observation: Any) -> Any:
         """Return the torques, [4], for an observation [24]."""
-        return self.machine.step_heuristic(
-            observation.astype(float)
-        )  # in float64 the state is plain numbers
+        # In float64 the state consists of plain numbers.
+        return self.machine.step_heuristic(observation.astype(float))
 
     def state_dict(self) -> dict[str, float]:
         """Return the state of the machine."""
@@ -155,7 +187,17 @@ class Walker:
 
 
 class LastAction(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Wrapper of a BabyAI env that remembers its `last_action` for `Bot`, and makes levels without printing."""
+    """Wrapper of a BabyAI env that remembers its `last_action` for `Bot`.
+
+    It also makes levels without printing.
+
+    Args:
+        env: the env.
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.last_action: Any = None
 
     def reset(self, **options: Any) -> Any:
         """Begin an episode."""
@@ -170,11 +212,14 @@ class LastAction(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 class Bot:
-    """Controller that solves BabyAI levels by the planner of MiniGrid, `BabyAIBot`; it knows the whole level.
+    """Controller that solves BabyAI levels by the planner of MiniGrid, `BabyAIBot`.
 
-    Its env needs the wrapper `LastAction`. It plans again after actions of others. When one opens a
-    box it can no longer help, and in a few levels of Unlock it plans without end: from then on it
-    advises `done`.
+    It knows the whole level, and plans again after actions of others. When one opens a box it can
+    no longer help, and in a few levels of Unlock it plans without end: from then on it advises
+    `done`.
+
+    Args:
+        env: a BabyAI env with the wrapper `LastAction`.
     """
 
     searches = 100  # in one step; usually there are at most 5

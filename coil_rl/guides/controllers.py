@@ -1,4 +1,9 @@
-"""Controllers of other people as guides: Python objects, functions, networks, entries of the env, recordings."""
+"""Controllers of other people as guides.
+
+They may be Python objects with a state, functions, networks, entries of the env that a controller
+inside writes, or actions from a file. A configuration names them, so everything that does not fit
+is refused at construction, in one sentence.
+"""
 
 import importlib
 import inspect
@@ -23,13 +28,14 @@ from coil_rl.transforms.action_space import nested_key
 
 
 class PerRow(TensorDictModuleBase):
-    """Python controllers as a guide, one object for each row of the env, made when its row first acts.
+    """Python controllers as a guide, one object for each row of the env.
 
-    `act(observation)` gets one NumPy array for each of `in_keys` and returns an action: numbers, an
-    index or a one-hot vector. `reset()`, if there is one, is called at the start of each episode;
-    without it each episode gets a new object. Objects with `state_dict()` and
-    `load_state_dict(state)` are part of a checkpoint; without these, new episodes begin when a run
-    is resumed. They are called one after the other: a batched guide is many times faster.
+    An object is made when its row first acts. `act(observation)` gets one NumPy array for each of
+    `in_keys` and returns an action: numbers, an index or a one-hot vector. `reset()`, if there is
+    one, is called at the start of each episode; without it each episode gets a new object. Objects
+    with `state_dict()` and `load_state_dict(state)` are part of a checkpoint; without these, new
+    episodes begin when a run is resumed. They are called one after the other: a batched guide is
+    many times faster.
 
     Args:
         make: makes an object; called without arguments.
@@ -65,16 +71,15 @@ class PerRow(TensorDictModuleBase):
         flat = tensordict.reshape(-1)
         rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
         observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
-        actions = [
-            np.atleast_1d(self._object(row, start).act(*observed))
-            for row, start, observed in zip(rows, starts, observations, strict=True)
-        ]
+        actions = []
+        for row, start, observed in zip(rows, starts, observations, strict=True):
+            actions.append(np.atleast_1d(self._object(row, start).act(*observed)))
         action = torch.as_tensor(np.stack(actions), device=tensordict.device)
-        return tensordict.set(
-            self.out_keys[0], action.reshape(*tensordict.batch_size, *action.shape[1:])
-        )
+        shape = (*tensordict.batch_size, *action.shape[1:])
+        return tensordict.set(self.out_keys[0], action.reshape(shape))
 
     def _object(self, row: int, start: bool) -> Any:
+        """Return the object of a row, made anew or reset if this is the `start` of an episode."""
         if row not in self.objects or (start and not hasattr(self.objects[row], "reset")):
             self.objects[row] = self.make()
         if start and hasattr(self.objects[row], "reset"):
@@ -82,7 +87,10 @@ class PerRow(TensorDictModuleBase):
         return self.objects[row]
 
     def get_extra_state(self) -> dict[int, Any] | None:
-        """Return the states by row, None if an object has none; raises a `ValueError` for one that cannot be saved."""
+        """Return the states by row; None if an object has none.
+
+        A state that cannot be saved is a `ValueError`.
+        """
         names = ("state_dict", "load_state_dict")
         if not all(hasattr(thing, name) for thing in self.objects.values() for name in names):
             return None
@@ -94,8 +102,8 @@ class PerRow(TensorDictModuleBase):
         except pickle.UnpicklingError as error:
             name = type(next(iter(self.objects.values()))).__name__
             raise ValueError(
-                f"state_dict() of the controller {name} may hold numbers, texts, lists, dictionaries and tensors only; "
-                "convert NumPy arrays by tolist()"
+                f"state_dict() of the controller {name} may hold numbers, texts, lists, "
+                "dictionaries and tensors only; convert NumPy arrays by tolist()"
             ) from error
 
     def set_extra_state(self, state: Mapping[int, Any] | None) -> None:
@@ -103,8 +111,11 @@ class PerRow(TensorDictModuleBase):
         self.continues = state is not None
         if state is None:
             name = getattr(self.make, "func", self.make).__name__
-            problem = f"the controller {name} has no state_dict() and load_state_dict(state), so new episodes begin"
-            warnings.warn(problem, stacklevel=2)
+            warnings.warn(
+                f"the controller {name} has no state_dict() and load_state_dict(state), so new "
+                "episodes begin",
+                stacklevel=2,
+            )
             state = {}
         self.objects = {row: self.make() for row in state}
         for row, thing in self.objects.items():
@@ -113,9 +124,6 @@ class PerRow(TensorDictModuleBase):
 
 class ControllerGuide(TensorDictModuleBase):
     """A controller that is named by `MODULE:NAME`. What is found there decides how it is used.
-
-    What cannot be imported, is nothing of the following, or takes other arguments, is a
-    `ValueError`.
 
     | it is | it becomes |
     | --- | --- |
@@ -128,6 +136,9 @@ class ControllerGuide(TensorDictModuleBase):
         of: such as `my_package.control:MyPID`.
         in_keys: entries to read; None for `observation`, or for those of a TensorDictModule.
         options: arguments of the class, or further ones of the function, by name.
+
+    Raises:
+        ValueError: for what cannot be imported, is nothing of the above, or takes other arguments.
     """
 
     def __init__(
@@ -138,6 +149,7 @@ class ControllerGuide(TensorDictModuleBase):
     ) -> None:
         thing, options = load(of), dict(options or {})
         keys = [nested_key(key) for key in in_keys or ["observation"]]
+        act = getattr(thing, "act", None)
         guide: TensorDictModuleBase
         if not inspect.isclass(thing):
             if not callable(thing) or isinstance(thing, nn.Module):
@@ -151,13 +163,14 @@ class ControllerGuide(TensorDictModuleBase):
                 guide = TensorDictModule(module, in_keys=keys, out_keys=["action"])
             elif in_keys is not None:
                 raise ValueError(f"of={of} has its own in_keys={module.in_keys}; leave in_keys out")
-        elif callable(act := getattr(thing, "act", None)):
+        elif callable(act):
             _check_call(thing, of, [], options)
             _check_call(act, f"{of}.act", ["self", *keys], {})
             guide = PerRow(partial(thing, **options), keys)
         else:
             raise ValueError(
-                f"of={of} is a class without act(observation); give it this method, or name a function"
+                f"of={of} is a class without act(observation); give it this method, or name a "
+                "function"
             )
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
@@ -169,7 +182,13 @@ class ControllerGuide(TensorDictModuleBase):
 
 
 class EntryGuide(TensorDictModule):
-    """The action in entry `key` [*batch, A] of the env, as of a controller inside, which may know more than agents."""
+    """The action in an entry of the env, as of a controller inside of it.
+
+    Such a controller may know more than agents observe.
+
+    Args:
+        key: the entry, [*batch, A].
+    """
 
     sees = "env"
 
@@ -178,10 +197,14 @@ class EntryGuide(TensorDictModule):
 
 
 class RecordedGuide(TensorDictModuleBase):
-    """Actions of a recording, from the first step of every episode; the last one is held after the end.
+    """Actions from a CSV file, from the first step of every episode on.
 
-    The `file` is a CSV of numbers, [T, A] action units, one line for each step; a first line with
-    names is left out. A file that cannot be read, or without finite numbers, is a `ValueError`.
+    The last one is held after the end of the file.
+
+    Args:
+        file: a CSV of numbers, [T, A] in action units, one line for each step; a first line with
+            names is left out. A file that cannot be read, or without finite numbers, is a
+            `ValueError`.
     """
 
     in_keys, out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
@@ -204,27 +227,34 @@ class RecordedGuide(TensorDictModuleBase):
 
 
 def load(of: str) -> Any:
-    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported."""
+    """Return what is named by `MODULE:NAME`; raises a `ValueError` if it cannot be imported.
+
+    Args:
+        of: the name.
+    """
     module, _, names = of.partition(":")
     if not module or not names:
         raise ValueError(f"of={of} must be MODULE:NAME, such as my_package.control:MyPID")
     try:
         thing: Any = importlib.import_module(module)
     except ModuleNotFoundError as error:
+        # The missing module is the one that was named, or a package around it.
         if f"{module}.".startswith(f"{error.name}."):
-            problem = f"of={of}: there is no module {error.name}; install its package, or add its folder to PYTHONPATH"
-        else:
-            problem = f"of={of}: {module} needs {error.name}, which is missing; install it"
-        raise ValueError(problem) from error
+            raise ValueError(
+                f"of={of}: there is no module {error.name}; install its package, or add its folder "
+                "to PYTHONPATH"
+            ) from error
+        raise ValueError(
+            f"of={of}: {module} needs {error.name}, which is missing; install it"
+        ) from error
     except Exception as error:
         raise ValueError(
             f"of={of}: {module} cannot be imported ({type(error).__name__}: {error})"
         ) from error
     for name in names.split("."):
         if not hasattr(thing, name):
-            raise ValueError(
-                f"of={of}: {module} has no {names}{did_you_mean(name, vars(thing)) or '; name another'}"
-            )
+            hint = did_you_mean(name, vars(thing)) or "; name another"
+            raise ValueError(f"of={of}: {module} has no {names}{hint}")
         thing = getattr(thing, name)
     return thing
 
@@ -232,6 +262,14 @@ def load(of: str) -> Any:
 def _check_call(
     function: Callable[..., Any], title: str, entries: Sequence[Any], options: Mapping[str, Any]
 ) -> None:
+    """Raise a `ValueError` if a function cannot be called like this.
+
+    Args:
+        function: the function or class.
+        title: its name, for the message.
+        entries: positional arguments, by the name of what they hold.
+        options: arguments by name.
+    """
     try:
         signature = inspect.signature(function)
     except ValueError:  # some functions written in C have none
@@ -239,20 +277,17 @@ def _check_call(
     try:
         signature.bind(*entries, **options)
     except TypeError as error:
-        given = ", ".join(
-            [*(str(entry) for entry in entries if entry != "self"), *(f"{key}=" for key in options)]
-        )
-        close = [
-            did_you_mean(key, signature.parameters)
-            for key in options
-            if key not in signature.parameters
-        ]
+        positional = [str(entry) for entry in entries if entry != "self"]
+        given = ", ".join([*positional, *(f"{key}=" for key in options)])
+        unknown = [key for key in options if key not in signature.parameters]
+        hints = "".join(did_you_mean(key, signature.parameters) for key in unknown)
         raise ValueError(
-            f"{title} takes {signature}, but is called with ({given}): {error}{''.join(close)}"
+            f"{title} takes {signature}, but is called with ({given}): {error}{hints}"
         ) from error
 
 
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
+    """Return the actions of a CSV file, [T, A]."""
     try:
         with open(file, encoding="utf-8") as text:
             rows = [line.strip().split(",") for line in text if line.strip()]

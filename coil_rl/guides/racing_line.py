@@ -1,9 +1,11 @@
 """Racing line: pursuit of the farthest target with a clear path to it, which cuts corners."""
 
 import math
-from typing import Any
+from collections.abc import Sequence
+from typing import Literal
 
 import torch
+from tensordict import NestedKey
 from torch import Tensor
 
 from coil_rl.envs.limits import check_range
@@ -25,8 +27,14 @@ class RacingLineGuide(SplineGuide):
         lookahead: maximum distance of the target, m.
         spacing: distance between targets along the path, m.
         max_steering: steering angle of action 1, degrees, at most 90.
-        car_length: m.
-        options: as for `SplineGuide`, but `gain` and `sharpness`.
+        car_length: distance between the axles, m.
+        spline: of the path, "cubic" (smoothing spline) or "quadratic" (least-squares parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        in_keys: entries of cones, cone count and steering.
+        out_key: entry for the advice.
+
+    Raises:
+        ValueError: for a value out of range.
     """
 
     targets = 20
@@ -39,10 +47,16 @@ class RacingLineGuide(SplineGuide):
         spacing: float = 0.5,
         max_steering: float = 80.0,
         car_length: float = 2.0,
-        **options: Any,
+        *,
+        spline: Literal["cubic", "quadratic"] = "cubic",
+        smoothing: float = 1.0,
+        in_keys: Sequence[NestedKey] = ("cones", "cone_count", "steering"),
+        out_key: NestedKey = "action",
     ) -> None:
-        # Equation 103 is replaced: naming its options here rejects them in `options`.
-        super().__init__(gain=1.0, sharpness=1.8, max_steering=max_steering, **options)
+        # `gain` and `sharpness` are of equation 103, which the arc replaces.
+        super().__init__(
+            spline, smoothing, max_steering=max_steering, in_keys=in_keys, out_key=out_key
+        )
         check_range(
             0, above=True, turn=turn, lookahead=lookahead, spacing=spacing, car_length=car_length
         )
@@ -55,30 +69,36 @@ class RacingLineGuide(SplineGuide):
         self.spacing, self.car_length = spacing, car_length
 
     def steer(self, cones: Tensor, cone_count: Tensor, steering: Tensor) -> Tensor:
-        """Return the advice; arguments and result as for `SplineGuide.steer`."""
+        """Return the advice, [B, 1], as a fraction of `max_steering`.
+
+        Args:
+            cones: [B, 2, K, 2] m in the frame of the car, nearest first, left side first.
+            cone_count: [B, 2].
+            steering: [B, 1], current steering, returned if there is no target.
+        """
         plan = self.plan(cones, cone_count)
         excluded, square = plan.excluded, plan.squared_distance.clamp(min=TARGET_REACHED**2)
         full = math.radians(self.max_steering)
-        sine = (plan.targets[1] / square * (2 * self.turn * self.car_length)).clamp(
-            -math.sin(full), math.sin(full)
-        )
-        unclear = torch.maximum(
-            excluded, self._blocked(sine / self.car_length, square.sqrt(), cones, cone_count)
-        )
+        sine = plan.targets[1] / square * (2 * self.turn * self.car_length)
+        sine = sine.clamp(-math.sin(full), math.sin(full))
+        blocked = self._blocked(sine / self.car_length, square.sqrt(), cones, cone_count)
+        unclear = torch.maximum(excluded, blocked)
         none_clear = unclear.amin(0)
         # The farthest of the clear targets, else the nearest target.
         order = torch.lerp(square.reciprocal(), square, none_clear)
-        best = first_point(
-            sine.unsqueeze(0), order, torch.lerp(unclear, excluded, none_clear)
-        ).squeeze(0)
+        skipped = torch.lerp(unclear, excluded, none_clear)
+        best = first_point(sine.unsqueeze(0), order, skipped).squeeze(0)
         advice = best.asin() / full
         return torch.where(excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def _blocked(self, curvature: Tensor, distance: Tensor, cones: Tensor, count: Tensor) -> Tensor:
-        """Return 1 for arcs too close to a cone or with a target beyond the lookahead, else 0: [T, B].
+        """Return 1 for arcs too close to a cone or with a target too far away, else 0: [T, B].
 
-        Curvatures [T, B] are in 1/m, positive to the left; distances [T, B] m are those of the
-        targets.
+        Args:
+            curvature: of the arcs, [T, B] in 1/m, positive to the left.
+            distance: of the targets, [T, B] m.
+            cones: [B, 2, K, 2] m in the frame of the car.
+            count: [B, 2], number of cones.
         """
         x, y = cones[:, :, : slots_in_use(count, cones.shape[2])].permute(3, 2, 1, 0)
         slot = torch.arange(len(x), dtype=x.dtype, device=x.device).view(-1, 1, 1)
@@ -89,9 +109,6 @@ class RacingLineGuide(SplineGuide):
         limit = torch.where(count.t() > slot, (y * side - self.margin) * 2, math.inf)
         slope = (square - self.margin**2) * side
         curvature, reach = curvature.unsqueeze(1).unsqueeze(1), (distance + self.margin).square()
-        blocked = torch.gt(curvature * slope, limit).logical_and_(
-            square <= reach.unsqueeze(1).unsqueeze(1)
-        )
-        return (
-            blocked.flatten(1, 2).any(1).logical_or_(distance > self.lookahead).to(distance.dtype)
-        )
+        near = square <= reach.unsqueeze(1).unsqueeze(1)
+        too_close = torch.gt(curvature * slope, limit).logical_and_(near).flatten(1, 2).any(1)
+        return too_close.logical_or_(distance > self.lookahead).to(distance.dtype)

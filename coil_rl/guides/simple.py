@@ -1,4 +1,8 @@
-"""Constant and random guides as baselines, and a policy that follows the advice."""
+"""Constant and random guides as baselines, and a policy that follows the advice.
+
+A guide without information shows what an agent gains by the mere presence of another entry. The
+policy shows what a guide reaches alone, behind all transforms that change its advice.
+"""
 
 from collections.abc import Sequence
 
@@ -14,6 +18,8 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class _Uniform(SeededGenerator):
+    """Uniform random numbers [*batch, size] from `low` to `high`, whatever is observed."""
+
     def __init__(self, low: float, high: float, size: int, seed: int) -> None:
         super().__init__(seed)
         self.low, self.high, self.size = low, high, size
@@ -27,7 +33,7 @@ class ConstantGuide(TensorDictModuleBase):
     """Guide with a constant action.
 
     Args:
-        value: the action, one number or one per dimension.
+        value: the action in action units, one number or one per dimension.
         in_key: any entry [*batch, N], for the batch shape.
         out_key: entry for the action, [*batch, A].
     """
@@ -51,7 +57,13 @@ class ConstantGuide(TensorDictModuleBase):
 
 
 class ZeroGuide(ConstantGuide):
-    """Guide with the action 0, [*batch, size]; keys as for `ConstantGuide`."""
+    """Guide with the action 0.
+
+    Args:
+        size: A, number of dimensions of the action, at least 1.
+        in_key: any entry [*batch, N], for the batch shape.
+        out_key: entry for the action, [*batch, A].
+    """
 
     def __init__(
         self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
@@ -61,9 +73,17 @@ class ZeroGuide(ConstantGuide):
 
 
 class RandomGuide(TensorDictModule):
-    """Guide with uniform random actions [*batch, size] from `low` to `high`; keys as for `ConstantGuide`.
+    """Guide with uniform random actions.
 
     The state of its generator is in `state_dict()`.
+
+    Args:
+        low: smallest number, in action units.
+        high: largest number, in action units.
+        size: A, number of dimensions of the action, at least 1.
+        seed: of the generator.
+        in_key: any entry [*batch, N], for the batch shape.
+        out_key: entry for the action, [*batch, A].
     """
 
     def __init__(
@@ -105,6 +125,5 @@ class FollowAdvice(TensorDictModuleBase):
         """Write the action."""
         advice = tensordict[self.in_keys[0]]
         guide = self.guide.expand(advice.shape[:-2])[..., None, None].expand_as(advice[..., :1, :])
-        return tensordict.set(
-            self.out_keys[0], self.action_space.actions(advice.gather(-2, guide).squeeze(-2))
-        )
+        chosen = advice.gather(-2, guide).squeeze(-2)
+        return tensordict.set(self.out_keys[0], self.action_space.actions(chosen))

@@ -1,4 +1,8 @@
-"""Safety policy of the paper (appendix A.1): pursuit of a spline through the middle of the visible cones."""
+"""Safety policy of the paper (appendix A.1): pursuit of a spline between the visible cones.
+
+The guide pairs left with right cones, fits a path through the midpoints, and steers for a point on
+it by equation 103. All rows of a batch go through the same tensor operations.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -21,14 +25,23 @@ FAR = 1e3  # m
 
 
 class PathPlan(NamedTuple):
-    """Path through the visible cones, positions in m in the frame of the car."""
+    """Path through the visible cones, positions in m in the frame of the car.
 
-    midpoints: Tensor  # midpoints of left-right pairs, nearest first, [2, M, B]
-    midpoint_count: Tensor  # number of valid midpoints, [B]
-    path: Spline  # through the midpoints
-    targets: Tensor  # points along the path, [2, T, B]; a shorter path repeats its last point
-    squared_distance: Tensor  # of the targets, [T, B] m^2
-    excluded: Tensor  # 1 for targets that are reached or outside the field of view, else 0, [T, B]
+    Attributes:
+        midpoints: [2, M, B], of left-right pairs, nearest first.
+        midpoint_count: [B], number of valid midpoints.
+        path: through the midpoints.
+        targets: [2, T, B], points along the path; a shorter path repeats its last point.
+        squared_distance: [T, B] m^2, of the targets.
+        excluded: [T, B], 1 for targets that are reached or outside the field of view, else 0.
+    """
+
+    midpoints: Tensor
+    midpoint_count: Tensor
+    path: Spline
+    targets: Tensor
+    squared_distance: Tensor
+    excluded: Tensor
 
     def nearest_target(self) -> Tensor:
         """Return the nearest target that is not excluded, [2, B]; any target if all are."""
@@ -36,15 +49,16 @@ class PathPlan(NamedTuple):
 
 
 class SplineGuide(TensorDictModuleBase):
-    """Smooth path through the midpoints of left-right pairs of cones, and pursuit of its nearest target.
+    """Pursuit of a smooth path through the midpoints of left-right pairs of cones.
 
-    Reads `cones`, `cone_count` and `steering` of the current step, writes `action`.
+    The target is the nearest point of the path that is ahead and not reached yet. The guide reads
+    `cones`, `cone_count` and `steering` of the current step, and writes `action`.
 
     Args:
         spline: "cubic" (smoothing spline) or "quadratic" (least-squares parabola).
         smoothing: lambda of the cubic smoothing spline, m^3.
-        gain: factor of the advice of equation 103.
-        sharpness: power of the distance in equation 103.
+        gain: factor of the advice of equation 103; less than 1 is an undertuned guide.
+        sharpness: power of the distance in equation 103, at least 0.
         max_steering: steering angle of action 1, degrees.
         in_keys: entries of cones, cone count and steering.
         out_key: entry for the advice.
@@ -81,7 +95,11 @@ class SplineGuide(TensorDictModuleBase):
         self.compiled: Callable[..., Sequence[Tensor]] | None = None
 
     def compile_steps(self, compiled: Callable[..., Callable[..., Sequence[Tensor]]]) -> None:
-        """Compile the advice for batches of the size of the first one, see `Compiled`."""
+        """Compile the advice for batches of the size of the first one.
+
+        Args:
+            compiled: compiles a function from tensors to tensors, see `Compiled`.
+        """
         self.compiled = compiled(lambda *entries: [self.steer(*entries)], once=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -103,14 +121,16 @@ class SplineGuide(TensorDictModuleBase):
         return torch.where(plan.excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def plan(self, cones: Tensor, cone_count: Tensor) -> PathPlan:
-        """Return the path and its targets; arguments as for `steer`."""
+        """Return the path and its targets.
+
+        Args:
+            cones: [B, 2, K, 2] m in the frame of the car, nearest first, left side first.
+            cone_count: [B, 2].
+        """
         points, count = self._midpoints(cones, cone_count)
         path = self.fit(points, count)
-        steps = (
-            (path.polyline_length / constant(self.spacing, points))
-            .round_()
-            .clamp_(1, self.targets - 1)
-        )
+        steps = (path.polyline_length / constant(self.spacing, points)).round_()
+        steps = steps.clamp_(1, self.targets - 1)
         slots = slots_in_use(steps, self.targets - 1) + 1
         x, y = targets = path.along((constant(range(slots), points[0]) / steps).clamp_(max=1))
         square = torch.addcmul(x * x, y, y)
@@ -132,7 +152,15 @@ class SplineGuide(TensorDictModuleBase):
         return beta.clamp_(-abs(self.gain), abs(self.gain))
 
     def _midpoints(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the midpoints of close left-right pairs, nearest first, [2, M, B] m, and their number [B]."""
+        """Return the midpoints of close left-right pairs, nearest first.
+
+        Args:
+            cones: [B, 2, K, 2] m in the frame of the car, nearest first, left side first.
+            count: [B, 2], number of cones.
+
+        Returns:
+            The midpoints [2, M, B] m and their number [B].
+        """
         near = cones[:, :, : slots_in_use(count, self.cones)].permute(3, 2, 1, 0)
         real = (count.t() - constant(range(near.shape[1]), near[0])).clamp_(0, 1)
         # Padding is moved far away, so that it makes no pairs.
@@ -148,5 +176,11 @@ class SplineGuide(TensorDictModuleBase):
 
 
 def first_point(points: Tensor, order: Tensor, excluded: Tensor) -> Tensor:
-    """Return the point [2, B] with the smallest `order` [T, B] of the points [2, T, B] that are not excluded."""
+    """Return the first point in an order that is not excluded, [2, B].
+
+    Args:
+        points: to choose from, [2, T, B].
+        order: [T, B]; the smallest comes first.
+        excluded: [T, B], 1 for points to skip, else 0.
+    """
     return points.flatten(1).index_select(1, flat_index(smallest(order, excluded, 1)))

@@ -1,4 +1,9 @@
-"""Spline guide with a memory: pursuit of targets that it has placed on the way, as in the authors' program."""
+"""Spline guide with a memory: pursuit of targets that it has placed on the way.
+
+This is how the authors' program does it. `SplineGuide` plans anew in every step; here a path is
+planned only when a new cone comes into view, and its targets stay where they are. The memory is
+entries of the data (see `GuideMemory`), so the guide works for any batch.
+"""
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -21,26 +26,31 @@ NOWHERE = 1e4  # m, coordinates of empty slots
 
 
 class SplineMemoryGuide(SplineGuide):
-    """Pursuit of remembered targets: the safety policy of the paper as in the authors' program (appendix A.1).
+    """Pursuit of remembered targets: the paper's safety policy as in the authors' program.
 
-    When a cone that was never seen comes into view, and two of each side are in view, the guide
-    places targets on the least-squares parabola through the midpoints of left-right pairs, at least
-    1 m from each other. It steers for the nearest visible target that has not been passed. All
-    positions are in the frame of the car at the start of the episode, and the car's own follows
-    from `motion`. There is room for 192 targets and 128 cones a side; further ones are not
+    See appendix A.1. When a cone that was never seen comes into view, and two of each side are in
+    view, the guide places targets on the least-squares parabola through the midpoints of left-right
+    pairs, at least 1 m from each other. It steers for the nearest visible target that has not been
+    passed. All positions are in the frame of the car at the start of the episode, and the car's own
+    follows from `motion`. There is room for 192 targets and 128 cones a side; further ones are not
     remembered.
 
     Reads `cones`, `cone_count`, `steering`, `motion` and `is_init`, writes `action`. Its memory is
     entries named `path_...`.
 
     Args:
-        oddities: whether to act as the authors' program: the target is the one chosen in the step
+        oddities: whether to act exactly as the authors' program: the target is that of the step
             before, and without one the steering is 0; passed targets count again only in a circle
             around the first midpoint; midpoints that share a coordinate with a nearer one are
             dropped; the first observation is ignored. By default the target is chosen now, the
             steering is kept without one, and passed targets count again out of sight.
         sight: m, range in which a target is visible.
-        gain, sharpness, max_steering: as for `SplineGuide`.
+        gain: factor of the advice of equation 103.
+        sharpness: power of the distance in equation 103, at least 0.
+        max_steering: steering angle of action 1, degrees.
+
+    Raises:
+        ValueError: for a value out of range.
 
     Example:
         >>> from torchrl.envs import TransformedEnv
@@ -72,11 +82,8 @@ class SplineMemoryGuide(SplineGuide):
             # cost less.
             "path_cones": ((2, 2, CONES), NOWHERE, torch.float16),
             "path_cone_count": ((2,), 0, torch.int64),
-            "path_in_view": (
-                (2, self.cones, 2),
-                NOWHERE,
-                torch.float32,
-            ),  # at the last step: coordinate, cone, side
+            # At the last step: coordinate, cone, side.
+            "path_in_view": ((2, self.cones, 2), NOWHERE, torch.float32),
         }
         if oddities:
             self.memory["path_chosen"] = ((2,), NOWHERE, torch.float32)
@@ -90,10 +97,10 @@ class SplineMemoryGuide(SplineGuide):
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
         """Declare the memory."""
-        specs = {
-            key: Unbounded(shape, dtype=dtype) for key, (shape, _, dtype) in self.memory.items()
-        }
-        first = {key: value for key, (_, value, _) in self.memory.items()}
+        specs, first = {}, {}
+        for key, (shape, value, dtype) in self.memory.items():
+            specs[key] = Unbounded(shape, dtype=dtype)
+            first[key] = value
         return TensorDictPrimer(specs, default_value=first, expand_specs=True)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -125,9 +132,15 @@ class SplineMemoryGuide(SplineGuide):
         return tensordict.set(self.out_keys[0], action.to(dtype))
 
     def _nearest_unpassed(self, memory: dict[str, Tensor], frame: Frame, before: Tensor) -> Tensor:
-        """Update which targets are passed; return the nearest visible one that is not, or a place far away, [2, B].
+        """Update which targets are passed, and return the nearest visible one that is not.
 
-        `before` is the position at the last step, [2, B].
+        Args:
+            memory: by entry; replaced where it changes.
+            frame: of the cars now.
+            before: position at the last step, [2, B].
+
+        Returns:
+            The target [2, B], a place far away where there is none.
         """
         slots = slots_in_use(memory["path_target_count"], TARGETS)
         targets, passed = memory["path_targets"][:, :, :slots], memory["path_passed"][:, :slots]
@@ -137,9 +150,7 @@ class SplineMemoryGuide(SplineGuide):
         ahead = torch.addcmul(x * cos, y, sin)
         if self.oddities:
             passed = passed & ~memory["path_in_circle"]
-            offset = before - memory["path_gate"].t()
-            inside = torch.addcmul(offset[0] * offset[0], offset[1], offset[1]) < TARGET_REACHED**2
-            memory["path_in_circle"] = inside.unsqueeze(-1)
+            memory["path_in_circle"] = self._in_circle(memory, before)
         else:
             passed = passed & (square < self.sight**2)
         passed = passed | (square <= TARGET_REACHED**2)
@@ -150,10 +161,53 @@ class SplineMemoryGuide(SplineGuide):
         target = targets.gather(2, index).squeeze(-1)
         return torch.where(nearest.values.isinf(), constant(NOWHERE, target), target.t())
 
+    def _in_circle(self, memory: dict[str, Tensor], position: Tensor) -> Tensor:
+        """Return whether positions [2, B] are in the circle around the first midpoint, [B, 1]."""
+        offset = position - memory["path_gate"].t()
+        inside = torch.addcmul(offset[0] * offset[0], offset[1], offset[1]) < TARGET_REACHED**2
+        return inside.unsqueeze(-1)
+
     def _discover(
         self, memory: dict[str, Tensor], frame: Frame, cones: Tensor, count: Tensor
     ) -> None:
-        """Remember the cones in view, and place targets in the rows where one was never seen before."""
+        """Remember the cones in view, and place targets in the rows where one was never seen.
+
+        Args:
+            memory: by entry; replaced where it changes.
+            frame: of the cars.
+            cones: [B, 2, K, 2] m in the frame of the car, nearest first, left side first.
+            count: [B, 2], number of cones.
+        """
+        world, appeared = self._look(memory, frame, cones, count)
+        rows = rows_in_use(appeared.flatten(0, 1).any(0))
+        if not len(rows):
+            return
+        world, appeared, count = world[..., rows], appeared[..., rows], count[rows]
+        seen = memory["path_cones"][rows].permute(1, 3, 2, 0)
+        seen_count = memory["path_cone_count"][rows].t()
+        known = seen[:, : slots_in_use(seen_count, CONES)].to(world)
+        new = appeared & ~_near(world, known, SAME_CONE)
+        seen, total = append(seen, seen_count, world.to(seen), new)
+        plans = (total > seen_count).any(0) & (count > 1).all(-1)
+        memory["path_cones"] = memory["path_cones"].index_copy(0, rows, seen.permute(3, 0, 2, 1))
+        memory["path_cone_count"] = memory["path_cone_count"].index_copy(0, rows, total.t())
+        if self.oddities:
+            # The middle of the circle is the first midpoint of the first path.
+            gate = memory["path_gate"][rows].t()
+            gate = torch.where(plans & (gate[0] == NOWHERE), world[:, 0].mean(1), gate)
+            memory["path_gate"] = memory["path_gate"].index_copy(0, rows, gate.t())
+        frame = Frame(memory["path_pose"][rows].t())
+        self._place_targets(memory, frame, rows, plans, cones[rows], count, total[0])
+
+    def _look(
+        self, memory: dict[str, Tensor], frame: Frame, cones: Tensor, count: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Remember which cones are in view; the arguments are those of `_discover`.
+
+        Returns:
+            The cones [2, K, 2, B] m in the frame of the start, far away in the padding, and which
+            of them were not in view in the step before [K, 2, B].
+        """
         slots = slots_in_use(count, self.cones)
         real = count.t() > constant(range(slots), count.t().unsqueeze(0))
         local = cones[:, :, :slots].permute(3, 2, 1, 0)
@@ -162,33 +216,7 @@ class SplineMemoryGuide(SplineGuide):
         appeared = real & ~_near(world, before[:, :slots], SAME_CONE)
         empty = constant(NOWHERE, world).expand(2, self.cones - slots, *world.shape[2:])
         memory["path_in_view"] = torch.cat([world, empty], 1).permute(3, 0, 1, 2)
-        rows = rows_in_use(appeared.flatten(0, 1).any(0))
-        if not len(rows):
-            return
-        world, appeared, local, count = (
-            world[..., rows],
-            appeared[..., rows],
-            local[..., rows],
-            count[rows],
-        )
-        seen, seen_count = (
-            memory["path_cones"][rows].permute(1, 3, 2, 0),
-            memory["path_cone_count"][rows].t(),
-        )
-        new = appeared & ~_near(
-            world, seen[:, : slots_in_use(seen_count, CONES)].to(world), SAME_CONE
-        )
-        seen, total = append(seen, seen_count, world.to(seen), new)
-        plans = (total > seen_count).any(0) & (count > 1).all(-1)
-        memory["path_cones"] = memory["path_cones"].index_copy(0, rows, seen.permute(3, 0, 2, 1))
-        memory["path_cone_count"] = memory["path_cone_count"].index_copy(0, rows, total.t())
-        if self.oddities:
-            gate = memory["path_gate"][rows].t()
-            gate = torch.where(plans & (gate[0] == NOWHERE), world[:, 0].mean(1), gate)
-            memory["path_gate"] = memory["path_gate"].index_copy(0, rows, gate.t())
-        self._place_targets(
-            memory, Frame(memory["path_pose"][rows].t()), rows, plans, cones[rows], count, total[0]
-        )
+        return world, appeared
 
     def _place_targets(
         self,
@@ -200,28 +228,26 @@ class SplineMemoryGuide(SplineGuide):
         count: Tensor,
         left: Tensor,
     ) -> None:
-        """Place targets on the path through the cones in view where `plans`; `left` is the number of left cones."""
+        """Place targets on the path through the cones in view.
+
+        Args:
+            memory: by entry, of all B rows; replaced where it changes.
+            frame: of the cars, for R of the rows as the following.
+            rows: their indices, [R].
+            plans: [R], whether to place targets.
+            cones: [R, 2, K, 2] m in the frame of the car.
+            count: [R, 2], number of cones.
+            left: [R], number of left cones that were ever seen.
+        """
         midpoints, total = self._midpoints(cones, count)
         points, total = frame.to_world(midpoints), total.to(torch.int64)
         if self.oddities:
-            real = total > constant(range(points.shape[1]), points[0])
-            shared = ((points.unsqueeze(1) - points.unsqueeze(2)).abs() < SAME_COORDINATE).any(0)
-            points, total = append(
-                torch.zeros_like(points), torch.zeros_like(total), points, first_come(real, shared)
-            )
-        first, middle, last = self.fit(points, total).equidistant(3).unsqueeze(2).unbind(1)
-        spacing = constant(tuple(0.5 / max(k, 1) ** 0.4 for k in range(CONES + 1)), points[0, 0])[
-            left
-        ]
-        u = constant(range(CANDIDATES), points[0]) * spacing
-        # The parabola through three of its points, which goes on behind the last one.
-        candidates = first + u * (last - first + (u - 1) * 2 * (first - 2 * middle + last))
-        targets, target_count = (
-            memory["path_targets"][rows].permute(1, 2, 0),
-            memory["path_target_count"][rows].t()[0],
-        )
+            points, total = _without_shared(points, total)
+        candidates, along = self._candidates(points, total, left)
+        targets = memory["path_targets"][rows].permute(1, 2, 0)
+        target_count = memory["path_target_count"][rows].t()[0]
         free = ~_near(candidates, targets[:, : slots_in_use(target_count, TARGETS)], self.spacing)
-        eligible = free & (u < 1.01) & (plans & (total > 1))
+        eligible = free & (along < 1.01) & (plans & (total > 1))
         apart = (candidates.unsqueeze(1) - candidates.unsqueeze(2)).square().sum(0)
         placed = first_come(eligible, apart < self.spacing**2)
         targets, target_count = append(targets, target_count, candidates, placed)
@@ -232,8 +258,46 @@ class SplineMemoryGuide(SplineGuide):
             0, rows, target_count.unsqueeze(-1)
         )
 
+    def _candidates(self, points: Tensor, total: Tensor, left: Tensor) -> tuple[Tensor, Tensor]:
+        """Return points on a path, and where on the path they are.
+
+        Args:
+            points: midpoints of left-right pairs, [2, M, R] m.
+            total: [R], number of midpoints.
+            left: [R], number of left cones that were ever seen, on which the spacing depends.
+
+        Returns:
+            The points [2, C, R] m and their parameters [C, R], from 0 at the first to 1 at the last
+            midpoint and beyond.
+        """
+        first, middle, last = self.fit(points, total).equidistant(3).unsqueeze(2).unbind(1)
+        spacings = tuple(0.5 / max(k, 1) ** 0.4 for k in range(CONES + 1))
+        u = constant(range(CANDIDATES), points[0]) * constant(spacings, points[0, 0])[left]
+        # The parabola through three of its points, which goes on behind the last one.
+        candidates = first + u * (last - first + (u - 1) * 2 * (first - 2 * middle + last))
+        return candidates, u
+
+
+def _without_shared(points: Tensor, total: Tensor) -> tuple[Tensor, Tensor]:
+    """Drop points that share a coordinate with a nearer one; return the others and their number.
+
+    Args:
+        points: [2, M, R] m, nearest first.
+        total: [R], number of points.
+    """
+    real = total > constant(range(points.shape[1]), points[0])
+    shared = ((points.unsqueeze(1) - points.unsqueeze(2)).abs() < SAME_COORDINATE).any(0)
+    kept = first_come(real, shared)
+    return append(torch.zeros_like(points), torch.zeros_like(total), points, kept)
+
 
 def _near(points: Tensor, others: Tensor, distance: float) -> Tensor:
-    """Return which points [2, M, *batch] are nearer than a distance in m to any of the others [2, N, *batch]."""
+    """Return which points are near to any of the others, [M, *batch].
+
+    Args:
+        points: [2, M, *batch] m.
+        others: [2, N, *batch] m.
+        distance: m.
+    """
     x, y = (points.unsqueeze(2) - others.unsqueeze(1)).unbind(0)
     return torch.addcmul(x * x, y, y).amin(1) < distance**2

@@ -1,4 +1,4 @@
-"""Fitted regressors of scikit-learn as bytes: read without running code, and checked before the first prediction.
+"""Fitted regressors of scikit-learn as bytes: read without running code, and checked.
 
 skops constructs trusted types only. That is not enough: the compiled code of scikit-learn follows
 the indices in trees and support vector machines without a check, so that forged ones read foreign
@@ -41,7 +41,11 @@ FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, pa
 
 
 def dump(model: BaseEstimator) -> bytes:
-    """Return a fitted regressor as bytes; raises a `UserError` if `load` would refuse it."""
+    """Return a fitted regressor as bytes; raises a `UserError` if `load` would refuse it.
+
+    Args:
+        model: the regressor.
+    """
     content: bytes = skops.io.dumps(model)
     _types(content)
     _check(model)
@@ -49,7 +53,11 @@ def dump(model: BaseEstimator) -> bytes:
 
 
 def load(content: bytes) -> BaseEstimator:
-    """Return the regressor of `dump`; raises a `UserError` if it could run code, is damaged, or is forged."""
+    """Return the regressor of `dump`.
+
+    Args:
+        content: its bytes; if it could run code, is damaged or is forged, a `UserError` is raised.
+    """
     try:
         model = skops.io.loads(content, trusted=_types(content))
         if not isinstance(model, BaseEstimator) or not is_regressor(model):
@@ -68,14 +76,17 @@ def load(content: bytes) -> BaseEstimator:
 def _types(content: bytes) -> list[str]:
     """Return the types that skops does not trust by default, all of which must be known here."""
     found: list[str] = skops.io.get_untrusted_types(data=content)
-    if unknown := sorted(set(found) - PARTS):
+    unknown = sorted(set(found) - PARTS)
+    if unknown:
         raise UserError(
-            f"a regressor with parts of type {', '.join(unknown)} could run code; use another regressor"
+            f"a regressor with parts of type {', '.join(unknown)} could run code; use another "
+            "regressor"
         )
     return found
 
 
 def _check(model: BaseEstimator) -> None:
+    """Raise a `UserError` or a `ValueError` for a regressor that must not be used."""
     for part in _parts(model):
         if isinstance(part, FUNCTIONS):
             raise UserError(
@@ -106,91 +117,123 @@ def _parts(model: object) -> Iterator[Any]:
         elif isinstance(part, np.ndarray) and part.dtype.hasobject:
             waiting += part.ravel().tolist()
         elif not isinstance(part, type) and type(part).__module__.startswith("sklearn."):
-            waiting += vars(part).values() if hasattr(part, "__dict__") else []
+            waiting += getattr(part, "__dict__", {}).values()
 
 
 def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
-    """Check what compiled code reads at a prediction; raises a `ValueError`. Parts that are not fitted pass."""
+    """Check what compiled code reads at a prediction; raises a `ValueError`.
+
+    Parts that are not fitted pass.
+
+    Args:
+        part: an estimator.
+        state: its attributes.
+    """
     inputs = state.get("n_features_in_")
     if isinstance(part, DecisionTreeRegressor) and "tree_" in state:
-        _require(
-            isinstance(part.tree_, Tree) and part.tree_.n_features == inputs,
-            "a tree has other features",
-        )
-        tree, leaf = part.tree_, part.tree_.children_left == -1
-        _check_nodes(tree.children_left, tree.children_right, leaf, tree.feature, tree.n_features)
-        _check_numbers(tree.value, tree.threshold)
+        _check_tree(part, inputs)
     elif isinstance(part, FORESTS) and "estimators_" in state:
-        trees = np.ravel(part.estimators_)
-        _require(len(trees) > 0, "a forest has no trees")
-        known = all(
-            isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree) for tree in trees
-        )
-        alike = known and all(vars(tree).get("n_features_in_") == inputs for tree in trees)
-        _require(alike, "the trees of a forest differ")
-        boosted = isinstance(part, GradientBoostingRegressor)
-        _require(
-            not boosted or np.shape(part.estimators_) == (len(trees), 1),
-            "boosted trees have a wrong shape",
-        )
+        _check_forest(part, inputs)
     elif isinstance(part, HistGradientBoostingRegressor) and "_predictors" in state:
-        categorical = state.get("_preprocessor") is not None or np.any(
-            part._bin_mapper.is_categorical_
-        )
-        _require(not categorical and not state.get("_in_fit"), "categories cannot be checked")
-        for predictor in chain.from_iterable(part._predictors):
-            _require(isinstance(predictor, TreePredictor), "boosted trees have a wrong type")
-            nodes = predictor.nodes
-            _require(not nodes["is_categorical"].any(), "categories cannot be checked")
-            _check_nodes(
-                nodes["left"], nodes["right"], nodes["is_leaf"] != 0, nodes["feature_idx"], inputs
-            )
-            _check_numbers(nodes["value"], nodes["num_threshold"])
+        _check_histograms(part, state, inputs)
     elif isinstance(part, (SVR, NuSVR)) and "support_vectors_" in state:
-        count = len(part.support_vectors_)
-        shapes = {
-            "support_vectors_": (count, inputs),
-            "support_": (count,),
-            "_dual_coef_": (1, count),
-            "_intercept_": (1,),
-            "_n_support": (2,),
-            "_probA": (0,),
-            "_probB": (0,),
-        }
-        fits = all(np.shape(state[name]) == shape for name, shape in shapes.items())
-        known = (
-            part.kernel in ("linear", "poly", "rbf", "sigmoid")
-            and not part._sparse
-            and "_impl" not in state
-        )
-        _require(count > 0 and fits and known, "a support vector machine has wrong shapes")
-        _check_numbers(part._dual_coef_, part.support_vectors_)
+        _check_support_vectors(part, state, inputs)
     elif isinstance(part, (KNeighborsRegressor, RadiusNeighborsRegressor)) and "_fit_X" in state:
-        part.fit(
-            part._fit_X, part._y
-        )  # finds the neighbours by a tree of its own, made from the points
+        # Finds the neighbours by a tree of its own, made from the points.
+        part.fit(part._fit_X, part._y)
+
+
+def _check_tree(part: DecisionTreeRegressor, inputs: int | None) -> None:
+    """Check a tree for this number of inputs."""
+    tree = part.tree_
+    _require(
+        isinstance(tree, Tree) and tree.n_features == inputs,
+        "a tree has other features",
+    )
+    leaf = tree.children_left == -1
+    _check_nodes(tree.children_left, tree.children_right, leaf, tree.feature, tree.n_features)
+    _check_numbers(tree.value, tree.threshold)
+
+
+def _check_forest(part: Any, inputs: int | None) -> None:
+    """Check that a forest consists of fitted trees for this number of inputs.
+
+    The trees themselves are parts of their own.
+    """
+    trees = np.ravel(part.estimators_)
+    _require(len(trees) > 0, "a forest has no trees")
+    for tree in trees:
+        fitted = isinstance(tree, DecisionTreeRegressor) and "tree_" in vars(tree)
+        alike = fitted and vars(tree).get("n_features_in_") == inputs
+        _require(alike, "the trees of a forest differ")
+    if isinstance(part, GradientBoostingRegressor):
+        one_output = np.shape(part.estimators_) == (len(trees), 1)
+        _require(one_output, "boosted trees have a wrong shape")
+
+
+def _check_histograms(
+    part: HistGradientBoostingRegressor, state: Mapping[str, Any], inputs: Any
+) -> None:
+    """Check boosted trees on histograms for this number of inputs."""
+    plain = state.get("_preprocessor") is None and not np.any(part._bin_mapper.is_categorical_)
+    _require(plain and not state.get("_in_fit"), "categories cannot be checked")
+    for predictor in chain.from_iterable(part._predictors):
+        _require(isinstance(predictor, TreePredictor), "boosted trees have a wrong type")
+        nodes = predictor.nodes
+        _require(not nodes["is_categorical"].any(), "categories cannot be checked")
+        leaf = nodes["is_leaf"] != 0
+        _check_nodes(nodes["left"], nodes["right"], leaf, nodes["feature_idx"], inputs)
+        _check_numbers(nodes["value"], nodes["num_threshold"])
+
+
+def _check_support_vectors(part: Any, state: Mapping[str, Any], inputs: int | None) -> None:
+    """Check a support vector machine for this number of inputs."""
+    count = len(part.support_vectors_)
+    shapes = {
+        "support_vectors_": (count, inputs),
+        "support_": (count,),
+        "_dual_coef_": (1, count),
+        "_intercept_": (1,),
+        "_n_support": (2,),
+        "_probA": (0,),
+        "_probB": (0,),
+    }
+    fits = all(np.shape(state[name]) == shape for name, shape in shapes.items())
+    usual = part.kernel in ("linear", "poly", "rbf", "sigmoid")
+    known = usual and not part._sparse and "_impl" not in state
+    _require(count > 0 and fits and known, "a support vector machine has wrong shapes")
+    _check_numbers(part._dual_coef_, part.support_vectors_)
 
 
 def _check_nodes(
     left: Any, right: Any, leaf: NDArray[np.bool_], feature: Any, features: Any
 ) -> None:
-    """Check that nodes form one tree in which children come after their parents, as scikit-learn stores it."""
+    """Check that nodes form one tree, as scikit-learn stores it: children come after their parents.
+
+    Args:
+        left: index of the left child of each node.
+        right: index of its right child.
+        leaf: whether it has no children.
+        feature: by which it is split.
+        features: number of features.
+    """
     inner = np.flatnonzero(~leaf)
     children = np.concatenate([left[inner], right[inner]]).astype(np.int64)
     ordered = (children > np.concatenate([inner, inner])).all()
     reached = np.array_equal(np.sort(children), np.arange(1, len(leaf)))
     _require(len(leaf) > 0 and ordered and reached, "the nodes of a tree do not form a tree")
     used = feature[inner]
-    _require(
-        ((used >= 0) & (used < features)).all(), "a tree splits by a feature that does not exist"
-    )
+    exists = ((used >= 0) & (used < features)).all()
+    _require(exists, "a tree splits by a feature that does not exist")
 
 
 def _check_numbers(values: NDArray[np.floating], others: NDArray[np.floating]) -> None:
+    """Check that predicted values are finite, and the other numbers are numbers."""
     finite = np.isfinite(values).all() and not np.isnan(others).any()
     _require(finite, "a predicted number or a threshold is not a number")
 
 
 def _require(condition: object, otherwise: str) -> None:
+    """Raise a `ValueError` with the text `otherwise` unless a condition holds."""
     if not condition:
         raise ValueError(otherwise)

@@ -1,4 +1,4 @@
-"""Imitation of a guide: offline (OIL, paper algorithm 6) and by data-set aggregation (DAgger, algorithm 7).
+"""Imitation of a guide: offline (OIL, paper algorithm 6) and by DAgger (algorithm 7).
 
 The guide's action in every state of a batch is added to a data set, and a regressor is fitted to
 the whole data set. One batch in which the guide acted gives behavioural cloning, offline imitation
@@ -30,20 +30,23 @@ from coil_rl.transforms.action_space import ActionSpace, nested_key
 class Imitation(Learner):
     """The imitation learner.
 
-    An env without such advice or observation is a `KeyError`, without such a guide a `ValueError`.
-    A data set that is missing, damaged or of another env is a `UserError`.
-
     Args:
-        env: the env, for its specs.
+        env: the env with its transforms, for its specs.
         in_keys: entries that the policy observes.
-        regressor: specification of the regressor.
+        regressor: specification of the regressor; its `fresh` copy is fitted.
         advice_key: entry with the advice in a state, [*batch, n_guides, A].
-        guide: index of the guide in the advice.
+        guide: row of the advice, the index of the guide to imitate.
         group_key: entry with the track of a sample, for the validation on unseen tracks. None, or
             an entry that the env does not have, skips that validation.
         validate: whether to validate in each update, which takes several more fits.
-        dataset: file of a data set to start from, `dataset.pt` of another run.
-        seed: of the random split of the validation.
+        dataset: file of a data set to start from, `dataset.pt` of another run; None to start
+            without.
+        seed: of the random split of the validation, below 2^32.
+
+    Raises:
+        KeyError: for an env without such advice or observation.
+        ValueError: for an env without such a guide, and for a seed out of range.
+        UserError: for a data set that is missing, damaged or of another env.
 
     Attributes:
         policy: writes the prediction of the regressor, clamped to the bounds of the action; 0
@@ -62,7 +65,8 @@ class Imitation(Learner):
         >>> env = ConeTrackEnv(shipped_tracks("train"), num_envs=7, assignment="cyclic")
         >>> env = TransformedEnv(env, GuideActions({"middle": SplineGuide()}))
         >>> learner = Imitation(env, regressor=SklearnRegressor(LinearRegression()))
-        >>> metrics = learner.update(Rollout(env, learner.policy, steps=20, keys=learner.keys).collect())
+        >>> rollout = Rollout(env, learner.policy, steps=20, keys=learner.keys)
+        >>> metrics = learner.update(rollout.collect())
     """
 
     kind: ClassVar[str] = "imitation"
@@ -100,18 +104,20 @@ class Imitation(Learner):
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
         group: NestedKey | None = nested_key(group_key)
         self.group_key = group if group in available else None
-        self.keys: list[NestedKey] = [
-            *in_keys,
-            advice_key,
-            *([] if self.group_key is None else [self.group_key]),
-        ]
+        self.keys: list[NestedKey] = [*in_keys, advice_key]
+        if self.group_key is not None:
+            self.keys.append(self.group_key)
         self.validate, self.seed, self.device = validate, seed, env.device
-        self.dataset: TensorDictBase | None = (
-            None if dataset is None else self._load(Path(dataset), env)
-        )
+        self.dataset: TensorDictBase | None = None
+        if dataset is not None:
+            self.dataset = self._load(Path(dataset), env)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
-        """Add the guide's actions in a batch [*B, T] with `keys` to the data set, and fit the regressor to it.
+        """Add the guide's actions in a batch to the data set, and fit the regressor to it.
+
+        Args:
+            batch: [*B, T] with the entries `keys`.
+            progress: of the run; ignored.
 
         Returns:
             The number of `samples`; `target_variance`, the mean squared error of predicting the
@@ -120,9 +126,9 @@ class Imitation(Learner):
             of `cross_validate`.
         """
         pairs = self._pairs(batch)
-        dataset: TensorDictBase = (
-            pairs if self.dataset is None else torch.cat([self.dataset, pairs])
-        )
+        dataset: TensorDictBase = pairs
+        if self.dataset is not None:
+            dataset = torch.cat([self.dataset, pairs])
         self.dataset = dataset
         x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]
         metrics = {
@@ -150,10 +156,10 @@ class Imitation(Learner):
             checkpoint.save(self.dataset.to_dict(), folder / "dataset.pt")
 
     def _pairs(self, batch: TensorDictBase) -> TensorDictBase:
+        """Return the samples of a batch: what the policy observes and the action of the guide."""
         rows = batch.select(*self.keys).reshape(-1)
-        pairs = rows.select(
-            *(key for key in self.keys if key != self.advice_key or key in self.in_keys)
-        )
+        kept = [key for key in self.keys if key != self.advice_key or key in self.in_keys]
+        pairs = rows.select(*kept)
         return pairs.set("action", rows[self.advice_key][:, self.guide])
 
     def _load(self, file: Path, env: EnvBase) -> TensorDictBase:
@@ -164,13 +170,15 @@ class Imitation(Learner):
         expected = self._pairs(env.fake_tensordict())
         keys = list(expected.keys(True, True))
         for key in keys:
-            shape = dataset[key].shape[1:] if key in dataset.keys(True, True) else None
-            if shape != expected[key].shape[1:]:
-                fault = f"{key} is {'missing' if shape is None else list(shape)}"
-                remedy = (
-                    f"but must be {list(expected[key].shape[1:])}; give another data set, or none"
+            needed = list(expected[key].shape[1:])
+            found = "missing"
+            if key in dataset.keys(True, True):
+                found = str(list(dataset[key].shape[1:]))
+            if found != str(needed):
+                raise UserError(
+                    f"{file} is a data set of another env: {key} is {found}, but must be {needed}; "
+                    "give another data set, or none"
                 )
-                raise UserError(f"{file} is a data set of another env: {fault}, {remedy}")
         return dataset.select(*keys).to(env.device)
 
     def state_dict(self) -> dict[str, Any]:
@@ -181,12 +189,13 @@ class Imitation(Learner):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from `state_dict`."""
         self.policy.load_state_dict(state["policy"])
-        self.dataset = (
-            None if state["dataset"] is None else _from_dict(state["dataset"]).to(self.device)
-        )
+        self.dataset = None
+        if state["dataset"] is not None:
+            self.dataset = _from_dict(state["dataset"]).to(self.device)
 
 
 def _from_dict(entries: dict[str, Any]) -> TensorDictBase:
+    """Return the entries of a data set as a TensorDict [N]."""
     return TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
 
 

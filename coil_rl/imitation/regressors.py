@@ -1,4 +1,8 @@
-"""Regressors for imitation: a neural network, and any regressor of scikit-learn."""
+"""Regressors for imitation: a neural network, and any regressor of scikit-learn.
+
+Imitation needs few things of a regressor: it fits vectors to vectors from scratch, it predicts, and
+its fitted state can be saved. So the learner is the same for a network, a forest or a line.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +39,10 @@ class Regressor(nn.Module, ABC):
 
     @abstractmethod
     def fit(self, x: Tensor, y: Tensor) -> None:
-        """Fit y [N, outputs] to x [N, inputs] from scratch; the result depends on these and the constructor only."""
+        """Fit y [N, outputs] to x [N, inputs] from scratch.
+
+        The result depends on these and on the arguments of the constructor only.
+        """
 
     @abstractmethod
     def forward(self, x: Tensor) -> Tensor:
@@ -45,14 +52,15 @@ class Regressor(nn.Module, ABC):
 class NetworkRegressor(Regressor):
     """A tanh network, fitted to standardised inputs and outputs by least squares with Adam.
 
-    A value out of range is a `ValueError`.
-
     Args:
         hidden: widths of the hidden layers.
-        epochs: passes over the data.
-        minibatch: samples in a minibatch.
-        learning_rate: of Adam, a number or a schedule over the fit.
-        seed: of the initial weights and of the order of minibatches.
+        epochs: passes over the data, at least 1.
+        minibatch: samples in a minibatch, at least 1.
+        learning_rate: of Adam, positive, a number or a schedule over the fit.
+        seed: of the initial weights and of the order of minibatches, at least 0.
+
+    Raises:
+        ValueError: for a value out of range.
     """
 
     layers: MLP
@@ -91,10 +99,9 @@ class NetworkRegressor(Regressor):
             torch.manual_seed(self.seed)
             fresh.layers = Mlp(self.hidden).layers(inputs, outputs, gain=1.0)
         fresh.x_mean, fresh.x_scale = nn.Buffer(torch.zeros(inputs)), nn.Buffer(torch.ones(inputs))
-        fresh.y_mean, fresh.y_scale = (
-            nn.Buffer(torch.zeros(outputs)),
-            nn.Buffer(torch.zeros(outputs)),
-        )
+        # A scale of 0 makes an unfitted regressor predict 0.
+        fresh.y_mean = nn.Buffer(torch.zeros(outputs))
+        fresh.y_scale = nn.Buffer(torch.zeros(outputs))
         return fresh
 
     @torch.enable_grad()
@@ -125,8 +132,11 @@ class NetworkRegressor(Regressor):
 class SklearnRegressor(Regressor):
     """A regressor of scikit-learn, which may be a pipeline or a search.
 
-    Its state is a tensor with the bytes of a skops archive. A `random_state` that is None is set to
-    0. Any other `estimator`, of which only the parameters are used, is a `ValueError`.
+    Its state is a tensor with the bytes of a skops archive.
+
+    Args:
+        estimator: the regressor, of which only the parameters are used; a `random_state` that is
+            None is set to 0. Anything else is a `ValueError`.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression
@@ -141,7 +151,8 @@ class SklearnRegressor(Regressor):
         super().__init__()
         if not isinstance(estimator, BaseEstimator) or not is_regressor(estimator):
             raise ValueError(
-                f"estimator={estimator!r} is not a regressor of scikit-learn, such as LinearRegression()"
+                f"estimator={estimator!r} is not a regressor of scikit-learn, such as "
+                "LinearRegression()"
             )
         self.estimator = _with_parameter(
             clone(estimator), "random_state", lambda value: 0 if value is None else value
@@ -151,20 +162,29 @@ class SklearnRegressor(Regressor):
         self._archive: Tensor | None = torch.empty(0, dtype=torch.uint8)
 
     def fresh(self, inputs: int, outputs: int) -> SklearnRegressor:
-        """Return an unfitted regressor, which predicts 0; raises a `ValueError` if it can predict one number only."""
+        """Return an unfitted regressor, which predicts 0.
+
+        Args:
+            inputs: length of the inputs.
+            outputs: length of the outputs; more than 1 is a `ValueError` for an estimator that
+                predicts one number only.
+        """
         if outputs > 1 and not get_tags(self.estimator).target_tags.multi_output:
-            problem = f"{self.estimator!r} predicts one number, but an action has {outputs} here"
-            raise ValueError(f"{problem}; put it into sklearn.multioutput.MultiOutputRegressor")
+            raise ValueError(
+                f"{self.estimator!r} predicts one number, but an action has {outputs} here; put it "
+                "into sklearn.multioutput.MultiOutputRegressor"
+            )
         fresh = SklearnRegressor(self.estimator)
         fresh.inputs, fresh.outputs = inputs, outputs
         return fresh
 
     def fit(self, x: Tensor, y: Tensor) -> None:
         """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision."""
-        single = self.outputs == 1 and get_tags(self.estimator).target_tags.single_output
-        data = [part.cpu().double().numpy() for part in (x, y.squeeze(-1) if single else y)]
+        if self.outputs == 1 and get_tags(self.estimator).target_tags.single_output:
+            y = y.squeeze(-1)
+        fitted = clone(self.estimator).fit(x.cpu().double().numpy(), y.cpu().double().numpy())
         # For small batches threads cost more than they save, and they sum in random order.
-        self.model = _with_parameter(clone(self.estimator).fit(*data), "n_jobs", lambda _: 1)
+        self.model = _with_parameter(fitted, "n_jobs", lambda _: 1)
         self._archive = None
 
     def forward(self, x: Tensor) -> Tensor:
@@ -172,9 +192,8 @@ class SklearnRegressor(Regressor):
         if self.model is None:
             return x.new_zeros(*x.shape[:-1], self.outputs)
         y = _predict(self.model, x.detach().reshape(-1, x.shape[-1]).cpu().numpy())
-        return (
-            torch.from_numpy(np.asarray(y, np.float32)).to(x).reshape(*x.shape[:-1], self.outputs)
-        )
+        prediction = torch.from_numpy(np.asarray(y, np.float32)).to(x)
+        return prediction.reshape(*x.shape[:-1], self.outputs)
 
     def get_extra_state(self) -> Tensor:
         """Return the fitted regressor as bytes, [n] uint8; empty before the first fit."""
@@ -183,7 +202,10 @@ class SklearnRegressor(Regressor):
         return self._archive
 
     def set_extra_state(self, state: Tensor) -> None:
-        """Restore a fitted regressor; raises a `UserError` if that could run code or if the bytes do not fit."""
+        """Restore a fitted regressor from its bytes, [n] uint8.
+
+        If that could run code or if the bytes do not fit, a `UserError` is raised.
+        """
         content = state.cpu()
         model = archive.load(content.numpy().tobytes()) if len(content) else None
         inputs = getattr(model, "n_features_in_", self.inputs)
@@ -201,26 +223,36 @@ class SklearnRegressor(Regressor):
                 ) from error
             if not usable:
                 raise UserError(
-                    f"the state is a regressor that does not predict {self.outputs} numbers; train again"
+                    f"the state is a regressor that does not predict {self.outputs} numbers; train "
+                    "again"
                 )
         self.model, self._archive = model, content
 
 
 def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floating]:
-    """Predict y for x [N, inputs]; for forests without scikit-learn's checks, which dominate for small batches."""
+    """Predict y for x [N, inputs].
+
+    For forests this leaves out scikit-learn's checks, which dominate for small batches.
+    """
     forest = type(model) in (RandomForestRegressor, ExtraTreesRegressor)
     if forest and x.shape[1] == model.n_features_in_ and np.isfinite(x).all():
-        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in model.estimators_) / len(
-            model.estimators_
-        )
+        trees = model.estimators_
+        return sum(tree.tree_.predict(x.astype(np.float32)) for tree in trees) / len(trees)
     return model.predict(x)
 
 
 def _with_parameter(
     estimator: BaseEstimator, name: str, change: Callable[[object], object]
 ) -> BaseEstimator:
-    """Change a parameter of an estimator and of the estimators inside it."""
-    values = {
-        key: value for key, value in estimator.get_params().items() if key.split("__")[-1] == name
-    }
-    return estimator.set_params(**{key: change(value) for key, value in values.items()})
+    """Change a parameter of an estimator and of the estimators inside it.
+
+    Args:
+        estimator: the outer one.
+        name: of the parameter.
+        change: takes the old value and returns the new one.
+    """
+    changed = {}
+    for key, value in estimator.get_params().items():
+        if key.split("__")[-1] == name:
+            changed[key] = change(value)
+    return estimator.set_params(**changed)

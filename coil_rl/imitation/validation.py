@@ -23,7 +23,7 @@ Split = tuple[NDArray[np.int64], NDArray[np.int64]]  # rows for training, rows f
 def cross_validate(
     regressor: Regressor, x: Tensor, y: Tensor, groups: Tensor | None = None, seed: int = 0
 ) -> dict[str, float]:
-    """Return the errors of fresh regressors on a random fifth of the samples and on left-out tracks.
+    """Return the errors of fresh regressors on a random fifth and on left-out tracks.
 
     They are `mse_random_split`, `r2_random_split` and, with groups, `mse_by_track`, `r2_by_track`:
     see `scores`.
@@ -40,8 +40,10 @@ def cross_validate(
         seed: of the random split.
     """
     if len(x) < MIN_SAMPLES:
-        remedy = f"use at least {MIN_SAMPLES}, or learner.validate=false"
-        raise UserError(f"{len(x)} samples are too few to validate; {remedy}")
+        raise UserError(
+            f"{len(x)} samples are too few to validate; use at least {MIN_SAMPLES}, or "
+            "learner.validate=false"
+        )
     rows = np.arange(len(x))
     splits: dict[str, list[Split]] = {
         "random_split": [train_test_split(rows, test_size=TEST_SHARE, random_state=seed)]
@@ -49,9 +51,8 @@ def cross_validate(
     if groups is not None:
         splits["by_track"] = group_splits(groups)
     metrics: dict[str, float] = {}
-    with tqdm(
-        total=sum(map(len, splits.values())), unit="fit", desc="validate", leave=False
-    ) as bar:
+    fits = sum(len(folds) for folds in splits.values())
+    with tqdm(total=fits, unit="fit", desc="validate", leave=False) as bar:
         for name, folds in splits.items():
             predictions, targets = [], []
             for fold in folds:
@@ -67,24 +68,30 @@ def cross_validate(
 
 
 def group_splits(groups: Tensor) -> list[Split]:
-    """Return at most ten splits of rows with group numbers [N]; each row is tested once, no group is on both sides.
+    """Return at most ten splits of rows; each row is tested once, no group is on both sides.
 
-    A single group is a `UserError`.
+    Args:
+        groups: [N], group number of each row; a single group is a `UserError`.
     """
     labels = groups.cpu().numpy()
     count = len(np.unique(labels))
     if count < 2:
         raise UserError(
-            "all samples are from one track, so no track can be left out; set learner.group_key=null"
+            "all samples are from one track, so no track can be left out; set "
+            "learner.group_key=null"
         )
     return list(GroupKFold(min(count, MAX_FOLDS)).split(labels, groups=labels))
 
 
 def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) -> dict[str, float]:
-    """Return `mse_NAME` and `r2_NAME` of the split NAME: mean squared error and R^2, means over the A outputs.
+    """Return mean squared error and R^2 as `mse_NAME` and `r2_NAME`, means over the A outputs.
 
-    Predictions and targets are [N, A] for each fold. Where targets are constant, R^2 is 1 for
-    correct predictions and else 0.
+    Where targets are constant, R^2 is 1 for correct predictions and else 0.
+
+    Args:
+        predictions: [N, A] of each fold.
+        targets: [N, A] of each fold.
+        name: NAME, of the split.
     """
     numbers = (torch.cat(list(targets)).cpu().numpy(), torch.cat(list(predictions)).cpu().numpy())
     return {

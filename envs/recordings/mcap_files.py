@@ -1,4 +1,9 @@
-"""MCAP files and rosbag2 folders: reading and writing of encoded messages."""
+"""MCAP files and rosbag2 folders: reading and writing of encoded messages.
+
+Recordings come from robots whose batteries run out and from disks that are full. So a file that
+ends early is read as far as it goes, damaged chunks are skipped and counted, and everything that
+cannot be used is refused in one sentence with a remedy.
+"""
 
 import hashlib
 import os
@@ -49,20 +54,34 @@ class RecordingError(ValueError):
 
 
 class Channel(NamedTuple):
-    """A topic with its message type and the type's definition."""
+    """A topic with its message type and the type's definition.
+
+    Attributes:
+        topic: name of the topic.
+        message_type: empty if the file has none.
+        encoding: of the messages.
+        language: of the definition.
+        definition: of the message type.
+        metadata: keys and values, such as the quality of service that ROS 2 offers.
+    """
 
     topic: str
-    message_type: str  # empty if the file has none
+    message_type: str
     encoding: str = "cdr"
     language: str = "ros2msg"
     definition: bytes = b""
-    metadata: tuple[
-        tuple[str, str], ...
-    ] = ()  # keys and values, such as the quality of service that ROS 2 offers
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class RawMessage(NamedTuple):
-    """An encoded message; times in ns."""
+    """An encoded message.
+
+    Attributes:
+        channel: topic and type.
+        log_time: ns, when it was recorded.
+        publish_time: ns, when it was sent.
+        data: the encoded message.
+    """
 
     channel: Channel
     log_time: int
@@ -72,16 +91,25 @@ class RawMessage(NamedTuple):
 
 @dataclass
 class Contents:
-    """Contents of a recording."""
+    """Contents of a recording.
 
-    messages: dict[str, list[RawMessage]]  # by topic, in order of log time
-    channels: list[Channel] = field(default_factory=list)  # of all topics
-    notes: dict[str, dict[str, str]] = field(default_factory=dict)  # metadata records by name
-    attachments: dict[str, records.Attachment] = field(default_factory=dict)  # by name
-    cut_off: bool = False  # whether a file ends early
-    damage: list[str] = field(default_factory=list)  # the damaged places that were skipped
-    # Number of messages that damage made unreadable, by topic; a topic is missing if the number is
-    # unknown.
+    Attributes:
+        messages: by topic, in order of log time.
+        channels: of all topics.
+        notes: metadata records by name.
+        attachments: by name.
+        cut_off: whether a file ends early.
+        damage: the damaged places that were skipped.
+        lost: number of messages that damage made unreadable, by topic; a topic is missing if the
+            number is unknown.
+    """
+
+    messages: dict[str, list[RawMessage]]
+    channels: list[Channel] = field(default_factory=list)
+    notes: dict[str, dict[str, str]] = field(default_factory=dict)
+    attachments: dict[str, records.Attachment] = field(default_factory=dict)
+    cut_off: bool = False
+    damage: list[str] = field(default_factory=list)
     lost: dict[str, int] = field(default_factory=dict)
 
 
@@ -105,7 +133,12 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
 
 
 def digest(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a recording, in hexadecimal; for a folder, of the concatenation of its files."""
+    """Return the SHA-256 of a recording, in hexadecimal.
+
+    Args:
+        path: an MCAP file, or the folder of a rosbag2 recording, of whose files the concatenation
+            is taken.
+    """
     sha256 = hashlib.sha256()
     for file in _files(Path(path)):
         _check_format(file)
@@ -114,10 +147,14 @@ def digest(path: str | os.PathLike[str]) -> str:
 
 
 class RecordingWriter:
-    """Collects messages and writes them as an MCAP file, ordered by time, at the end of a `with` block.
+    """Collects messages, and writes them as an MCAP file at the end of a `with` block.
 
-    Nothing is written if the block raises. The file appears complete or not at all, and replaces an
-    existing one. Equal messages make equal bytes. See `read_recording` for an example.
+    The messages are ordered by time. Nothing is written if the block raises. The file appears
+    complete or not at all, and replaces an existing one. Equal messages make equal bytes. See
+    `read_recording` for an example.
+
+    Args:
+        path: of the file; its folder is made if it is missing.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -127,7 +164,15 @@ class RecordingWriter:
         self._attachments: dict[str, tuple[str, bytes, tuple[int, int] | None]] = {}
 
     def add(self, topic: str, message_type: str, time: int, fields: Mapping[str, Any]) -> None:
-        """Add a message; the time in ns, type, fields and errors as in `messages.encode`."""
+        """Add a message.
+
+        Args:
+            topic: of the message.
+            message_type: such as "geometry_msgs/msg/Twist".
+            time: ns, of the recording and of the sending.
+            fields: by name, each a number, text, sequence or nested mapping; zero or empty if
+                missing. An unknown field is a `ValueError`.
+        """
         channel = Channel(topic, message_type, definition=definition(message_type))
         self.copy(RawMessage(channel, time, time, encode(message_type, fields)))
 
@@ -136,7 +181,12 @@ class RecordingWriter:
         self._messages.append(message)
 
     def describe(self, name: str, entries: Mapping[str, str]) -> None:
-        """Add a metadata record."""
+        """Add a metadata record.
+
+        Args:
+            name: of the record.
+            entries: its keys and values.
+        """
         self._metadata[name] = dict(sorted(entries.items()))
 
     def attach(
@@ -144,8 +194,12 @@ class RecordingWriter:
     ) -> None:
         """Add an attachment, such as a configuration.
 
-        `times` are those of creation and of logging in ns, by default both the time of the first
-        message.
+        Args:
+            name: of the attachment.
+            media_type: such as "text/yaml".
+            data: its content.
+            times: ns, of creation and of logging; by default both are the time of the first
+                message.
         """
         self._attachments[name] = media_type, data, times
 
@@ -182,24 +236,26 @@ class RecordingWriter:
                 schemas[schema] = writer.register_schema(*schema)
             about = channel.encoding, schemas.get(schema, 0), dict(channel.metadata)
             channels[channel] = writer.register_channel(channel.topic, *about)
-        for message in sorted(
-            self._messages, key=lambda message: (message.log_time, message.channel)
-        ):
-            writer.add_message(
-                channels[message.channel], message.log_time, message.data, message.publish_time
-            )
+        in_order = sorted(self._messages, key=lambda message: (message.log_time, message.channel))
+        for message in in_order:
+            channel_id = channels[message.channel]
+            writer.add_message(channel_id, message.log_time, message.data, message.publish_time)
         writer.finish()
 
 
 def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -> None:
-    """Add the contents of a file."""
+    """Add the contents of a file.
+
+    Args:
+        file: an MCAP file.
+        topics: topics to read; None for all.
+        contents: to which the contents are added.
+    """
     size, complete = _check_format(file)
+    before = {topic: len(messages) for topic, messages in contents.messages.items()}
+    damage = len(contents.damage)
     selected: dict[int, tuple[Channel, list[RawMessage]]] = {}
     schemas: dict[int, records.Schema] = {}
-    before, damage = (
-        {topic: len(messages) for topic, messages in contents.messages.items()},
-        len(contents.damage),
-    )
     with file.open("rb") as stream:
         for record in _records(file, stream, size, complete, contents):
             if type(record) is records.Message:
@@ -211,16 +267,7 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
             elif type(record) is records.Schema:
                 schemas[record.id] = record
             elif type(record) is records.Channel:
-                kind = schemas.get(record.schema_id) or records.Schema(
-                    id=0, name="", encoding="", data=b""
-                )
-                about = (
-                    record.message_encoding,
-                    kind.encoding,
-                    kind.data,
-                    tuple(record.metadata.items()),
-                )
-                channel = Channel(record.topic, kind.name, *about)
+                channel = _channel(record, schemas.get(record.schema_id))
                 contents.channels.append(channel)
                 if topics is None or channel.topic in topics:
                     selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
@@ -228,69 +275,101 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
                 contents.notes[record.name] = dict(record.metadata)
             elif type(record) is records.Attachment:
                 contents.attachments[record.name] = record
-        summary = _summary(stream) if len(contents.damage) > damage else Summary()
-    if summary.statistics:
-        written = summary.statistics.channel_message_counts
-        for topic, messages in contents.messages.items():
-            total = sum(
-                written.get(number, 0)
-                for number, each in summary.channels.items()
-                if each.topic == topic
-            )
-            read = len(messages) - before.get(topic, 0)
-            contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
+        if len(contents.damage) > damage:
+            _count_lost(contents, before, _summary(stream))
+
+
+def _channel(record: records.Channel, schema: records.Schema | None) -> Channel:
+    """Return a channel of a file, whose messages may have no type."""
+    metadata = tuple(record.metadata.items())
+    if schema is None:
+        return Channel(record.topic, "", record.message_encoding, "", b"", metadata)
+    return Channel(
+        record.topic, schema.name, record.message_encoding, schema.encoding, schema.data, metadata
+    )
+
+
+def _count_lost(contents: Contents, before: Mapping[str, int], summary: Summary) -> None:
+    """Count the messages of a damaged file that could not be read.
+
+    Args:
+        contents: with the messages that could be read.
+        before: number of messages of each topic that come from other files.
+        summary: of the file; without statistics the number is unknown.
+    """
+    if not summary.statistics:
+        return
+    written = summary.statistics.channel_message_counts
+    for topic, messages in contents.messages.items():
+        numbers = [number for number, each in summary.channels.items() if each.topic == topic]
+        total = sum(written.get(number, 0) for number in numbers)
+        read = len(messages) - before.get(topic, 0)
+        contents.lost[topic] = contents.lost.get(topic, 0) + max(0, total - read)
 
 
 def _records(
     file: Path, stream: BinaryIO, size: int, complete: bool, contents: Contents
 ) -> Iterator[Any]:
-    """Yield the records of a file, of its chunks too; skip damaged chunks, and note them and an early end."""
-    reader = StreamReader(
-        stream, emit_chunks=True, validate_crcs=True, record_size_limit=size
-    ).records
+    """Yield the records of a file, of its chunks too.
+
+    Damaged chunks are skipped. They and an early end are noted in the contents.
+
+    Args:
+        file: the file, for messages.
+        stream: its bytes.
+        size: number of bytes.
+        complete: whether the end of the file is there.
+        contents: of the recording.
+    """
+    reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
+    read = reader.records
     while True:
         start, record = stream.tell(), None
         try:
-            record = next(reader, None)
+            record = next(read, None)
             if record is None:
                 return
-            parts = (
-                breakup_chunk(record, validate_crc=True)
-                if type(record) is records.Chunk
-                else [record]
-            )
-        except (
-            Exception
-        ) as error:  # damaged bytes raise almost any exception in the libraries below
+            parts = [record]
+            if type(record) is records.Chunk:
+                parts = breakup_chunk(record, validate_crc=True)
+        # Damaged bytes raise almost any exception in the libraries below.
+        except Exception as error:
             end = stream.tell()
             if not complete and (end >= size or isinstance(error, RecordLengthLimitExceeded)):
                 contents.cut_off = True
                 return
             summary = _summary(stream)
-            # Places of all chunks, metadata records and attachments.
-            places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
-            places += [metadata.offset for metadata in summary.metadata_indexes]
-            places += [attachment.offset for attachment in summary.attachment_indexes]
-            following = [place for place in places if place > start] + ([end] if record else [])
+            places = _places(summary)
+            following = [place for place in places if place > start]
+            if record:
+                following.append(end)
             # A wrong checksum of the whole file does not tell where the damage is.
             whole = isinstance(error, CRCValidationError) and type(error.record) is records.DataEnd
             if whole or not (places or following):
                 reason = " ".join(str(error).split()) or type(error).__name__
-                save = "save what is left with: mcap recover FILE -o OTHER.mcap"
-                remedy = f"copy it again from where it was recorded, or {save}"
                 raise RecordingError(
-                    f"{file} is damaged before byte {end} ({reason}); {remedy}."
+                    f"{file} is damaged before byte {end} ({reason}); copy it again from where it "
+                    "was recorded, or save what is left with: mcap recover FILE -o OTHER.mcap."
                 ) from None
             contents.damage.append(f"byte {start}")
             if not following:
                 return
             stream.seek(min(following))
-            reader = StreamReader(
+            read = StreamReader(
                 stream, skip_magic=True, emit_chunks=True, record_size_limit=size
             ).records
             # The damage may hide the channels of the messages that follow.
             parts = [*summary.schemas.values(), *summary.channels.values()]
         yield from parts
+
+
+def _places(summary: Summary) -> list[int]:
+    """Return the places in a file of all chunks, metadata records and attachments."""
+    return [
+        *(chunk.chunk_start_offset for chunk in summary.chunk_indexes),
+        *(metadata.offset for metadata in summary.metadata_indexes),
+        *(attachment.offset for attachment in summary.attachment_indexes),
+    ]
 
 
 def _summary(stream: BinaryIO) -> Summary:
@@ -303,7 +382,10 @@ def _summary(stream: BinaryIO) -> Summary:
 
 
 def _check_format(file: Path) -> tuple[int, bool]:
-    """Return the size of an MCAP file in bytes and whether its end is there; raise for any other file."""
+    """Return the size of an MCAP file in bytes, and whether its end is there.
+
+    Any other file is a `RecordingError`.
+    """
     try:
         with file.open("rb") as stream:
             start = stream.read(32)
@@ -331,12 +413,13 @@ def _files(path: Path) -> Iterator[Path]:
     if not path.is_dir():
         yield path
         return
-    metadata, reindex = path / "metadata.yaml", "let ROS write it: ros2 bag reindex FOLDER."
+    metadata = path / "metadata.yaml"
     try:
         text = metadata.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):
         raise RecordingError(
-            f"{path} is a folder without a readable metadata.yaml; {reindex}"
+            f"{path} is a folder without a readable metadata.yaml; let ROS write it: ros2 bag "
+            "reindex FOLDER."
         ) from None
     # The file is written by a program, so two of its lines are found without a YAML parser.
     storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
@@ -346,7 +429,9 @@ def _files(path: Path) -> Iterator[Path]:
             f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}."
         )
     if not listed:
-        raise RecordingError(f"{metadata} lists no files; {reindex}")
+        raise RecordingError(
+            f"{metadata} lists no files; let ROS write it: ros2 bag reindex FOLDER."
+        )
     for line in listed[1].splitlines():
         # Older versions of ROS put the folder's own name before the file's.
         file = path / Path(line.strip().removeprefix("-").strip(" \"'")).name

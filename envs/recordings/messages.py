@@ -1,4 +1,8 @@
-"""ROS 2 messages in CDR, encoded and decoded with the type store of rosbags."""
+"""ROS 2 messages in CDR, encoded and decoded with the type store of rosbags.
+
+A recording stores the definition of each message type, so that messages can be read without an
+installation of ROS.
+"""
 
 import math
 from collections.abc import Mapping
@@ -10,11 +14,9 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-SCAN, ODOMETRY, TWIST = (
-    "sensor_msgs/msg/LaserScan",
-    "nav_msgs/msg/Odometry",
-    "geometry_msgs/msg/Twist",
-)
+SCAN = "sensor_msgs/msg/LaserScan"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 
 
@@ -26,27 +28,36 @@ def ros_types() -> Typestore:
 
 @cache
 def definition(message_type: str) -> bytes:
-    """Return the definition of a type and its parts as in a recording; raises a `ValueError` for an unknown type."""
+    """Return the definition of a type and its parts as in a recording.
+
+    Args:
+        message_type: name of a standard type, else a `ValueError`.
+    """
     _fields_of(message_type)
     return ros_types().generate_msgdef(message_type, ros_version=2)[0].encode()
 
 
 def encode(message_type: str, fields: Mapping[str, Any]) -> bytes:
-    """Return a message of a type such as "geometry_msgs/msg/Twist" as little-endian CDR.
+    """Return a message as little-endian CDR.
 
-    A field is a number, text, sequence or nested mapping, zero or empty if missing. An unknown one
-    is a `ValueError`.
+    Args:
+        message_type: such as "geometry_msgs/msg/Twist".
+        fields: by name, each a number, text, sequence or nested mapping; zero or empty if missing.
+            An unknown field is a `ValueError`.
     """
-    return bytes(
-        ros_types().serialize_cdr(_message(message_type, fields), message_type, little_endian=True)
-    )
+    message = _message(message_type, fields)
+    return bytes(ros_types().serialize_cdr(message, message_type, little_endian=True))
 
 
 def decode(data: bytes, message_type: str, language: str = "ros2msg", text: bytes = b"") -> Any:
     """Return a message in CDR of either byte order, with its fields as attributes.
 
-    The definition stored with the message is used, or the standard one if that text cannot be
-    parsed. Bytes that are not a message of this type are a `SerdeError`.
+    Args:
+        data: the message; bytes that are not a message of this type are a `SerdeError`.
+        message_type: such as "geometry_msgs/msg/Twist".
+        language: of the definition, "ros2msg" or "ros2idl".
+        text: the definition that is stored with the message; if it is empty or cannot be parsed,
+            the standard one is used.
     """
     return _types_of(message_type, language, text).deserialize_cdr(data, message_type)
 
@@ -90,12 +101,10 @@ def _types_of(message_type: str, language: str, text: bytes) -> Typestore:
     if not text:
         return ros_types()
     try:
-        parse_idl = language == "ros2idl"
-        parsed = (
-            get_types_from_idl(text.decode())
-            if parse_idl
-            else get_types_from_msg(text.decode(), message_type)
-        )
+        if language == "ros2idl":
+            parsed = get_types_from_idl(text.decode())
+        else:
+            parsed = get_types_from_msg(text.decode(), message_type)
         types = get_typestore(Stores.EMPTY)
         types.register(parsed)
         types.get_msgdef(message_type)
@@ -105,6 +114,7 @@ def _types_of(message_type: str, language: str, text: bytes) -> Typestore:
 
 
 def _fields_of(message_type: str) -> dict[str, Any]:
+    """Return the fields of a standard type, each with the description of its type by rosbags."""
     if message_type not in ros_types().fielddefs:
         raise ValueError(
             f"{message_type!r} is not a standard ROS 2 message type; give one such as {SCAN}"
@@ -113,8 +123,10 @@ def _fields_of(message_type: str) -> dict[str, Any]:
 
 
 def _message(message_type: str, fields: Mapping[str, Any]) -> Any:
+    """Return a message as an object of rosbags."""
     kinds = _fields_of(message_type)
-    if unknown := set(fields) - set(kinds):
+    unknown = set(fields) - set(kinds)
+    if unknown:
         raise ValueError(
             f"{message_type} has no field {sorted(unknown)}; it has {', '.join(kinds)}"
         )
@@ -126,7 +138,9 @@ def _value(description: Any, value: Any) -> Any:
     """Return the value of a field, zero or empty for None; the description is that of rosbags."""
     node, kind = description
     if node == Nodetype.BASE:
-        return ("" if kind[0] == "string" else 0) if value is None else value
+        if value is not None:
+            return value
+        return "" if kind[0] == "string" else 0
     if node == Nodetype.NAME:
         return _message(kind, value or {})
     (element, element_kind), size = kind

@@ -1,4 +1,8 @@
-"""Robot recordings as arrays: LiDAR scans, odometry and commands."""
+"""Robot recordings as arrays: LiDAR scans, odometry and commands.
+
+What a user of recordings needs is a few arrays with one clock. What robots record is messages of
+several senders with two clocks each. This file chooses, checks and warns about what it leaves out.
+"""
 
 import math
 import os
@@ -26,39 +30,47 @@ from coil_rl.envs.recordings.messages import (
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 LARGEST = 1e7  # of poses, commands and angles
-REMEDY = "record it again, or correct the program that sent it"
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
-Scanner = tuple[
-    str, float, float, str
-]  # frame, smallest and greatest range, name of the program that sent its scans
+# Frame, smallest and greatest range, name of the program that sent its scans.
+Scanner = tuple[str, float, float, str]
 
 
 @dataclass(frozen=True)
 class Recording:
-    """N scans of a LiDAR, with the odometry and the commands of the drive."""
+    """N scans of a LiDAR, with the odometry and the commands of the drive.
 
-    path: Path  # of the file or folder
-    log_time: Times  # [N] ns, ascending
-    stamp: Times  # [N] ns, start of each scan by the scanner's clock
-    ranges: NDArray[
-        np.float32
-    ]  # [N, P] m; inf if not finite or outside the scanner's range, and for padding
-    points: NDArray[np.int64]  # [N] number of ranges of each scan
-    angle_min: Floats  # [N] radians, bearing of the first range
-    angle_increment: Floats  # [N] radians, step of the bearing, negative for clockwise rotation
-    # Poses [M, 3] m, m, radians, with their log times and stamps [M] ns; None without odometry.
+    Args:
+        path: of the file or folder.
+        log_time: [N] ns, when the scans were recorded, ascending.
+        stamp: [N] ns, start of each scan by the scanner's clock.
+        ranges: [N, P] m; infinite if not finite or outside the scanner's range, and for padding.
+        points: [N], number of ranges of each scan.
+        angle_min: [N] radians, bearing of the first range.
+        angle_increment: [N] radians, step of the bearing, negative for clockwise rotation.
+        odometry: poses [M, 3] (m, m, radians), with their log times and stamps [M] ns; None without
+            odometry.
+        commands: [M, 2] m/s and radians/s, with their log times [M] ns; None without commands.
+        frame: of the scanner.
+        stamped_commands: whether the commands are TwistStamped messages.
+        notes: metadata records by name.
+        remarks: what the file has and the arrays lack, such as "is cut off: 160 scans can be read".
+    """
+
+    path: Path
+    log_time: Times
+    stamp: Times
+    ranges: NDArray[np.float32]
+    points: NDArray[np.int64]
+    angle_min: Floats
+    angle_increment: Floats
     odometry: tuple[Floats, Times, Times] | None = None
-    commands: tuple[Floats, Times] | None = (
-        None  # [M, 2] m/s, radians/s, with their log times [M] ns; None without
-    )
-    frame: str = "laser"  # of the scanner
-    stamped_commands: bool = False  # whether the commands are TwistStamped messages
-    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # metadata records by name
-    remarks: Sequence[
-        str
-    ] = ()  # what the file has and the arrays lack: "is cut off: 160 scans can be read"
+    commands: tuple[Floats, Times] | None = None
+    frame: str = "laser"
+    stamped_commands: bool = False
+    notes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    remarks: Sequence[str] = ()
 
     @property
     def simulated(self) -> bool:
@@ -67,7 +79,10 @@ class Recording:
 
     @property
     def seconds(self) -> Floats:
-        """[N] s since the first scan, by the scanner's clock, or by log time if that clock is not ascending."""
+        """[N] s since the first scan.
+
+        They are taken by the scanner's clock, or by log time if that clock is not ascending.
+        """
         clock = self.stamp if _ascending(self.stamp) else self.log_time
         return (clock - clock[0]) / 1e9
 
@@ -90,10 +105,8 @@ class Recording:
             scan_time, pose_time = (self.stamp, stamp) if stamped else (self.log_time, log_time)
             # Relative times, as floating point would round absolute nanoseconds to a quarter of a
             # microsecond.
-            at, times = (
-                (scan_time - pose_time[0]).astype(float),
-                (pose_time - pose_time[0]).astype(float),
-            )
+            at = (scan_time - pose_time[0]).astype(float)
+            times = (pose_time - pose_time[0]).astype(float)
             columns = [pose[:, 0], pose[:, 1], np.unwrap(pose[:, 2])]
             return np.stack([np.interp(at, times, column) for column in columns], axis=1)
         if self.commands is not None:
@@ -106,8 +119,11 @@ class Recording:
         It is the last command before the next scan: a controller needs time for a scan, and a
         program that sends commands at a higher rate repeats the old one meanwhile. The speed is the
         command's own, with which its turn rate means a steering angle; if no command has one, that
-        of the odometry, and without it the nominal one, m/s. A recording without commands is a
+        of the odometry, and without it the nominal one. A recording without commands is a
         `ValueError`.
+
+        Args:
+            nominal_speed: m/s.
         """
         if self.commands is None:
             raise ValueError(f"{self.path} has no commands; check that commands is not None")
@@ -117,13 +133,10 @@ class Recording:
         if not commands[:, 0].any():
             rows[:, 0] = nominal_speed
             if self.odometry is not None:  # from each scan to the next one
-                path, time = (
-                    np.hypot(*np.diff(self.poses()[:, :2], axis=0).T),
-                    np.diff(self.seconds),
-                )
-                rows[:, 0] = np.append(
-                    np.divide(path, time, out=np.zeros_like(path), where=time > 0), 0.0
-                )
+                path = np.hypot(*np.diff(self.poses()[:, :2], axis=0).T)
+                time = np.diff(self.seconds)
+                speed = np.divide(path, time, out=np.zeros_like(path), where=time > 0)
+                rows[:, 0] = np.append(speed, 0.0)
         return rows
 
 
@@ -139,16 +152,20 @@ def read_recording(
     """Read a recording with ROS 2 messages: an MCAP file or a rosbag2 folder.
 
     A warning names what is left out: scans that are lost, odometry or commands of other types,
-    other scanners. What cannot be read is a `RecordingError`, in one sentence with its remedy.
+    other scanners.
 
     Args:
         path: of the file or folder.
         scan: topic of the LiDAR.
-        odometry: its topic, or None; ignored if the recording does not have it.
-        command: likewise, for the commands, Twist or TwistStamped.
+        odometry: topic of the odometry, or None; ignored if the recording does not have it.
+        command: topic of the commands, Twist or TwistStamped, or None; ignored if the recording
+            does not have it.
         frame: of the scanner, if several send scans on one topic; None for the first one.
         strict: raise for a recording that is cut off or damaged, instead of a warning with the
             number of scans.
+
+    Raises:
+        RecordingError: for what cannot be read, in one sentence with its remedy.
 
     Example:
         >>> import tempfile
@@ -161,26 +178,13 @@ def read_recording(
         (3, 360)
     """
     path = Path(path)
-    types: dict[str, tuple[str, ...]] = {scan: (SCAN,)}
-    types |= ({odometry: (ODOMETRY,)} if odometry else {}) | (
-        {command: (TWIST, TWIST_STAMPED)} if command else {}
-    )
-    if len(types) < 1 + bool(odometry) + bool(command):
-        raise RecordingError(
-            f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics."
-        )
+    types = _types_of_topics(path, scan, odometry, command)
     contents = read_messages(path, types)
-    scans, lost = len(contents.messages[scan]), contents.lost.get(scan, "an unknown number")
-    remarks = [f"is cut off: {scans} scans can be read"] if contents.cut_off else []
-    if contents.damage:
-        remarks.append(
-            f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost"
-        )
-    remarks += [
-        remark
-        for topic in types
-        if (remark := _ignore_other_types(path, topic, types[topic], contents, scan))
-    ]
+    remarks = _remarks_on_losses(contents, scan)
+    for topic in types:
+        remark = _ignore_other_types(path, topic, types[topic], contents, scan)
+        if remark:
+            remarks.append(remark)
     if not contents.messages[scan]:
         raise _no_scans(path, scan, contents)
     if strict and (contents.cut_off or contents.damage):
@@ -191,7 +195,7 @@ def read_recording(
     extra: dict[str, Any] = {"notes": contents.notes, "remarks": remarks}
     if odometry and contents.messages[odometry]:
         time, rows = _decoded(
-            path, odometry, contents, lambda message: (stamp_of(message), pose_of(message))
+            path, odometry, contents, lambda each: (stamp_of(each), pose_of(each))
         )
         poses = np.array([pose for _, pose in rows])
         _check_finite(path, odometry, time, poses, "the pose")
@@ -200,19 +204,55 @@ def read_recording(
         time, twists = _decoded(path, command, contents, twist_of)
         _check_finite(path, command, time, np.array(twists), "the command")
         extra["commands"] = np.array(twists), time
-        extra["stamped_commands"] = (
-            contents.messages[command][0].channel.message_type == TWIST_STAMPED
-        )
+        message_type = contents.messages[command][0].channel.message_type
+        extra["stamped_commands"] = message_type == TWIST_STAMPED
     fields = _scans(path, scan, contents, frame, remarks)
     for remark in remarks:
         warnings.warn(f"{path} {remark}", stacklevel=2)
     return Recording(path=path, **fields, **extra)
 
 
+def _types_of_topics(
+    path: Path, scan: str, odometry: str | None, command: str | None
+) -> dict[str, tuple[str, ...]]:
+    """Return the message types that can be read on each topic; `path` is for a message."""
+    types: dict[str, tuple[str, ...]] = {scan: (SCAN,)}
+    if odometry:
+        types[odometry] = (ODOMETRY,)
+    if command:
+        types[command] = (TWIST, TWIST_STAMPED)
+    if len(types) < 1 + bool(odometry) + bool(command):
+        raise RecordingError(
+            f"{path}: scan={scan}, odometry={odometry}, command={command} must be different topics."
+        )
+    return types
+
+
+def _remarks_on_losses(contents: Contents, scan: str) -> list[str]:
+    """Return remarks on scans that an early end or damage of a file made unreadable."""
+    scans, lost = len(contents.messages[scan]), contents.lost.get(scan, "an unknown number")
+    remarks = []
+    if contents.cut_off:
+        remarks.append(f"is cut off: {scans} scans can be read")
+    if contents.damage:
+        remarks.append(
+            f"is damaged at {contents.damage[0]}: {scans} scans can be read, {lost} are lost"
+        )
+    return remarks
+
+
 def _scans(
     path: Path, topic: str, contents: Contents, frame: str | None, remarks: list[str]
 ) -> dict[str, Any]:
-    """Return the fields of a `Recording` that come from the scans; add a remark if other scanners are left out."""
+    """Return the fields of a `Recording` that come from the scans.
+
+    Args:
+        path: of the recording, for messages.
+        topic: of the scans.
+        contents: of the recording.
+        frame: of the scanner; None for the first one.
+        remarks: a remark is added if other scanners are left out.
+    """
 
     def fields(message: Any) -> tuple[Any, ...]:
         scanner = message.header.frame_id, message.range_min, message.range_max
@@ -234,8 +274,10 @@ def _scans(
     stamps, _, _, scans = zip(*(messages[row] for row in kept), strict=True)
     points = np.array([len(scan) for scan in scans])
     if not points.any():
-        problem = "no scan has a range; check that the scanner ran, and record again."
-        raise RecordingError(f"{path}, topic {topic}: {problem}")
+        raise RecordingError(
+            f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record "
+            "again."
+        )
     ranges = np.full((len(scans), points.max()), np.inf, np.float32)
     for row, scan in zip(ranges, scans, strict=True):
         row[: len(scan)] = scan
@@ -255,7 +297,15 @@ def _scans(
 def _choose_scanner(
     path: Path, topic: str, scanners: Sequence[Scanner], frame: str | None, remarks: list[str]
 ) -> Scanner:
-    """Return the first scanner, or the first one with this frame; add a remark if there are others to choose from."""
+    """Return the first scanner, or the first one with a frame.
+
+    Args:
+        path: of the recording, for messages.
+        topic: of the scans.
+        scanners: of all scans.
+        frame: to choose; None for the first scanner.
+        remarks: a remark is added if there are others to choose from.
+    """
     scans = Counter(scanners)
     candidates = [scanner for scanner in scans if frame in (None, scanner[0])]
     if not candidates:
@@ -264,11 +314,7 @@ def _choose_scanner(
             f"{path}, topic {topic} has no scan with the frame {frame}; give frame={frames}."
         )
     if len(candidates) > 1:
-        names = ", ".join(
-            f"{' of '.join(filter(None, (name, sender))) or 'no frame'} ({count} scans to {high:g} m)"
-            for (name, _, high, sender), count in scans.items()
-            if frame in (None, name)
-        )
+        names = ", ".join(_described(scanner, scans[scanner]) for scanner in candidates)
         same = len({scanner[0] for scanner in candidates}) < len(candidates)
         remedy = "record each on a topic of its own" if same else "choose with frame=NAME"
         remarks.append(
@@ -277,8 +323,26 @@ def _choose_scanner(
     return candidates[0]
 
 
+def _described(scanner: Scanner, scans: int) -> str:
+    """Return a scanner with its number of scans, for a remark."""
+    frame, _, range_max, sender = scanner
+    name = " of ".join(filter(None, (frame, sender))) or "no frame"
+    return f"{name} ({scans} scans to {range_max:g} m)"
+
+
 def _integrate_commands(commands: Floats, command_time: Times, time: Times) -> Floats:
-    """Return the poses at `time` if each command holds until the next one; the robot stands before the first."""
+    """Return the poses of a robot that holds each command until the next one.
+
+    It stands before the first one.
+
+    Args:
+        commands: [M, 2] m/s and radians/s.
+        command_time: [M] ns.
+        time: [N] ns, times of the poses.
+
+    Returns:
+        Poses [N, 3], m, m and radians.
+    """
     moments = np.union1d(command_time, time)
     index = np.searchsorted(command_time, moments, side="right") - 1
     speed, turn_rate = np.where(index[:, None] < 0, 0.0, commands[index]).T
@@ -287,62 +351,91 @@ def _integrate_commands(commands: Floats, command_time: Times, time: Times) -> F
     # The chord of an arc has the direction of the arc's middle.
     direction = heading + turn_rate * step / 2
     chord = speed * step * np.sinc(turn_rate * step / (2 * np.pi))
-    x, y = (
-        np.cumsum(part) - part for part in (chord * np.cos(direction), chord * np.sin(direction))
-    )
+    east, north = chord * np.cos(direction), chord * np.sin(direction)
+    x, y = np.cumsum(east) - east, np.cumsum(north) - north
     return np.stack([x, y, heading], axis=1)[np.searchsorted(moments, time)]
 
 
 def _ascending(times: Times) -> bool:
+    """Return whether each time is later than the one before."""
     return bool((np.diff(times) > 0).all())
 
 
 def _decoded(
     path: Path, topic: str, contents: Contents, fields: Callable[[Any], tuple[Any, ...]]
 ) -> tuple[Times, list[tuple[Any, ...]]]:
-    """Return the log times of a topic, and the chosen fields of its messages."""
+    """Return the log times of a topic, and the chosen fields of its messages.
+
+    Args:
+        path: of the recording, for messages.
+        topic: of the messages.
+        contents: of the recording.
+        fields: takes a decoded message and returns what is needed of it.
+    """
     rows = []
     for index, (channel, log_time, _, data) in enumerate(contents.messages[topic]):
         try:
-            rows.append(
-                fields(decode(data, channel.message_type, channel.language, channel.definition))
-            )
+            message = decode(data, channel.message_type, channel.language, channel.definition)
+            rows.append(fields(message))
         except Exception as error:  # bytes and definition may be anything
-            problem = f"it is not a valid {channel.message_type} ({' '.join(str(error).split())})"
-            raise _message_error(path, topic, index, log_time, problem) from None
+            raise RecordingError(
+                f"{path}, topic {topic}, message {index} at {log_time / 1e9:.3f} s: it is not a "
+                f"valid {channel.message_type} ({' '.join(str(error).split())}); record it again, "
+                "or correct the program that sent it."
+            ) from None
     return np.array([message.log_time for message in contents.messages[topic]]), rows
 
 
 def _ignore_other_types(
     path: Path, topic: str, types: Sequence[str], contents: Contents, scan: str
 ) -> str | None:
-    """Remove the messages of other types or encodings of a topic; return a remark on them, if there are any.
+    """Remove the messages of other types or encodings of a topic.
 
-    Only such messages on the topic of the scans are a `RecordingError`.
+    Args:
+        path: of the recording, for messages.
+        topic: of the messages.
+        types: the message types that can be read.
+        contents: of the recording.
+        scan: topic of the scans; if there are only other messages on it, a `RecordingError` is
+            raised.
+
+    Returns:
+        A remark on the removed messages; None if there are none.
     """
     channels = [channel for channel in contents.channels if channel.topic == topic]
-    others = [
-        channel
-        for channel in channels
-        if channel.message_type not in types or channel.encoding != "cdr"
-    ]
+    others = [each for each in channels if each.message_type not in types or each.encoding != "cdr"]
     if not others:
         return None
     contents.messages[topic] = [
         message for message in contents.messages[topic] if message.channel not in others
     ]
     given = f"{others[0].message_type or 'no type'} in {others[0].encoding or 'no encoding'}"
-    problem = f"has messages of {given} on topic {topic}, not of {' or '.join(types)} in cdr"
-    found = _topics(contents, types) if len(others) == len(channels) else ""
-    remedy = f"; give the topic of such messages, here {found}" if found else ""
-    if topic == scan and len(others) == len(channels):
-        raise RecordingError(
-            f"{path} {problem}{remedy or f'; record the scans as {SCAN} with ROS 2'}."
+    needed = " or ".join(types)
+    if len(others) < len(channels):
+        return (
+            f"has messages of {given} on topic {topic}, not of {needed} in cdr, and they are "
+            "ignored"
         )
-    return f"{problem}, and they are ignored{remedy}"
+    other_topics = _topics(contents, types)
+    if topic == scan and not other_topics:
+        raise RecordingError(
+            f"{path} has messages of {given} on topic {topic}, not of {needed} in cdr; record the "
+            f"scans as {SCAN} with ROS 2."
+        )
+    if topic == scan:
+        raise RecordingError(
+            f"{path} has messages of {given} on topic {topic}, not of {needed} in cdr; give the "
+            f"topic of such messages, here {other_topics}."
+        )
+    advice = f"; give the topic of such messages, here {other_topics}" if other_topics else ""
+    return (
+        f"has messages of {given} on topic {topic}, not of {needed} in cdr, and they are "
+        f"ignored{advice}"
+    )
 
 
 def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
+    """Return the error for a recording without scans, which says what there is instead."""
     if contents.cut_off or contents.damage:
         loss = "cut off" if contents.cut_off else "damaged"
         return RecordingError(
@@ -350,9 +443,11 @@ def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
         )
     if any(channel.topic == topic for channel in contents.channels):
         return RecordingError(
-            f"{path}, topic {topic} has no message; check that the scanner ran, and record it again."
+            f"{path}, topic {topic} has no message; check that the scanner ran, and record it "
+            "again."
         )
-    if others := _topics(contents, (SCAN,)):
+    others = _topics(contents, (SCAN,))
+    if others:
         return RecordingError(
             f"{path} has no topic {topic}; give the topic of the LiDAR, here {others}."
         )
@@ -363,23 +458,26 @@ def _no_scans(path: Path, topic: str, contents: Contents) -> RecordingError:
 
 
 def _topics(contents: Contents, types: Sequence[str]) -> str:
-    channels = (channel for channel in contents.channels if channel.encoding == "cdr")
-    return " or ".join(
-        sorted({channel.topic for channel in channels if channel.message_type in types})
-    )
+    """Return the topics with messages of some types that can be decoded, for a message."""
+    channels = [channel for channel in contents.channels if channel.encoding == "cdr"]
+    topics = {channel.topic for channel in channels if channel.message_type in types}
+    return " or ".join(sorted(topics))
 
 
 def _check_finite(path: Path, topic: str, time: Times, values: Floats, name: str) -> None:
-    """Raise if a row of values [M, n] is not finite, or beyond what any robot does, in m, rad and s."""
+    """Raise a `RecordingError` for a message with numbers beyond what any robot does.
+
+    Args:
+        path: of the recording, for the message.
+        topic: of the values.
+        time: [M] ns, log time of each message.
+        values: [M, n], in m, radians and s.
+        name: of the values, for the message.
+    """
     wrong = np.flatnonzero(~(np.abs(values) < LARGEST).all(axis=1))
     if len(wrong):
         index = int(wrong[0])
-        raise _message_error(
-            path, topic, index, time[index], f"{name} is not a number below {LARGEST:g}"
+        raise RecordingError(
+            f"{path}, topic {topic}, message {index} at {time[index] / 1e9:.3f} s: {name} is not a "
+            f"number below {LARGEST:g}; record it again, or correct the program that sent it."
         )
-
-
-def _message_error(path: Path, topic: str, index: int, time: int, problem: str) -> RecordingError:
-    return RecordingError(
-        f"{path}, topic {topic}, message {index} at {time / 1e9:.3f} s: {problem}; {REMEDY}."
-    )

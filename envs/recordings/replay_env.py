@@ -1,4 +1,8 @@
-"""Replay of recorded robot drives as an env: the actions of a policy, scan by scan, without effect on the drive."""
+"""Replay of recorded robot drives as an env.
+
+A policy gets the scans of a recording one after the other and chooses an action for each, which has
+no effect on the drive. This shows what a policy would do on a real robot before it is let loose.
+"""
 
 import math
 import os
@@ -24,9 +28,9 @@ AnyPath = str | os.PathLike[str]
 
 
 class McapReplayEnv(EnvBase):
-    """Recordings side by side, each replayed from its first to its last scan whatever the agent does.
+    """Recordings side by side, each replayed from its first to its last scan.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of
+    Reads `action` [B, 1], the steering angle as a fraction of `max_steering`. Writes the entries of
     `ConeTrackEnv`: `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world,
     `cone_count` [B, 2], `steering` [B, 1], `reward`, `done`, `terminated`, `truncated` [B, 1];
     `omega` [B, 1] radians/s, the turn rate of the robot at that steering; and under `info`: `scan`
@@ -36,8 +40,7 @@ class McapReplayEnv(EnvBase):
     other actions.
 
     A step takes the action for the current scan and moves on to the next scan, so a recording of N
-    scans takes N actions; then the episode is truncated, and the last scan is repeated. A recording
-    that cannot be used is a `RecordingError`, a value outside its range a `ValueError`.
+    scans takes N actions; then the episode is truncated, and the last scan is repeated.
 
     Args:
         recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
@@ -45,12 +48,25 @@ class McapReplayEnv(EnvBase):
             cones [N, 2, K, 2] in the car's frame, m in the scale of the cone world, left side
             first, nearest first; and their number [N, 2]. Called once for all scans of a recording
             with equal bearings.
-        scan, odometry, command, frame, strict: as in `read_recording`.
-        spline, smoothing, kept_cones, max_steering: as in `ConeTrackEnv`.
+        scan: topic of the LiDAR.
+        odometry: topic of the odometry, or None; ignored if the recording does not have it.
+        command: topic of the commands, or None; ignored if the recording does not have it.
+        frame: of the scanner, if several send scans on one topic; None for the first one.
+        strict: raise for a recording that is cut off or damaged, instead of a warning.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
+            parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3 in the scale of the cone world.
         smooth: weight of the reward per unit of |a - mean of the last 20 actions|.
+        kept_cones: K, the nearest cones of each side that are written.
         sight: m, range of view in the scale of the cone world.
-        speed, car_length: of the robot, m/s and m.
+        speed: m/s, of the robot.
+        car_length: m, distance between the axles of the robot.
+        max_steering: degrees of an action of 1, at most 90.
         device: of all tensors.
+
+    Raises:
+        RecordingError: for a recording that cannot be used.
+        ValueError: for a value outside its range, and without a recording.
     """
 
     def __init__(
@@ -78,11 +94,10 @@ class McapReplayEnv(EnvBase):
         )
         check_range(0, 90, above=True, max_steering=max_steering)
         check_range(-1e6, 1e6, smooth=smooth)
-        sources = (
-            [recordings]
-            if isinstance(recordings, (str, os.PathLike, Recording))
-            else list(recordings)
-        )
+        if isinstance(recordings, (str, os.PathLike, Recording)):
+            sources = [recordings]
+        else:
+            sources = list(recordings)
         if not sources:
             raise ValueError("recordings is empty; give at least one MCAP file or rosbag2 folder")
         read = partial(
@@ -102,13 +117,11 @@ class McapReplayEnv(EnvBase):
         self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
         # All scans are perceived here and stored end to end, [T] scans per buffer.
         self.perception = perception
-        cones, count = zip(
-            *(_perceive(each, perception, kept_cones) for each in self.recordings), strict=True
-        )
-        self.cones, self.count = _joined(cones), _joined(count)
-        self.pose = _joined(
-            [_from_start(each.poses()).astype(np.float32) for each in self.recordings]
-        )
+        views = [_perceive(each, perception, kept_cones) for each in self.recordings]
+        self.cones = _joined([cones for cones, _ in views])
+        self.count = _joined([count for _, count in views])
+        poses = [_from_start(each.poses()) for each in self.recordings]
+        self.pose = _joined([pose.astype(np.float32) for pose in poses])
         self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
         length = torch.tensor([len(each.ranges) for each in self.recordings])
         self.length: Tensor = nn.Buffer(length, persistent=False)
@@ -128,10 +141,8 @@ class McapReplayEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
-        self.steps, self.history = (
-            self.steps.masked_fill(mask, 0),
-            self.history.masked_fill(mask, 0),
-        )
+        self.steps = self.steps.masked_fill(mask, 0)
+        self.history = self.history.masked_fill(mask, 0)
         self.memory.reset(mask)
         # Rows that are not reset perceive their scan again, which does not change their memory.
         return self._tensordict(self._perceive(), torch.zeros_like(self.history[0]))
@@ -144,11 +155,8 @@ class McapReplayEnv(EnvBase):
         out = self._tensordict(self._perceive(), roughness)
         out["reward"] = out["info", "reward", "smooth"]
         done = (self.steps >= self.length).unsqueeze(-1)
-        out["done"], out["truncated"], out["terminated"] = (
-            done,
-            done.clone(),
-            torch.zeros_like(done),
-        )
+        out["done"], out["truncated"] = done, done.clone()
+        out["terminated"] = torch.zeros_like(done)
         return out
 
     def _current(self) -> Tensor:
@@ -156,35 +164,39 @@ class McapReplayEnv(EnvBase):
         return self.first + torch.minimum(self.steps, self.length - 1)
 
     def _perceive(self) -> dict[str, Tensor]:
-        """Return the cones in the current scans, and the observation with the memory updated by them."""
+        """Update the memory with the current scans; return the entries that come from them."""
         current = self._current()
         cones, count = self.cones.index_select(0, current), self.count.index_select(0, current)
-        found = self.samples.index_select(3, current), self.valid.index_select(1, current)
-        observation, valid = self.memory.remember(*found)
+        samples, valid = self.samples.index_select(3, current), self.valid.index_select(1, current)
+        observation, valid = self.memory.remember(samples, valid)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 
     def _tensordict(self, view: dict[str, Tensor], roughness: Tensor) -> TensorDict:
+        """Put the entries of a reset or a step together.
+
+        Args:
+            view: the entries that come from the scan.
+            roughness: [B], |a - mean of the last 20 actions|.
+        """
         current, steering = self._current(), self.history[0].unsqueeze(-1)
+        reward = {"smooth": self.smooth * roughness.unsqueeze(-1)}
         info = {
             "scan": (current - self.first).unsqueeze(-1),
             "time": self.seconds.index_select(0, current).unsqueeze(-1),
             "pose": self.pose.index_select(0, current),
             "valid": view["valid"],
             "smoothness": roughness.unsqueeze(-1),
-            "reward": TensorDict(
-                {"smooth": self.smooth * roughness.unsqueeze(-1)}, self.batch_size
-            ),
+            "reward": TensorDict(reward, self.batch_size),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {
-            "steering": steering,
-            "info": TensorDict(info, self.batch_size, device=self.device),
-        }
+        entries["steering"] = steering
+        entries["info"] = TensorDict(info, self.batch_size, device=self.device)
         entries["omega"] = (steering * self.max_steering).sin() * (self.speed / self.car_length)
         return TensorDict(entries, self.batch_size, device=self.device)
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> Tensor:
+    """Return arrays end to end as a buffer that is not saved, as it follows from the recordings."""
     return nn.Buffer(torch.from_numpy(np.concatenate(parts)), persistent=False)
 
 
@@ -198,32 +210,30 @@ def _from_start(poses: NDArray[np.float64]) -> NDArray[np.float64]:
 def _perceive(
     recording: Recording, perception: Perceive, kept_cones: int
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2]."""
+    """Return the cones [N, 2, K, 2] m of all scans of a recording, and their number [N, 2].
+
+    Args:
+        recording: the recording.
+        perception: called once for all scans with equal bearings.
+        kept_cones: K.
+    """
     scans = len(recording.ranges)
-    all_cones, all_counts = (
-        np.zeros((scans, 2, kept_cones, 2), np.float32),
-        np.zeros((scans, 2), np.int64),
-    )
+    all_cones = np.zeros((scans, 2, kept_cones, 2), np.float32)
+    all_counts = np.zeros((scans, 2), np.int64)
     layouts = np.stack([recording.points, recording.angle_min, recording.angle_increment], axis=1)
     for layout in np.unique(layouts, axis=0):
         rows = np.flatnonzero((layouts == layout).all(axis=1))
         points = int(layout[0])
-        cones, count = map(
-            np.asarray,
-            perception(recording.ranges[rows, :points], recording.angles(rows[0])[:points]),
-        )
-        expected = (len(rows), 2, 2)
-        if (
-            cones.ndim != 4
-            or cones.shape[:2] + cones.shape[3:] != expected
-            or count.shape != expected[:2]
-        ):
-            given = f"cones {cones.shape} and counts {count.shape} for {len(rows)} scans"
-            needed = f"[{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
-            raise ValueError(f"perception returned {given}; it must return {needed}")
+        ranges, angles = recording.ranges[rows, :points], recording.angles(rows[0])[:points]
+        cones, count = map(np.asarray, perception(ranges, angles))
+        # Any number of cones per side will do.
+        fits = cones.ndim == 4 and cones.shape[:2] + cones.shape[3:] == (len(rows), 2, 2)
+        if not fits or count.shape != (len(rows), 2):
+            raise ValueError(
+                f"perception returned cones {cones.shape} and counts {count.shape} for {len(rows)} "
+                f"scans; it must return [{len(rows)}, 2, K, 2] and [{len(rows)}, 2]"
+            )
         nearest = min(kept_cones, cones.shape[2])
-        all_cones[rows, :, :nearest], all_counts[rows] = (
-            cones[:, :, :nearest],
-            np.minimum(count, nearest),
-        )
+        all_cones[rows, :, :nearest] = cones[:, :, :nearest]
+        all_counts[rows] = np.minimum(count, nearest)
     return all_cones, all_counts

@@ -1,4 +1,9 @@
-"""Tracks of the simulated robot: the 6 m track, cone positions and radii, distance to a crash, laps of a drive."""
+"""Tracks of the simulated robot: the 6 m track, its cones, the distance to a crash, and laps.
+
+All lengths are in the robot's own metres. A robot's course is a `Track` as in the cone world; what
+is particular here are the radii of the cones, thin ones left and thick ones right, by which the
+robot tells the sides apart.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -32,7 +37,10 @@ LINE_OFFSET = 1e-3  # m, so that a robot that stands on the line has not crossed
 
 @cache
 def robot_track() -> Track:
-    """Return the track in the robot's own metres: a closed line of 6 m with left bends, a right bend and a straight."""
+    """Return the track in the robot's own metres.
+
+    It is a closed line of 6 m with left bends, a right bend and a straight.
+    """
     centre, normal = _centre_line()
     sides = []
     for sign in (1, -1):
@@ -46,11 +54,18 @@ def robot_track() -> Track:
 def robot_tracks(
     scale: float = 1, count: int = 1, missing: float = 0, moved: float = 0, seed: int = 0
 ) -> list[Track]:
-    """Return copies of the robot's track, enlarged by `scale`: with 7 it fits the cars of the cone world.
+    """Return copies of the robot's track, enlarged and with faults.
 
-    Each cone is `missing` with this probability, or `moved` by normal noise of this standard
-    deviation in m of the unscaled track. A track with too few cones, or with sides that cross, is a
-    `TrackError`.
+    Args:
+        scale: factor of all lengths; with 7 the track fits the cars of the cone world.
+        count: number of copies.
+        missing: probability with which each cone is missing.
+        moved: m of the unscaled track, standard deviation of the normal noise by which each cone is
+            moved.
+        seed: of the missing and moved cones.
+
+    Raises:
+        TrackError: for a track with too few cones, or with sides that cross.
     """
     check_range(0, missing=missing, moved=moved)
     track, generator, tracks = robot_track(), np.random.default_rng(seed), []
@@ -60,7 +75,8 @@ def robot_tracks(
         left, right = (
             scale * (ring + moved * generator.standard_normal(ring.shape)) for ring in kept
         )
-        tracks.append(Track(f"{track.name} {copy}".removesuffix(" 0"), left, right, start))
+        name = track.name if copy == 0 else f"{track.name} {copy}"
+        tracks.append(Track(name, left, right, start))
     return tracks
 
 
@@ -71,7 +87,13 @@ def track_notes(track: Track) -> dict[str, str]:
 
 
 def noted_track(notes: Mapping[str, str]) -> Track:
-    """Return the track of a metadata record; without valid `left` and `right`, [[x, y], ...] m each, a `TrackError`."""
+    """Return the track of a metadata record.
+
+    Args:
+        notes: the record: `left` and `right`, each [[x, y], ...] m as JSON, and if given `start`
+            and `name`. Without valid sides, or for sides that make no track, a `TrackError` is
+            raised.
+    """
     try:
         left, right, start = (
             json.loads(notes.get(key, "null")) for key in ("left", "right", "start")
@@ -85,22 +107,39 @@ def noted_track(notes: Mapping[str, str]) -> Track:
 
 
 class RobotCourse:
-    """Cones and boundaries of T tracks in the robot's own metres, with the distance of robots to a crash."""
+    """Cones and boundaries of several tracks, and the distance of robots to a crash.
+
+    Args:
+        tracks: T tracks in the robot's own metres.
+
+    Attributes:
+        cones: centres, [2, T, M] m.
+        radius: of the cones, [T, M] m.
+        boundaries: of the left and the right side, [2, T, points] m each.
+    """
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         cones = [cones_of(track) for track in tracks]
-        self.cones = _stack_padded([centres for centres, _ in cones], FAR)  # [2, T, M] m
-        self.radius = _stack_padded([radius.unsqueeze(0) for _, radius in cones], 0.0)[
-            0
-        ]  # [T, M] m
-        lines = ([torch.tensor(track.boundary(side, STEP).T) for track in tracks] for side in SIDES)
-        self.boundaries = [_stack_padded(side, FAR) for side in lines]  # [2, T, points] m each
+        self.cones = _stack_padded([centres for centres, _ in cones], FAR)
+        self.radius = _stack_padded([radius.unsqueeze(0) for _, radius in cones], 0.0)[0]
+        self.boundaries = []
+        for side in SIDES:
+            lines = [torch.tensor(track.boundary(side, STEP).T) for track in tracks]
+            self.boundaries.append(_stack_padded(lines, FAR))
 
     def clearance(self, track: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distance of robots to a crash [B] m, and those of their centres to both boundaries [2, B] m.
+        """Return the distance of robots to a crash, and to both boundaries.
 
         A crash, a distance of at most 0, is that of the outline into a cone or of the centre into a
-        boundary. Robots are at poses [3, B] (m, m, radians) on tracks [B].
+        boundary.
+
+        Args:
+            track: [B], index of the track of each robot.
+            pose: [3, B], m, m and radians.
+
+        Returns:
+            The distance to a crash [B] m, and those of the centre to the left and the right
+            boundary [2, B] m.
         """
         cones, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
         outside = Frame(pose).to_car(cones).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
@@ -113,12 +152,21 @@ class RobotCourse:
 
 
 def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Tensor, Tensor]:
-    """Return the cones of a robot's track: centres [2, M] m and radii [M] m, thin ones left, thick ones right."""
-    rings = [
-        (ring, size)
-        for ring, size, use in ((track.left, THIN, left), (track.right, THICK, right))
-        if use
-    ]
+    """Return the cones of a robot's track, thin ones left and thick ones right.
+
+    Args:
+        track: the track.
+        left: whether to include the cones of the left side.
+        right: whether to include those of the right side; neither side is a `ValueError`.
+
+    Returns:
+        Centres [2, M] m and radii [M] m.
+    """
+    rings = []
+    if left:
+        rings.append((track.left, THIN))
+    if right:
+        rings.append((track.right, THICK))
     if not rings:
         raise ValueError(
             "cones_of a track with neither left nor right has no cone; choose one side or both"
@@ -128,36 +176,46 @@ def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Te
 
 
 def middle_line(track: Track, spacing: float) -> Array:
-    """Return evenly spaced points midway between the boundaries of a track, from the start on: [T, 2] m."""
+    """Return evenly spaced points midway between the boundaries of a track: [T, 2] m.
+
+    Args:
+        track: the track; the points begin at its start.
+        spacing: m, approximate distance of two points.
+    """
     middle = track.middle(STEP)
-    middle = np.roll(
-        middle, -int(((middle - np.array(track.start[:2])) ** 2).sum(1).argmin()), axis=0
-    )
-    return resample(middle, spacing)
+    nearest = ((middle - np.array(track.start[:2])) ** 2).sum(1).argmin()
+    return resample(np.roll(middle, -int(nearest), axis=0), spacing)
 
 
 @dataclass(frozen=True)
 class Laps:
-    """Duration and length of L completed laps, [L] each."""
+    """Duration and length of L completed laps.
+
+    Attributes:
+        seconds: [L] s, durations.
+        metres: [L] m, lengths.
+    """
 
     seconds: Array
     metres: Array
 
 
 def laps(poses: Array, seconds: Array) -> Laps:
-    """Return the laps of a drive with poses [N, 3] m, m, radians at times [N] s.
+    """Return the laps of a drive.
 
     A lap ends where the drive crosses, forwards, the line across its start.
+
+    Args:
+        poses: [N, 3], m, m and radians.
+        seconds: [N] s, their times.
     """
     x, y, heading = poses[0]
-    forward = (
-        (poses[:, 0] - x) * np.cos(heading) + (poses[:, 1] - y) * np.sin(heading) - LINE_OFFSET
-    )
-    sideways = (poses[:, 1] - y) * np.cos(heading) - (poses[:, 0] - x) * np.sin(heading)
+    east, north = poses[:, 0] - x, poses[:, 1] - y
+    forward = east * np.cos(heading) + north * np.sin(heading) - LINE_OFFSET
+    sideways = north * np.cos(heading) - east * np.sin(heading)
     travelled = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T))])
-    before = np.flatnonzero(
-        (forward[:-1] <= 0) & (forward[1:] > 0) & (np.abs(sideways[1:]) < LINE_HALF_WIDTH)
-    )
+    crosses = (forward[:-1] <= 0) & (forward[1:] > 0) & (np.abs(sideways[1:]) < LINE_HALF_WIDTH)
+    before = np.flatnonzero(crosses)
     share = forward[before] / (forward[before] - forward[before + 1])
     time, way = (
         values[before] + share * (values[before + 1] - values[before])
@@ -175,11 +233,10 @@ def _centre_line() -> tuple[Array, Array]:
     # With a straight of this length the three arcs close the lap.
     straight = 4 * RADIUS * np.sin(RIGHT_TURN / 2)
     left_turn = np.pi + RIGHT_TURN / 2
-    half, left, right = (
-        (straight / 2, 0.0),
-        (RADIUS * left_turn, 1 / RADIUS),
-        (RADIUS * RIGHT_TURN, -1 / RADIUS),
-    )
+    # Length and curvature of each piece.
+    half = (straight / 2, 0.0)
+    left = (RADIUS * left_turn, 1 / RADIUS)
+    right = (RADIUS * RIGHT_TURN, -1 / RADIUS)
     pieces = [half, left, right, left, half]
     ends = np.cumsum([length for length, _ in pieces])
     # Steps are evaluated at their midpoints: then the length of each bend is exact to a fraction of
@@ -188,9 +245,8 @@ def _centre_line() -> tuple[Array, Array]:
     midpoints = (np.arange(steps) + 0.5) * ends[-1] / steps
     curvature = np.array([curvature for _, curvature in pieces])[np.searchsorted(ends, midpoints)]
     heading = np.cumsum(curvature) * ends[-1] / steps
-    position = (
-        np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * ends[-1] / steps
-    )
+    directions = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    position = np.cumsum(directions, axis=0) * ends[-1] / steps
     # Spread the rounding error that keeps the lap open.
     position -= np.outer(np.linspace(0, 1, steps), position[-1])
     return position, np.stack([-np.sin(heading), np.cos(heading)], axis=1)
@@ -198,9 +254,5 @@ def _centre_line() -> tuple[Array, Array]:
 
 def _stack_padded(tables: Sequence[Tensor], padding: float) -> Tensor:
     """Stack tables [D, any] to [D, T, most]."""
-    return (
-        pad_sequence([table.T for table in tables], padding_value=padding)
-        .permute(2, 1, 0)
-        .float()
-        .contiguous()
-    )
+    stacked = pad_sequence([table.T for table in tables], padding_value=padding)
+    return stacked.permute(2, 1, 0).float().contiguous()

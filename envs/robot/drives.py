@@ -1,4 +1,4 @@
-"""Drives of simulated robots: scripted drives with the true cone of each range, and recordings of drives as MCAP.
+"""Drives of simulated robots: scripted ones with the truth about each range, and recordings.
 
 In a recording, a scan is stamped with the time of its first measurement and logged at the time of
 its last one. As with rplidar_ros, the first measurement is the last range of the message (see
@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -47,19 +47,33 @@ MAX_RANGE_ERROR = 0.03  # m, a range with a greater error is an outlier
 
 @dataclass(frozen=True, eq=False)
 class SimulatedDrive:
-    """T scans of a drive with their ground truth."""
+    """T scans of a drive with their ground truth.
+
+    Attributes:
+        name: of the drive.
+        track: on which the robot drove.
+        sides: the sides of the track that have cones.
+        seconds: [T] s, start of each scan.
+        angles: radians, bearings of the beams, [P], or [T, P] if each scan has its own.
+        ranges: [T, P] m, infinite without a return.
+        hit: [T, P], index of the cone of each range, -1 for none.
+        poses: [3, T, P], sensor pose at the time of each beam (m, m, radians), NaN for padding.
+        cones: [2, M] m, centres.
+        radius: [M] m, of the cones.
+        visibility: [T, M], share of a cone's beams that no nearer cone blocks; 0 for a cone without
+            beams.
+    """
 
     name: str
     track: Track
-    sides: Sides  # of the track with cones
-    seconds: Tensor  # [T] start of each scan
-    angles: Tensor  # [P] radians, bearings of the beams, or [T, P] if each scan has its own
-    ranges: Tensor  # [T, P] m, infinite without a return
-    hit: Tensor  # [T, P] index of the cone of each range, -1 for none
-    poses: Tensor  # [3, T, P] sensor pose at the time of each beam (m, m, radians), NaN for padding
-    cones: Tensor  # [2, M] m, centres
-    radius: Tensor  # [M] m, of the cones
-    # [T, M] share of a cone's beams that no nearer cone blocks; 0 for a cone without beams
+    sides: Sides
+    seconds: Tensor
+    angles: Tensor
+    ranges: Tensor
+    hit: Tensor
+    poses: Tensor
+    cones: Tensor
+    radius: Tensor
     visibility: Tensor
 
     @property
@@ -69,71 +83,117 @@ class SimulatedDrive:
 
 
 def simulated_drive(sides: Sides, seed: int, lidar: SimulatedLidar | None = None) -> SimulatedDrive:
-    """Simulate a lap along the centre line of `robot_track()` with cones on one side or both.
+    """Simulate a lap along the centre line of `robot_track()`.
 
-    The seed is that of the noise and the sway. By default the LiDAR is an RPLIDAR A1M8.
+    Args:
+        sides: of the track with cones, "left", "right" or "both"; else a `ValueError`.
+        seed: of the noise and of the sway.
+        lidar: the sensor; None for an RPLIDAR A1M8.
     """
     check_choice(("left", "right", "both"), sides=sides)
     track, lidar = robot_track(), lidar or SimulatedLidar()
     generator = torch.Generator().manual_seed(seed)
     line = torch.from_numpy(middle_line(track, SPEED / lidar.rate))
-    waves, phase = torch.rand(2, generator=generator, dtype=torch.float64)
-    # The closed line, displaced sideways by a sine.
-    along = line.roll(-1, 0) - line.roll(1, 0)
-    across = torch.stack([-along[:, 1], along[:, 0]], 1) / along.norm(dim=1, keepdim=True)
-    periods = torch.linspace(0, 3 + 5 * float(waves), len(line), dtype=line.dtype) + float(phase)
-    path = line + SWAY * (2 * torch.pi * periods).sin().unsqueeze(1) * across
-    # One scan for each step of the path: poses at the time of each beam.
-    way = path[1:] - path[:-1]
-    heading = torch.atan2(way[:, 1], way[:, 0])
-    turn = torch.remainder(heading[1:] - heading[:-1] + torch.pi, 2 * torch.pi) - torch.pi
-    position = path[:-2, :, None] + way[:-1, :, None] * lidar.phase
-    bearing = (heading[:-1, None] + turn[:, None] * lidar.phase).unsqueeze(1)
-    poses = torch.cat([position, bearing], 1).transpose(0, 1).float()
+    poses = _poses_along(_swaying(line, generator), lidar.phase)
     cones, radius = cones_of(track, left=sides != "right", right=sides != "left")
     true, hit = cast_beams(poses, lidar.angles, cones, radius)
     ranges, outlier = lidar.measure(true, generator)
-    seconds = torch.arange(len(ranges), dtype=torch.float64) / lidar.rate
-    visibility = _visibility(poses, lidar.angles, cones, radius, hit)
-    hit = torch.where(outlier, -1, hit)
-    name = f"{sides}_{seed}"
     return SimulatedDrive(
-        name, track, sides, seconds, lidar.angles, ranges, hit, poses, cones, radius, visibility
+        name=f"{sides}_{seed}",
+        track=track,
+        sides=sides,
+        seconds=torch.arange(len(ranges), dtype=torch.float64) / lidar.rate,
+        angles=lidar.angles,
+        ranges=ranges,
+        hit=torch.where(outlier, -1, hit),
+        poses=poses,
+        cones=cones,
+        radius=radius,
+        visibility=_visibility(poses, lidar.angles, cones, radius, hit),
     )
+
+
+def _swaying(line: Tensor, generator: torch.Generator) -> Tensor:
+    """Displace a closed line [T, 2] m sideways by a sine of random phase and frequency."""
+    waves, phase = torch.rand(2, generator=generator, dtype=torch.float64)
+    along = line.roll(-1, 0) - line.roll(1, 0)
+    across = torch.stack([-along[:, 1], along[:, 0]], 1) / along.norm(dim=1, keepdim=True)
+    periods = torch.linspace(0, 3 + 5 * float(waves), len(line), dtype=line.dtype) + float(phase)
+    return line + SWAY * (2 * torch.pi * periods).sin().unsqueeze(1) * across
+
+
+def _poses_along(path: Tensor, phase: Tensor) -> Tensor:
+    """Return the pose of the sensor at the time of each beam, one scan for each step of a path.
+
+    Args:
+        path: [T + 2, 2] m, the position at the start of each scan.
+        phase: [P], time of each beam as a share of its scan.
+
+    Returns:
+        Poses [3, T, P] (m, m, radians).
+    """
+    way = path[1:] - path[:-1]
+    heading = torch.atan2(way[:, 1], way[:, 0])
+    turn = torch.remainder(heading[1:] - heading[:-1] + torch.pi, 2 * torch.pi) - torch.pi
+    position = path[:-2, :, None] + way[:-1, :, None] * phase
+    bearing = (heading[:-1, None] + turn[:, None] * phase).unsqueeze(1)
+    return torch.cat([position, bearing], 1).transpose(0, 1).float()
 
 
 def labelled_drive(recording: Recording) -> SimulatedDrive:
-    """Return a recorded drive, simulated or real, with the ground truth that follows from its odometry and track.
+    """Return a recorded drive, simulated or real, with its ground truth.
 
-    The last scan is left out, as the pose at its end is unknown. A recording without a track,
-    odometry or a second scan is a `RecordingError`.
+    The truth follows from its odometry and its track. The last scan is left out, as the pose at its
+    end is unknown.
+
+    Args:
+        recording: with odometry, a track in its metadata and at least two scans, else a
+            `RecordingError`.
     """
     path, scans = recording.path, recording.ranges
     if "track" not in recording.notes or recording.odometry is None or len(scans) < 2:
-        record = "a metadata record named track (left and right, each [[x, y], ...] m in the frame of the odometry)"
-        needed = f"{record}, odometry, and at least two scans"
-        raise RecordingError(f"{path} lacks the positions of its cones: it needs {needed}.")
+        raise RecordingError(
+            f"{path} lacks the positions of its cones: it needs a metadata record named track "
+            "(left and right, each [[x, y], ...] m in the frame of the odometry), odometry, and "
+            "at least two scans."
+        )
     track = track_of(recording)
     starts = torch.from_numpy(recording.poses()).float().t().unsqueeze(-1)
     angles = torch.from_numpy(recording.angles(slice(-1))).float()
-    # The time of each range as a share of its scan, NaN for padding; the scanner turns clockwise.
-    beam, points = np.arange(scans.shape[1]), recording.points[:-1, None]
-    order = np.where(recording.angle_increment[:-1, None] > 0, points - 1 - beam, beam)
-    phase = torch.from_numpy(np.where(beam < points, order / np.maximum(points, 1), np.nan)).float()
-    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * phase
+    poses = starts[:, :-1] + (starts[:, 1:] - starts[:, :-1]) * _phase_of(recording)
     cones, radius = cones_of(track)
     true, hit = cast_beams(poses, angles, cones, radius)
     ranges = torch.from_numpy(scans[:-1])
-    seconds = torch.from_numpy(recording.seconds[:-1])
-    visibility = _visibility(poses, angles, cones, radius, hit)
-    hit = torch.where(ranges.isfinite() & ((ranges - true).abs() > MAX_RANGE_ERROR), -1, hit)
+    outlier = ranges.isfinite() & ((ranges - true).abs() > MAX_RANGE_ERROR)
     return SimulatedDrive(
-        path.stem, track, "both", seconds, angles, ranges, hit, poses, cones, radius, visibility
+        name=path.stem,
+        track=track,
+        sides="both",
+        seconds=torch.from_numpy(recording.seconds[:-1]),
+        angles=angles,
+        ranges=ranges,
+        hit=torch.where(outlier, -1, hit),
+        poses=poses,
+        cones=cones,
+        radius=radius,
+        visibility=_visibility(poses, angles, cones, radius, hit),
     )
 
 
+def _phase_of(recording: Recording) -> Tensor:
+    """Return the time of each range as a share of its scan, without the last scan: [T - 1, P].
+
+    It is NaN for padding. The scanner turns clockwise, so ascending bearings are measured last to
+    first.
+    """
+    beam, points = np.arange(recording.ranges.shape[1]), recording.points[:-1, None]
+    order = np.where(recording.angle_increment[:-1, None] > 0, points - 1 - beam, beam)
+    phase = np.where(beam < points, order / np.maximum(points, 1), np.nan)
+    return torch.from_numpy(phase).float()
+
+
 def track_of(recording: Recording) -> Track:
-    """Return the track in a recording's metadata; raises a `RecordingError` if there is none, or it is not valid."""
+    """Return the track in a recording's metadata; without a valid one, raise a `RecordingError`."""
     try:
         return noted_track(recording.notes.get("track", {}))
     except TrackError as error:
@@ -141,7 +201,12 @@ def track_of(recording: Recording) -> Track:
 
 
 def save_drive(drive: SimulatedDrive, path: Path) -> None:
-    """Write the scans and the odometry of a drive as MCAP; the track is noted for a drive past both sides."""
+    """Write the scans and the odometry of a drive as MCAP.
+
+    Args:
+        drive: the drive; its track is noted in the metadata if it has cones on both sides.
+        path: of the file, which is replaced if it exists.
+    """
     rate = float(1 / drive.seconds[1])
     notes = _notes({"drive": drive.name}, drive.track if drive.sides == "both" else None)
     _write(path, rate, drive.angles, drive.ranges, drive.poses[..., -1].t(), None, notes)
@@ -150,14 +215,21 @@ def save_drive(drive: SimulatedDrive, path: Path) -> None:
 def record_labelling_drives(
     folder: Path, pairs: int = 5, both: int = 3, tick: Callable[[], Any] | None = None
 ) -> dict[Sides, list[str]]:
-    """Record drives to train a cone classifier, `pairs` past each side, and `both` drives past both sides to test it.
+    """Record drives to train a cone classifier, and drives to test it.
 
-    The result is the paths by side: `left_0.mcap`, `right_0.mcap`, `both_100.mcap`. `tick` is
-    called after each drive.
+    Args:
+        folder: for the files `left_0.mcap`, `right_0.mcap`, `both_100.mcap`, ...
+        pairs: number of drives past the left side, and past the right side, to train.
+        both: number of drives past both sides, to test.
+        tick: called after each drive.
+
+    Returns:
+        The paths by side.
     """
     paths: dict[Sides, list[str]] = {"left": [], "right": [], "both": []}
     for sides, files in paths.items():
-        for seed in range(TEST_SEED, TEST_SEED + both) if sides == "both" else range(pairs):
+        seeds = range(TEST_SEED, TEST_SEED + both) if sides == "both" else range(pairs)
+        for seed in seeds:
             files.append(os.path.join(folder, f"{sides}_{seed}.mcap"))
             save_drive(simulated_drive(sides, seed), files[-1])
             if tick is not None:
@@ -173,11 +245,19 @@ def record_drives(
     about: Mapping[str, str] | None = None,
     tick: Callable[[], Any] | None = None,
 ) -> None:
-    """Run a policy on B simulated robots for an episode; write `/scan`, `/odom` and `/cmd_vel` of each robot as MCAP.
+    """Run a policy on B simulated robots for an episode, and record each robot as MCAP.
 
-    The env is a `SimulatedRobotEnv` with or without transforms. The policy acts deterministically.
-    The entries of `about`, such as the name of the policy, are noted in each file. `tick` is called
-    after every step. Another kind of env, or another number of paths, is a `ValueError`.
+    A file has the topics `/scan`, `/odom` and `/cmd_vel`.
+
+    Args:
+        env: a `SimulatedRobotEnv` with or without transforms.
+        policy: acts deterministically.
+        paths: B files, one for each robot.
+        about: entries, such as the name of the policy, that are noted in each file.
+        tick: called after every step.
+
+    Raises:
+        ValueError: for another kind of env, or another number of paths.
     """
     base = env.base_env if isinstance(env, TransformedEnv) else env
     if not isinstance(base, SimulatedRobotEnv):
@@ -187,45 +267,67 @@ def record_drives(
     robots = env.batch_size[0]
     if len(paths) != robots:
         raise ValueError(f"{len(paths)} paths for {robots} robots; give one file for each")
+    steps = _run_episode(env, base, policy, tick)
+    speed = base.step_length * base.lidar.rate
+    turn_rate = (steps.action * base.max_steering).sin() * (speed / base.car_length)
+    commands = torch.stack([torch.full_like(turn_rate, speed), turn_rate], -1)
+    for robot, path in enumerate(paths):
+        own = steps.running[:, robot]
+        # The last scan ends at the second last pose; then the last command is executed.
+        poses = torch.cat([steps.start[own, robot], steps.end[own, robot][-2:]])
+        track = base.tracks[int(base.track[robot])]
+        notes = _notes({"drive": "closed loop", **(about or {})}, track)
+        scans = steps.scan[own, robot]
+        _write(path, base.lidar.rate, base.lidar.angles, scans, poses, commands[own, robot], notes)
+
+
+class _Steps(NamedTuple):
+    """Steps of B robots, [B, ...] for one step or [T, B, ...] for all of an episode.
+
+    Attributes:
+        running: whether the episode of the robot was not over yet.
+        scan: [P] m, the scan to which the robot reacted.
+        start: [3], pose at the start of this scan.
+        action: the action that reached the robot.
+        end: [3], pose after the step.
+    """
+
+    running: Tensor
+    scan: Tensor
+    start: Tensor
+    action: Tensor
+    end: Tensor
+
+
+def _run_episode(
+    env: EnvBase,
+    base: SimulatedRobotEnv,
+    policy: TensorDictModuleBase,
+    tick: Callable[[], Any] | None,
+) -> _Steps:
+    """Run a policy until the episodes of all robots of `base`, which is inside `env`, are over."""
     state = env.eval().reset()
-    track = base.track
     start = state["info", "pose"]
-    rows: list[tuple[Tensor, Tensor, Tensor, Tensor, Tensor]] = []
-    running = torch.ones(robots, dtype=torch.bool)
+    steps: list[_Steps] = []
+    running = torch.ones(env.batch_size[0], dtype=torch.bool)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         while running.any():
             scan, pose = base.scan, state["info", "pose"]
             step = env.step(policy(state))
+            after = step["next"]
             # The action that reached the robot: a transform may have changed the policy's.
-            rows.append(
-                (
-                    running,
-                    scan,
-                    start,
-                    step["next", "steering"].squeeze(-1),
-                    step["next", "info", "pose"],
-                )
-            )
+            action = after["steering"].squeeze(-1)
+            steps.append(_Steps(running, scan, start, action, after["info", "pose"]))
             # The robot stands during the first scan, so the second one starts at the same pose.
-            start, running = pose, running & ~step["next", "done"].squeeze(-1)
+            start, running = pose, running & ~after["done"].squeeze(-1)
             state = step_mdp(step)
             if tick is not None:
                 tick()
-    rows_of, scans, starts, actions, ends = (
-        torch.stack(column) for column in zip(*rows, strict=True)
-    )
-    speed = base.step_length * base.lidar.rate
-    turn_rate = (actions * base.max_steering).sin() * (speed / base.car_length)
-    for robot, path in enumerate(paths):
-        own = rows_of[:, robot]
-        commands = torch.stack([torch.full_like(turn_rate, speed), turn_rate], -1)[own, robot]
-        # The last scan ends at the second last pose; then the last command is executed.
-        poses = torch.cat([starts[own, robot], ends[own, robot][-2:]])
-        notes = _notes({"drive": "closed loop", **(about or {})}, base.tracks[int(track[robot])])
-        _write(path, base.lidar.rate, base.lidar.angles, scans[own, robot], poses, commands, notes)
+    return _Steps(*(torch.stack(column) for column in zip(*steps, strict=True)))
 
 
 def _notes(drive: Mapping[str, str], track: Track | None) -> dict[str, dict[str, str]]:
+    """Return the metadata records of a simulated drive, with its track unless it is None."""
     notes = {SIMULATED: {"sensor": "simulated RPLIDAR A1M8", **drive}}
     return notes if track is None else notes | {"track": track_notes(track)}
 
@@ -239,7 +341,17 @@ def _write(
     commands: Tensor | None,
     notes: Mapping[str, Mapping[str, str]],
 ) -> None:
-    """Write scans [T, P] m, the poses at their starts and after [T or more, 3], and the commands after them [T, 2]."""
+    """Write a recording of a simulated robot.
+
+    Args:
+        path: of the file.
+        rate: scans per second.
+        angles: [P] radians, bearings of the beams.
+        ranges: [T, P] m, the scans.
+        poses: [T or more, 3], at the start of each scan and after it (m, m, radians).
+        commands: [T, 2] m/s and radians/s, after each scan; None for none.
+        notes: metadata records by name.
+    """
     times = [round(scan / rate * 1e9) for scan in range(max(len(ranges) + 1, len(poses)))]
     beams, angle_min = len(angles), float(angles[0])
     increment = 2 * math.pi / beams
@@ -255,12 +367,10 @@ def _write(
     with RecordingWriter(path) as writer:
         for name, entries in notes.items():
             writer.describe(name, entries)
-        for index, (start, end, scan) in enumerate(
-            zip(times, times[1:], ranges.numpy(), strict=False)
-        ):
-            writer.add(
-                "/scan", SCAN, end, {"header": header(start, "laser"), "ranges": scan, **scanner}
-            )
+        for index, scan in enumerate(ranges.numpy()):
+            start, end = times[index], times[index + 1]
+            fields = {"header": header(start, "laser"), "ranges": scan, **scanner}
+            writer.add("/scan", SCAN, end, fields)
             if commands is not None:
                 writer.add("/cmd_vel", TWIST, end, twist(*commands[index].tolist()))
         for time, (x, y, heading) in zip(times, poses.tolist(), strict=False):
@@ -273,10 +383,19 @@ def _write(
 def _visibility(
     poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor, hit: Tensor
 ) -> Tensor:
-    """Return the share of the beams towards each cone that hit it [T, M]; `hit` [T, P] is the cone of each beam."""
-    alone = [
-        cast_beams(poses, angles, cones[:, [m]], radius[[m]])[0].isfinite().sum(-1)
-        for m in range(len(radius))
-    ]
-    hits = torch.stack([(hit == m).sum(-1) for m in range(len(radius))], -1)
-    return hits / torch.stack(alone, -1).clamp(min=1)
+    """Return the share of the beams towards each cone that hit it, [T, M].
+
+    Args:
+        poses: [3, T, P], sensor pose at the time of each beam.
+        angles: radians, bearings of the beams, [P] or [T, P].
+        cones: [2, M] m, centres.
+        radius: [M] m.
+        hit: [T, P], index of the cone that each beam hit, -1 for none.
+    """
+    hits, alone = [], []
+    for m in range(len(radius)):
+        hits.append((hit == m).sum(-1))
+        # The beams that would hit the cone if there were no other one.
+        distance, _ = cast_beams(poses, angles, cones[:, [m]], radius[[m]])
+        alone.append(distance.isfinite().sum(-1))
+    return torch.stack(hits, -1) / torch.stack(alone, -1).clamp(min=1)

@@ -1,4 +1,4 @@
-"""Simulation of the paper's robot (section 4.2): a small car with a LiDAR between thin and thick cones.
+"""Simulation of the paper's robot (section 4.2): a small car with a LiDAR between cones.
 
 It drives at 0.15 m/s, takes one action per LiDAR scan, and perceives cones from its scans alone:
 cones hide one another, are misclassified or missed. The entries have the keys and the scale of the
@@ -43,25 +43,40 @@ FINISH_RADIUS = 0.15  # m, covers the width between the cones
 class SimulatedRobotEnv(SeededEnv):
     """Simulated robots on tracks between cones, independent of one another.
 
-    Reads `action` [B, 1], the steering angle as a fraction of 80 degrees. Writes the entries of
+    Reads `action` [B, 1], the steering angle as a fraction of `max_steering`. Writes the entries of
     `ConeTrackEnv`: `observation` [B, 20], `cones` [B, 2, K, 2] in the scale of the cone world,
     `cone_count` [B, 2], `steering` [B, 1], `reward`, `done`, `terminated`, `truncated` [B, 1], and
     under `info` the same entries in the robot's own metres, and `valid` [B, 2], whether each side
     is valid in this scan. The reward is that of the cone world without the term for new cones, as
     the robot cannot distinguish new cones from known ones. A robot crashes if its outline touches a
     cone or its centre reaches a boundary. All state is in buffers; `scan` [B, P] m is the last
-    scan, infinite without a return. A value outside its range is a `ValueError`.
+    scan, infinite without a return.
 
     Args:
-        tracks: in the robot's own metres; None for `robot_track()`.
-        num_envs: B.
-        starts, assignment, spline, smoothing, reward, laps, time_limit, max_steering: as in
-            `ConeTrackEnv`.
-        perception: None for `Perception` with the shipped classifier.
-        lidar: None for an RPLIDAR A1M8; one control step per scan.
-        speed: m/s.
-        car_length: L in m; by default a seventh of the cone world's car.
-        seed: of the LiDAR's noise and the draw of tracks.
+        tracks: in the robot's own metres, at least one; None for `robot_track()`.
+        num_envs: B, the number of robots.
+        starts: number of places where an episode may begin; place i is on track i mod len(tracks),
+            and those of a track are spread along its middle. A lap that begins there counts as
+            driven from the finish at full speed. None for the starts of the tracks.
+        assignment: "random" draws a place at each reset; with `starts` it also draws at the first
+            reset how much of `time_limit` is over, so that the episodes do not end together.
+            "cyclic" keeps robot i on place i mod places.
+        perception: from scans to cones; None for `Perception` with the shipped classifier.
+        lidar: the sensor, with one control step per scan; None for an RPLIDAR A1M8.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
+            parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3 in the scale of the cone world.
+        reward: weights by the names of `RewardWeights`; the others, or all with None, are those of
+            the paper.
+        laps: completed laps that end an episode.
+        time_limit: s, after which an episode is truncated.
+        speed: m/s, constant.
+        car_length: m, distance between the axles; by default a seventh of the cone world's car.
+        max_steering: degrees of an action of 1, at most 90.
+        seed: of the LiDAR's noise and the draw of places.
+
+    Raises:
+        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import SimulatedRobotEnv
@@ -106,27 +121,27 @@ class SimulatedRobotEnv(SeededEnv):
         self.laps, self.max_steps = laps, round(time_limit * self.rate)
         self.step_length, self.car_length = speed / self.rate, car_length
         self.max_steering = math.radians(max_steering)
-        self.weights = {
-            key: torch.tensor(float(x))
-            for key, x in RewardWeights(**(reward or {}))._asdict().items()
-        }
+        weights = RewardWeights(**(reward or {}))._asdict()
+        self.weights = {key: torch.tensor(float(weight)) for key, weight in weights.items()}
         sight = self.perception.range_max * self.perception.scale
         self.memory = BoundaryMemory(num_envs, spline, smoothing, sight=sight)
         self.generator = torch.Generator()
         self.course = RobotCourse(self.tracks)
         index, poses, driven = map(torch.as_tensor, places(self.tracks, starts))
-        self.start_track, self.start_pose, self.staggered = (
-            index,
-            poses.T.float(),
-            starts is not None,
-        )
-        self.start_lap = (
-            torch.where(driven.isnan(), NEVER, -driven / self.step_length).round().long()
-        )
-        self.finish = torch.tensor(
-            np.stack([track.finish for track in self.tracks], axis=1)
-        ).float()
-        self.place: Tensor = nn.Buffer(torch.arange(num_envs) % len(index))
+        self.start_track, self.start_pose = index, poses.T.float()
+        self.staggered = starts is not None
+        # A negative step: the one at which a robot at full speed would have been at the finish.
+        start_lap = torch.where(driven.isnan(), NEVER, -driven / self.step_length)
+        self.start_lap = start_lap.round().long()
+        finish = np.stack([track.finish for track in self.tracks], axis=1)
+        self.finish = torch.tensor(finish).float()
+        self._register_state(num_envs)
+        declare_specs(self, self._reset())
+        self.set_seed(seed)
+
+    def _register_state(self, num_envs: int) -> None:
+        """Register all state that is not in the memory of the boundaries as buffers."""
+        self.place: Tensor = nn.Buffer(torch.arange(num_envs) % len(self.start_track))
         self.track: Tensor = nn.Buffer(self.start_track[self.place])
         self.pose: Tensor = nn.Buffer(torch.zeros(3, num_envs))
         self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, num_envs))
@@ -135,8 +150,6 @@ class SimulatedRobotEnv(SeededEnv):
         self.lap_start: Tensor = nn.Buffer(torch.full((num_envs,), NEVER))
         self.in_finish: Tensor = nn.Buffer(torch.zeros(num_envs, dtype=torch.bool))
         self.scan: Tensor = nn.Buffer(torch.full((num_envs, self.lidar.beams), torch.inf))
-        declare_specs(self, self._reset())
-        self.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
@@ -154,8 +167,6 @@ class SimulatedRobotEnv(SeededEnv):
             "track": self.start_track[place],
             "pose": self.start_pose[:, place],
             "steps": steps,
-        }
-        start |= {
             "lap_start": steps + self.start_lap[place],
             "history": torch.zeros(()),
             "lap": torch.tensor(0),
@@ -182,39 +193,52 @@ class SimulatedRobotEnv(SeededEnv):
         roughness = (action - recent_mean(self.history)).abs()
         self.history = torch.cat([action.unsqueeze(0), self.history[:-1]])
         self.steps = self.steps + 1
-        # Move along an arc by the bicycle model (equations 99-100), and measure a scan on the way.
-        turn, phase = (
-            (action * self.max_steering).sin() * (self.step_length / self.car_length),
-            self.lidar.phase,
-        )
-        poses = move_along_arc(
-            self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase
-        )
-        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
-        self.scan = self._measure(poses)
+        self._move(action)
         view = self._perceive()
 
         lap_time, finished = self._count_laps()
         clearance, to_boundaries = self.course.clearance(self.track, self.pose)
         crashed = clearance <= 0
-        no_cone, alive = torch.zeros_like(action), (~crashed).float()
         outcome = Outcome(
-            action, roughness, lap_time, finished, no_cone, to_boundaries, crashed, alive
+            action=action,
+            roughness=roughness,
+            lap_time=lap_time,
+            finished=finished,
+            discovered=torch.zeros_like(action),
+            to_boundaries=to_boundaries,
+            crashed=crashed,
+            alive=(~crashed).float(),
         )
         terms = weighted_terms(outcome, self.weights)
         completed = (self.lap >= self.laps) & ~crashed
         terminated = crashed | completed
         truncated = (self.steps >= self.max_steps) & ~terminated
-        flags = {"crashed": crashed, "completed": completed}
         out = self._tensordict(
-            view, terms, lap_time=lap_time, **flags, clearance=clearance, smoothness=roughness
+            view,
+            terms,
+            lap_time=lap_time,
+            crashed=crashed,
+            completed=completed,
+            clearance=clearance,
+            smoothness=roughness,
         )
         out["reward"] = reduce(torch.add, terms.values()).unsqueeze(-1)
         out["terminated"], out["truncated"] = terminated.unsqueeze(-1), truncated.unsqueeze(-1)
         out["done"] = (terminated | truncated).unsqueeze(-1)
         return out
 
+    def _move(self, action: Tensor) -> None:
+        """Move along an arc by the bicycle model (equations 99-100), and scan on the way."""
+        turn = (action * self.max_steering).sin() * (self.step_length / self.car_length)
+        phase = self.lidar.phase
+        poses = move_along_arc(
+            self.pose.unsqueeze(-1), self.step_length * phase, turn.unsqueeze(-1) * phase
+        )
+        self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
+        self.scan = self._measure(poses)
+
     def _measure(self, poses: Tensor) -> Tensor:
+        """Return a scan [B, P] m, measured at a pose for each beam, [3, B, P]."""
         true, _ = cast_beams(
             poses,
             self.lidar.angles,
@@ -224,17 +248,17 @@ class SimulatedRobotEnv(SeededEnv):
         return self.lidar.measure(true, self.generator)[0]
 
     def _perceive(self) -> dict[str, Tensor]:
-        """Return the cones in the last scan, and the observation with the memory updated by them."""
-        cones, count = (
-            torch.from_numpy(x)
-            for x in self.perception(self.scan.numpy(), self.lidar.angles.numpy())
-        )
-        cones = cones.float()
+        """Update the memory with the last scan; return the entries that come from it."""
+        found, number = self.perception(self.scan.numpy(), self.lidar.angles.numpy())
+        cones, count = torch.from_numpy(found).float(), torch.from_numpy(number)
         observation, valid = self.memory(cones, count)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 
     def _count_laps(self) -> tuple[Tensor, Tensor]:
-        """Count laps; return the lap time in s [B], 0 without a completed lap, and whether one was completed [B]."""
+        """Count laps; return lap time and whether a lap was completed, [B] each.
+
+        The lap time is in s, 0 unless a lap was completed.
+        """
         inside = self._inside()
         entered = inside & ~self.in_finish
         finished = entered & (self.lap_start > NEVER)
@@ -250,17 +274,19 @@ class SimulatedRobotEnv(SeededEnv):
     def _tensordict(
         self, view: dict[str, Tensor], terms: dict[str, Tensor], **values: Tensor
     ) -> TensorDict:
+        """Put the entries of a reset or a step together.
+
+        Args:
+            view: the entries that come from the scan.
+            terms: terms of the reward, [B] each.
+            values: other entries of `info`, [B] each.
+        """
         columns = {"track": self.track, "lap": self.lap, **values}
         reward = {key: value.unsqueeze(-1) for key, value in terms.items()}
         info: dict[str, Any] = {key: value.unsqueeze(-1) for key, value in columns.items()}
-        info |= {
-            "pose": self.pose.t(),
-            "valid": view["valid"],
-            "reward": TensorDict(reward, self.batch_size),
-        }
+        info["pose"], info["valid"] = self.pose.t(), view["valid"]
+        info["reward"] = TensorDict(reward, self.batch_size)
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}
-        entries |= {
-            "steering": self.history[0].unsqueeze(-1),
-            "info": TensorDict(info, self.batch_size),
-        }
+        entries["steering"] = self.history[0].unsqueeze(-1)
+        entries["info"] = TensorDict(info, self.batch_size)
         return TensorDict(entries, self.batch_size, device=self.device)

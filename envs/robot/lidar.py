@@ -1,4 +1,4 @@
-"""Simulated LiDAR: the distance along each beam of a rotating, moving sensor to the nearest of several upright cones.
+"""Simulated LiDAR: the distance along each beam of a rotating, moving sensor to the nearest cone.
 
 The defaults are those of an RPLIDAR A1M8 (360 points per scan, 5.5 scans per second). A cone is a
 disc in the plane of the beams. A nearer cone hides a farther one, and the robot moves during a
@@ -19,44 +19,65 @@ RANGE_MAX = 12.0  # m, maximum range
 
 @dataclass(eq=False)
 class SimulatedLidar:
-    """Range measurements with the noise of an RPLIDAR A1M8; raises a `ValueError` for a value outside its range."""
+    """Range measurements with the noise of an RPLIDAR A1M8.
 
-    beams: int = 360  # P, points per scan
-    rate: float = 5.5  # scans per second
-    noise: float = 0.0007  # m, standard deviation of a range at distance 0
-    noise_growth: float = (
-        0.001  # 1/m, increase of the standard deviation per square metre of distance
-    )
-    quantum: float = 0.00025  # m, resolution of the ranges
-    no_return: float = 0.02  # share of beams without a return
-    outliers: float = 0.005  # share of beams with a random range
+    Args:
+        beams: P, points per scan.
+        rate: scans per second.
+        noise: m, standard deviation of a range at distance 0.
+        noise_growth: 1/m, increase of the standard deviation per square metre of distance.
+        quantum: m, resolution of the ranges.
+        no_return: share of beams without a return, from 0 to 1.
+        outliers: share of beams with a random range, from 0 to 1.
+
+    Raises:
+        ValueError: for a value outside its range.
+
+    Attributes:
+        angles: [P] radians, bearings of the beams, ascending.
+        phase: [P], time of each beam as a share of the scan.
+    """
+
+    beams: int = 360
+    rate: float = 5.5
+    noise: float = 0.0007
+    noise_growth: float = 0.001
+    quantum: float = 0.00025
+    no_return: float = 0.02
+    outliers: float = 0.005
 
     def __post_init__(self) -> None:
         check_range(0, above=True, beams=self.beams, rate=self.rate, quantum=self.quantum)
         check_range(0, noise=self.noise, noise_growth=self.noise_growth)
         if min(self.no_return, self.outliers) < 0 or self.no_return + self.outliers > 1:
             raise ValueError(
-                f"no_return={self.no_return} and outliers={self.outliers} must be shares of all beams"
+                f"no_return={self.no_return} and outliers={self.outliers} must be shares of all "
+                "beams"
             )
         beams = self.beams
         # As in rplidar_ros, a scan starts and ends behind the robot. The sensor turns clockwise but
         # bearings ascend, so the last beam is measured first.
-        self.angles = (
-            torch.arange(1, beams + 1, dtype=torch.float64) * (2 * math.pi / beams) - math.pi
-        ).float()
-        # Time of each beam as a share of the scan.
+        steps = torch.arange(1, beams + 1, dtype=torch.float64)
+        self.angles = (steps * (2 * math.pi / beams) - math.pi).float()
         self.phase = torch.arange(beams - 1, -1, -1) / beams
 
     def measure(self, true: Tensor, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Return noisy ranges [B, P] m of true distances, infinite without a return; and which are outliers [B, P].
+        """Measure distances with noise.
 
-        The number of random draws does not depend on the distances, which are infinite for no cone.
+        The number of random draws does not depend on the distances.
+
+        Args:
+            true: the true distances, [B, P] m, infinite for no cone.
+            generator: of the noise.
+
+        Returns:
+            The measured ranges [B, P] m, infinite without a return, and which of them are outliers
+            [B, P].
         """
         noise = torch.randn(true.shape, generator=generator)
         chance, uniform = torch.rand(2, *true.shape, generator=generator)
-        ranges = true + noise * (
-            self.noise + self.noise_growth * true.clamp(max=RANGE_MAX).square()
-        )
+        deviation = self.noise + self.noise_growth * true.clamp(max=RANGE_MAX).square()
+        ranges = true + noise * deviation
         outlier = chance < self.outliers
         ranges = torch.where(outlier, RANGE_MIN + (RANGE_MAX - RANGE_MIN) * uniform, ranges)
         ranges = (ranges / self.quantum).round() * self.quantum
@@ -67,15 +88,17 @@ class SimulatedLidar:
 def cast_beams(
     poses: Tensor, angles: Tensor, cones: Tensor, radius: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the true distance along each beam to the first surface [B, P] m, and the index of the cone it hits [B, P].
-
-    Without a cone the distance is infinite and the index -1.
+    """Return the true distance along each beam to the first surface, and the cone that it hits.
 
     Args:
         poses: [3, B, P] (m, m, radians), sensor pose at the time of each beam.
         angles: [P] radians, bearings of the beams, or [B, P] if each sensor has its own.
         cones: centres, [2, M] m, or [2, B, M] if each sensor has its own.
-        radius: [M] or [B, M] m.
+        radius: of the cones, [M] or [B, M] m.
+
+    Returns:
+        The distance [B, P] m, infinite without a cone, and the index of the cone [B, P], -1 without
+        one.
     """
     direction = poses[2] + angles
     cos, sin = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
@@ -92,7 +115,13 @@ def cast_beams(
 
 
 def move_along_arc(pose: Tensor, distance: Tensor, turn: Tensor) -> Tensor:
-    """Return the pose [3, *batch] (m, m, radians) after an arc of a length in m and a change of heading in radians."""
+    """Return poses after arcs, [3, *batch] (m, m, radians).
+
+    Args:
+        pose: before the arcs, [3, *batch].
+        distance: length of each arc, m.
+        turn: change of heading along each arc, radians.
+    """
     x, y, heading = pose
     # The chord of an arc is shorter than the arc by sin(h) / h, h half the turn.
     chord = distance * torch.sinc(turn / (2 * math.pi))

@@ -1,4 +1,8 @@
-"""Perception of the robot (paper 4.2, A.3): from LiDAR scans to thin and thick cones, and to the observation."""
+"""Perception of the robot (paper 4.2, A.3): from LiDAR scans to cones, and to the observation.
+
+The points of a scan are clustered, and a classifier tells thin cones, thick cones and other things
+apart by three features of a cluster. The same code perceives simulated and recorded scans.
+"""
 
 import json
 import math
@@ -23,9 +27,8 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 SCANS_PER_BATCH = 512  # keeps the points in the cache
-MIN_DISTANCE = (
-    0.5  # m, least plausible distance of a boundary sample, in the scale of the cone world
-)
+# m, least plausible distance of a boundary sample, in the scale of the cone world.
+MIN_DISTANCE = 0.5
 MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of view
 
 
@@ -33,18 +36,27 @@ MAX_DISTANCE = 1.1  # greatest plausible distance, as a multiple of the range of
 class ConeClassifier:
     """Support vector machines that tell thin cones, thick cones and other clusters apart.
 
-    The kernel is radial, on standardised features. `coil_rl.robot` trains the machines with
-    scikit-learn; the decision in NumPy is many times faster for a few clusters. F features are
-    standardised by `mean` and `scale` [F] and compared with the support vectors [S, F] by the
-    kernel exp(-gamma |a - b|^2). The `weights` [2, S] and the `intercept` [2] of the two machines
-    turn the kernel into decision values: the first is positive for thick cones and negative for
-    thin ones; the second is negative for clusters unlike those of the training. Shapes that do not
-    match, a value that is not finite, and a `scale` or `gamma` that is not positive are a
-    `ValueError`.
+    `coil_rl.robot` trains the machines with scikit-learn; the decision in NumPy is many times
+    faster for a few clusters. The kernel is radial, exp(-gamma |a - b|^2), on standardised
+    features. Of the two decision values, the first is positive for thick cones and negative for
+    thin ones; the second is negative for clusters unlike those of the training.
+
+    Args:
+        mean: [F], of the features.
+        scale: [F], standard deviation of the features, positive.
+        support: [S, F], support vectors, standardised.
+        weights: [2, S], of the support vectors in the decision values.
+        intercept: [2], of the decision values.
+        gamma: of the kernel, positive.
+
+    Raises:
+        ValueError: for shapes that do not match, a value that is not finite, and a `scale` or
+            `gamma` that is not positive.
 
     Example:
         >>> from coil_rl.envs import simulated_cone_classifier
-        >>> simulated_cone_classifier().classify([[0.035, 0.01, 0.04], [0.085, 0.03, 0.10], [0.6, 0.1, 0.7]])
+        >>> thin, thick, wall = [0.035, 0.01, 0.04], [0.085, 0.03, 0.10], [0.6, 0.1, 0.7]
+        >>> simulated_cone_classifier().classify([thin, thick, wall])
         array([ 0,  1, -1])
     """
 
@@ -74,60 +86,72 @@ class ConeClassifier:
 
     def decision(self, features: NDArray[np.floating]) -> Array:
         """Return the decision values of both machines [C, 2] for features [C, F]."""
-        x = (
-            np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean)) - self.mean
-        ) / self.scale
-        squared_distance = (
-            (x * x).sum(1)[:, None]
-            + (self.support * self.support).sum(1)
-            - 2 * (x @ self.support.T)
-        )
-        return np.asarray(
-            np.exp(-self.gamma * squared_distance) @ self.weights.T + self.intercept,
-            dtype=np.float64,
-        )
+        rows = np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean))
+        x = (rows - self.mean) / self.scale
+        squares = (x * x).sum(1)[:, None] + (self.support * self.support).sum(1)
+        kernel = np.exp(-self.gamma * (squares - 2 * (x @ self.support.T)))
+        return np.asarray(kernel @ self.weights.T + self.intercept, dtype=np.float64)
 
     def classify(self, features: NDArray[np.floating]) -> Integers:
-        """Return the class of each cluster: 0 for a thin cone, 1 for a thick one, -1 for no cone; [C, F] to [C]."""
+        """Return the class of each cluster: 0 for a thin cone, 1 for a thick one, -1 for no cone.
+
+        Args:
+            features: [C, F].
+
+        Returns:
+            The classes, [C].
+        """
         thick, known = self.decision(features).T
         return np.where(known < 0, -1, thick > 0)
 
 
 def simulated_cone_classifier() -> ConeClassifier:
     """Return the shipped classifier, trained on simulated scans (`SimulatedLidar`)."""
-    text = (resources.files("coil_rl.envs.robot") / "simulated_cones.json").read_text(
-        encoding="utf-8"
-    )
-    return ConeClassifier(**json.loads(text))
+    file = resources.files("coil_rl.envs.robot") / "simulated_cones.json"
+    return ConeClassifier(**json.loads(file.read_text(encoding="utf-8")))
 
 
 @dataclass(eq=False)
 class Perception:
-    """Cones in view from LiDAR scans: cluster the points, classify the clusters, keep the cones in range.
+    """Cones in view from LiDAR scans.
 
-    Thin cones mark the left side of the track, thick cones the right side. A cone is at the mean of
-    its points. A value outside its range is a `ValueError`.
+    It clusters the points, classifies the clusters and keeps the cones in range. Thin cones mark
+    the left side of the track, thick cones the right side. A cone is at the mean of its points.
+
+    Args:
+        classifier: tells thin cones, thick cones and other clusters apart.
+        range_min: m, smaller ranges are no return.
+        range_max: m, range of view.
+        bearing_max: degrees to either side of the heading, at most 180.
+        scale: factor from the robot's metres to those of the cone world.
+        laser_yaw: degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise.
+        margin: m, points this far beyond `range_max` are clustered too, so that cones there are
+            complete.
+        gap: m, points closer than this are linked.
+        kept_cones: K, the nearest cones kept per side.
+
+    Raises:
+        ValueError: for a value outside its range.
 
     Example:
         >>> from coil_rl.envs import Perception, simulated_cone_classifier
-        >>> ranges = np.full((1, 360), np.inf)
+        >>> ranges, angles = np.full((1, 360), np.inf), np.radians(np.arange(360) - 180)
         >>> ranges[0, 200:204] = 0.5
-        >>> cones, count = Perception(simulated_cone_classifier())(ranges, np.radians(np.arange(360) - 180))
+        >>> cones, count = Perception(simulated_cone_classifier())(ranges, angles)
         >>> cones.shape, count
         ((1, 2, 16, 2), array([[1, 0]]))
     """
 
-    classifier: ConeClassifier  # tells thin cones, thick cones and other clusters apart
+    classifier: ConeClassifier
     _: KW_ONLY
-    range_min: float = 0.15  # m, smaller ranges are no return
-    range_max: float = 1.0  # m, range of view
-    bearing_max: float = 60.0  # degrees to either side of the heading
-    scale: float = 7.0  # factor from the robot's metres to those of the cone world
-    laser_yaw: float = 0.0  # degrees, bearing of the LiDAR's 0 in the car's frame, anticlockwise
-    # m, points this far beyond `range_max` are clustered too, so that cones there are complete
+    range_min: float = 0.15
+    range_max: float = 1.0
+    bearing_max: float = 60.0
+    scale: float = 7.0
+    laser_yaw: float = 0.0
     margin: float = 0.15
-    gap: float = GAP  # m, points closer than this are linked
-    kept_cones: int = 16  # K, the nearest cones kept per side
+    gap: float = GAP
+    kept_cones: int = 16
 
     def __post_init__(self) -> None:
         check_range(
@@ -140,7 +164,8 @@ class Perception:
         )
         if not 0 < self.range_min < self.range_max:
             raise ValueError(
-                f"range_min={self.range_min} must be above 0, the code for no return, and below range_max"
+                f"range_min={self.range_min} must be above 0, the code for no return, and below "
+                "range_max"
             )
         check_range(0, margin=self.margin)
         check_range(0, 180, above=True, bearing_max=self.bearing_max)
@@ -149,21 +174,32 @@ class Perception:
     def __call__(
         self, ranges: NDArray[np.floating], angles: NDArray[np.floating]
     ) -> tuple[Array, Integers]:
-        """Return the cones in view of scans [N, P] m, whose beams have the bearings [P] radians in the LiDAR's frame.
+        """Return the cones in view of scans.
+
+        Args:
+            ranges: [N, P] m, the scans.
+            angles: [P] radians, bearings of the beams in the LiDAR's frame.
 
         Returns:
             Cones [N, 2, K, 2] m times `scale` in the car's frame (x forward, y left), left side
             first, nearest first, padded with zeros; and their number [N, 2].
         """
         ranges = np.asarray(ranges)
-        starts = range(0, len(ranges) or 1, SCANS_PER_BATCH)
-        cones, count = zip(
-            *(self._cones(ranges[i : i + SCANS_PER_BATCH], angles) for i in starts), strict=True
-        )
-        return np.concatenate(cones), np.concatenate(count)
+        cones, counts = [], []
+        for start in range(0, len(ranges) or 1, SCANS_PER_BATCH):
+            found, count = self._cones(ranges[start : start + SCANS_PER_BATCH], angles)
+            cones.append(found)
+            counts.append(count)
+        return np.concatenate(cones), np.concatenate(counts)
 
     def clusters(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> Clusters:
-        """Return all clusters of at least two points, in the car's frame, unscaled; arguments as in `points_of`."""
+        """Return all clusters of at least two points, in the car's frame, unscaled.
+
+        Args:
+            ranges: [N, P] m, the scans.
+            angles: radians, bearings of the beams in the LiDAR's frame, [P] or, where each scan has
+                its own, [N, P].
+        """
         bearings = np.asarray(angles, dtype=np.float64) + math.radians(self.laser_yaw)
         points = points_of(ranges, bearings, self.range_min, self.range_max + self.margin)
         return measure(points, single_linkage(points, self.gap))
@@ -171,12 +207,16 @@ class Perception:
     def in_sight(self, clusters: Clusters) -> NDArray[np.bool_]:
         """Return whether the centroid of each cluster is in range and bearing, [C]."""
         x, y = clusters.centroid.T
-        return (np.hypot(x, y) <= self.range_max) & (
-            np.abs(np.arctan2(y, x)) <= math.radians(self.bearing_max)
-        )
+        near = np.hypot(x, y) <= self.range_max
+        return near & (np.abs(np.arctan2(y, x)) <= math.radians(self.bearing_max))
 
     def rejected(self, ranges: NDArray[np.floating], angles: NDArray[np.floating]) -> float:
-        """Return the share of the clusters in sight that are no cones, 0 without any; arguments as in `points_of`."""
+        """Return the share of the clusters in sight that are no cones, 0 without any.
+
+        Args:
+            ranges: [N, P] m, the scans.
+            angles: radians, bearings of the beams in the LiDAR's frame, [P] or [N, P].
+        """
         clusters = self.clusters(ranges, angles)
         kinds = self.classifier.classify(clusters.features[self.in_sight(clusters)])
         return float((kinds < 0).mean()) if len(kinds) else 0.0
@@ -196,19 +236,23 @@ class Perception:
         near = rank < self.kept_cones
         cones = np.zeros((2 * len(ranges), self.kept_cones, 2))
         cones[row[near], rank[near]] = position[near] * self.scale
-        return cones.reshape(-1, 2, self.kept_cones, 2), np.minimum(count, self.kept_cones).reshape(
-            -1, 2
-        )
+        kept = np.minimum(count, self.kept_cones)
+        return cones.reshape(-1, 2, self.kept_cones, 2), kept.reshape(-1, 2)
 
 
 class BoundaryMemory(nn.Module):
-    """The observation of a robot without a pose: the boundaries in view, or the last valid ones (paper A.3).
+    """The observation of a robot without a pose: the boundaries in view (paper A.3).
 
     A side is valid if it has at least two cones and each of the five boundary samples is at a
     plausible distance. Errors of perception last several scans, as a cone stays in the shadow of
-    another one; an invalid side keeps its last valid numbers. The state is in buffers of B rows,
-    the `batch`. `spline` and `smoothing` are those of the boundary estimate, as in `ConeTrackEnv`;
-    `sight` is the range of view in m in the scale of the cone world.
+    another one; an invalid side keeps its last valid numbers. The state is in buffers.
+
+    Args:
+        batch: B, number of robots.
+        spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
+            parabola).
+        smoothing: lambda of the cubic smoothing spline, m^3.
+        sight: m in the scale of the cone world, range of view.
     """
 
     def __init__(
@@ -225,15 +269,23 @@ class BoundaryMemory(nn.Module):
         self.ever_valid: Tensor = nn.Buffer(torch.zeros(2, batch))
 
     def forward(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Update the memory with the cones in view and their number, as `Perception` returns them.
+        """Update the memory with the cones in view.
 
-        Returns the observation [B, 20], zeros for a side that was never valid, and which sides are
-        valid now [B, 2].
+        Args:
+            cones: [B, 2, K, 2] m, as `Perception` returns them.
+            count: [B, 2], their number.
+
+        Returns:
+            The observation [B, 20], zeros for a side that was never valid, and which sides are
+            valid now [B, 2].
         """
         return self.remember(*self.estimate(cones, count))
 
     def estimate(self, cones: Tensor, count: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the boundary samples [2, 5, 2, B] m of cones, and which sides are valid [2, B], without the memory."""
+        """Return the boundary samples [2, 5, 2, B] m of cones, and which sides are valid [2, B].
+
+        The memory does not take part; the arguments are those of `forward`.
+        """
         samples = self.fit(cones.permute(3, 2, 1, 0), count.t()).equidistant(SAMPLES)
         distance = samples.square().sum(0).sqrt()
         plausible = (distance >= MIN_DISTANCE) & (distance <= self.sight * MAX_DISTANCE)
@@ -252,7 +304,12 @@ class BoundaryMemory(nn.Module):
 
 
 def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
-    """Set the specs of a simulated or replayed robot from an example of the entries of its reset."""
+    """Set the specs of a simulated or replayed robot.
+
+    Args:
+        env: the env.
+        example: the entries of its reset.
+    """
     batch, device = env.batch_size, env.device
     spec = make_composite_from_td(example, unsqueeze_null_shapes=False)
     for key in ("observation", "steering"):
@@ -261,6 +318,5 @@ def declare_specs(env: EnvBase, example: TensorDictBase) -> None:
     env.action_spec = Bounded(-1, 1, (*batch, 1), device=device, dtype=torch.float32)
     env.reward_spec = Unbounded((*batch, 1), device=device, dtype=torch.float32)
     flag = Binary(1, shape=(*batch, 1), dtype=torch.bool, device=device)
-    env.done_spec = Composite(
-        dict.fromkeys(("done", "terminated", "truncated"), flag), shape=batch, device=device
-    )
+    ends = dict.fromkeys(("done", "terminated", "truncated"), flag)
+    env.done_spec = Composite(ends, shape=batch, device=device)
