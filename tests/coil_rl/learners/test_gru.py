@@ -164,7 +164,7 @@ def test_update_sees_the_log_probabilities_and_states_of_the_rollout(action, opt
     )
     rows = learner.prepare(batch, 0.0)
     order = torch.randperm(len(rows))
-    steps = learner.remember(rows[order])
+    steps = learner.sampler.remember(rows[order])
     expected = batch[order].reshape(-1)["action_log_prob"]
     assert expected.std() > 0.1
     torch.testing.assert_close(learner.head.get_dist(steps).log_prob(steps["action"]), expected)
