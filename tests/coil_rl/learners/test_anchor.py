@@ -142,7 +142,7 @@ def test_sac_starts_at_the_guide_and_its_policy_waits_for_the_critics():
 @pytest.mark.parametrize(
     ("weight", "advised_acts"), [(1.0, True), (0.6, True), (0.4, False), (0.0, False)]
 )
-def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_than_the_weighted_range(
+def test_dqn_takes_the_advised_option_unless_it_is_worse_by_more_than_the_weighted_range(
     weight, advised_acts
 ):
     env = advised(
@@ -166,7 +166,7 @@ def results(*returns, failures=(0, 0, 0, 0, 0)):
 
 
 def first_results(*returns):
-    """Return results with two guides, the policy of its own, and opposites of the guides that are worse than that."""
+    """Return results of two guides, the policy of its own, and worse opposites of the guides."""
     return results(*returns, *[[value - 1 for value in returns[2]]] * 2)
 
 
@@ -182,7 +182,9 @@ def brake(anchor):
 
 def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(anchor):
     anchor.begin(
-        first_results([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]), anchor.head
+        first_results([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]),
+        torch.tensor([0.0, 1, 2]),
+        anchor.head,
     )
     assert anchor.active
     assert anchor.head.weight.tolist() == [0, 1]
@@ -191,7 +193,9 @@ def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(a
 
 def test_opposite_of_the_worst_guide_holds_if_it_is_the_best_and_lets_go_like_a_guide(anchor):
     bad = [-20.0, -20, -20]
-    compared = results(bad, bad, [0.0, 0, 0], [5.0, 6, 7], [100.0, 100, 100], failures=(9, 9, 9, 9, 1))
+    compared = results(
+        bad, bad, [0.0, 0, 0], [5.0, 6, 7], [100.0, 100, 100], failures=(9, 9, 9, 9, 1)
+    )
     anchor.begin(compared, torch.zeros(3), anchor.head)
     assert anchor.head.weight.tolist() == [0, -1]
     assert (anchor.weight, anchor.best_returns.tolist(), anchor.guide_failures) == (1, [100] * 3, 1)
@@ -231,7 +235,7 @@ def begun(anchor, weight=1.0):
     return anchor
 
 
-def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_the_tolerance_of_its_steps(
+def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_its_tolerances(
     anchor,
 ):
     assert torch.stack(begun(anchor).candidates()).tolist() == [[1, 0], pytest.approx([0.7, 0])]
@@ -281,7 +285,7 @@ def test_policy_goes_back_after_a_loss_of_more_than_three_tolerances(anchor, los
 
 @pytest.mark.parametrize(("errors", "goes_back"), [(1.99, False), (2.01, True)])
 def test_policy_goes_back_after_a_loss_of_more_than_two_standard_errors(anchor, errors, goes_back):
-    """The losses in three cases are m - d, m and m + d; the standard error of their mean m is d over root 3."""
+    """Losses m - d, m, m + d in three cases: the standard error of their mean is d / root 3."""
     begun(anchor)
     spread = 30.0
     mean = errors * spread / 3**0.5
@@ -343,7 +347,9 @@ def test_update_does_not_depend_on_the_unit_of_the_reward(kind):
         torch.manual_seed(0)
         trained = learner(env, kind)
         best = [unit * 2, unit * 2]
-        anchored(trained).begin(results(best, [0.0, 0], [-unit, -unit]), torch.zeros(2), trained.policy)
+        anchored(trained).begin(
+            results(best, [0.0, 0], [-unit, -unit]), torch.zeros(2), trained.policy
+        )
         assert anchored(trained).reward_scale == 2 * unit
         batch = Rollout(env, trained.policy, 8, trained.keys).collect()
         batch["next", "reward"] = torch.sin(torch.arange(64.0)).view(8, 8, 1) * unit
@@ -361,7 +367,7 @@ def test_state_brings_back_the_weight_and_the_brake():
     assert anchored(second).weight == anchor.weight == pytest.approx(0.75)
     torch.testing.assert_close(anchored(second).state_dict(), anchor.state_dict())
     anchored(second).decide(results([0.0, 0, 0], [0.0, 0, 0]), second.policy)
-    assert anchored(second).weight == pytest.approx(0.8), "the policy of the best check-up is in the state"
+    assert anchored(second).weight == pytest.approx(0.8), "the best policy is in the state"
 
 
 def test_anchor_without_advice_or_out_of_range_is_refused():

@@ -1,4 +1,4 @@
-"""Policies with a memory: they solve what needs one, and train, resume and are evaluated as any other."""
+"""Policies with a memory solve what needs one, and train, resume and are evaluated as any other."""
 
 import copy
 import shutil
@@ -63,7 +63,7 @@ TINY = [
 
 
 class Recall(SeededEnv):
-    """B rows whose first observation is -1 or 1, later ones are 0; after 5 steps the sign is the right action (0, 1).
+    """B rows whose first observation is -1 or 1; after 5 steps of 0 the sign is the right action.
 
     The reward is 1 or -1 in the last step, else 0.
     """
