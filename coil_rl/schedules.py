@@ -12,17 +12,25 @@ Schedule = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Linear:
-    """Linear interpolation between two values; raises a `ValueError` if `since` or `until` is out of range.
+    """Linear interpolation between two values.
+
+    A value of `since` or `until` that is out of range is a `ValueError`.
+
+    Args:
+        start: value up to progress `since`.
+        end: value from progress `until` on.
+        until: progress at which `end` is reached, in (0, 1].
+        since: progress up to which the value is `start`, in [0, until]; with both equal it jumps.
 
     Example:
         >>> Linear(1.0, 0.0)(0.25)
         0.75
     """
 
-    start: float  # value up to progress `since`
-    end: float  # value from progress `until` on
-    until: float = 1.0  # progress at which `end` is reached, in (0, 1]
-    since: float = 0.0  # in [0, until]; with both equal the value jumps
+    start: float
+    end: float
+    until: float = 1.0
+    since: float = 0.0
 
     def __post_init__(self) -> None:
         if not 0 < self.until <= 1:

@@ -1,4 +1,4 @@
-"""Advantages of actions, from the rewards that followed them and the critic's values of the states."""
+"""Advantages of actions, from the rewards after them and the critic's values of the states."""
 
 import torch
 from tensordict import TensorDictBase
@@ -30,7 +30,7 @@ class Advantages:
 
     @torch.no_grad()
     def __call__(self, batch: TensorDictBase) -> TensorDictBase:
-        """Write `advantage` and `value_target` [B, T, 1] into a batch [B, T] of consecutive steps."""
+        """Write `advantage` and `value_target` [B, T, 1] into a batch [B, T] of rollouts."""
         after = batch["next"]
         value, last = self._values(batch), self._values(after[..., -1:])
         next_value = torch.cat([value[..., 1:, :], last], -2)

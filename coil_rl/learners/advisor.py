@@ -1,4 +1,4 @@
-"""ADVISOR (Weihs et al. 2021): PPO where imitation of the guide cannot work, imitation where it can.
+"""ADVISOR (Weihs et al. 2021): PPO where imitation of the guide cannot work, else imitation.
 
 An auxiliary policy pi_aux with the agent's observation learns by imitation only. Where it cannot
 predict the guide's action g, the guide knows something that the agent does not see, and the agent
@@ -136,7 +136,11 @@ class Advisor(PPO):
         return [*super().parameter_groups(), [*self.imitator.parameters()]]
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of `PPO` with the weighted `loss_objective`, `loss_imitation`, and the mean `weight`."""
+        """Return the losses of `PPO` with another `loss_objective`, `loss_imitation`, and `weight`.
+
+        `loss_objective` is the weighted sum of both losses, `weight` the mean of w, and
+        `loss_imitation` the loss of the auxiliary policy.
+        """
         losses = super().losses(minibatch)
         predicted = self.imitation.each(self.imitator, minibatch)
         weight = (-self.alpha * self.distance(minibatch, predicted.detach())).exp()

@@ -13,9 +13,9 @@ the first policy does the opposite, and |w| falls.
 
 Falling too far breaks the policy, and any update may, so there is a brake. At a few check-ups over
 the run the policy is evaluated deterministically in fixed cases, with its present weight and with
-one that is lower by a margin. If the present one has become worse, the policy is rolled back to that
-of the best check-up. Else the weight falls, if the lower one fails in no further case: by a step,
-which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
+one that is lower by a margin. If the present one has become worse, the policy is rolled back to
+that of the best check-up. Else the weight falls, if the lower one fails in no further case: by a
+step, which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
 
 The parts are `AnchoredHead` in the policy, `AnchoredUpdate` in the updates, and `Brake` between
 them; `Anchor` has the numbers that a user chooses.
@@ -96,7 +96,7 @@ class AnchoredValues(AnchoredHead):
         super().__init__(nn.Identity(), nn.Identity(), guides, device)
 
     def forward(self, advice: Tensor, *inputs: Tensor) -> Tensor:
-        """Return values [*batch, n] with the bonus; the advice is one-hot, [*batch, n_guides, n]."""
+        """Return values [*batch, n] with the bonus; advice is one-hot, [*batch, n_guides, n]."""
         (values,) = inputs
         span = values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)
         return values + (self.weight @ advice.to(self.weight.dtype)).to(values.dtype) * (span + TIE)
@@ -274,16 +274,19 @@ class AnchoredUpdate(Stateful, Extension):
         self.head.weight.copy_(self.weights_of_guides(value))
 
     def weights_of_guides(self, value: float) -> Tensor:
-        """Return the weights of all guides, [n_guides], with a value for that of the anchor, or its opposite."""
+        """Return the weights of all guides, [n_guides]: a value for the anchor's, 0 for others."""
         return self.first_candidates()[self.guide] * (self.sign * value)
 
     def first_candidates(self) -> list[Tensor]:
-        """Return the weights, [n_guides] each, to compare before training: each guide, none, each opposite."""
+        """Return the weights, [n_guides] each, to compare before training.
+
+        They are for each guide alone, for none, and for the opposite of each guide.
+        """
         guides = torch.eye(len(self.head.weight), device=self.head.weight.device)
         return [*guides, guides[0] * 0, *-guides]
 
     def candidates(self) -> list[Tensor]:
-        """Return the two weights of a check-up, [n_guides] each: the present one, and the lower one."""
+        """Return the two weights of a check-up, [n_guides] each: the present and the lower one."""
         lower = max(self.weight - self.anchor.margin, 0.0)
         return [self.weights_of_guides(self.weight), self.weights_of_guides(lower)]
 
@@ -316,7 +319,7 @@ class AnchoredUpdate(Stateful, Extension):
         self.tolerance = max(self.anchor.tolerance * guide_return, chance)
 
     def decide(self, results: CaseResults, policy: nn.Module) -> bool:
-        """Lower the weight of the guide, or keep it, or roll the policy back to that of the best check-up.
+        """Lower the weight of the guide, keep it, or roll the policy back to the best check-up.
 
         Args:
             results: with the weights of `candidates`.
@@ -339,7 +342,7 @@ class AnchoredUpdate(Stateful, Extension):
         return False
 
     def _has_become_worse(self, results: CaseResults) -> bool:
-        """Return whether the policy with the present weight fails more often, or has lost too much."""
+        """Return whether the policy with the present weight fails more often or lost too much."""
         if results.failures[0] > self.guide_failures:
             return True
         error = float(standard_error(self.best_returns - results.returns[0]))
@@ -347,7 +350,7 @@ class AnchoredUpdate(Stateful, Extension):
         return results.mean_return(0) < float(self.best_returns.mean()) - accepted
 
     def _may_fall(self, results: CaseResults) -> bool:
-        """Return whether the lower weight fails in no further case, and loses next to nothing for each step."""
+        """Return whether the lower weight fails in no further case and loses next to nothing."""
         steps = self.anchor.margin / self.anchor.step if self.anchor.step else 1.0
         accepted = results.mean_return(0) - steps * self.tolerance
         return results.failures[1] <= results.failures[0] and results.mean_return(1) >= accepted
@@ -380,7 +383,7 @@ class Brake:
         self.cases = cases if count is None else cases.take(count)
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether there is a check-up: before training, and evenly over the run while active."""
+        """Return whether there is a check-up: before training, then evenly over the run."""
         if update == 0:
             return True
         looks = self.anchored.anchor.looks
@@ -389,7 +392,7 @@ class Brake:
         }
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Evaluate the candidate weights, decide, and return the numbers of the first two by name."""
+        """Evaluate the candidate weights, decide, and return numbers of the first two by name."""
         rolled_back = False
         if update == 0:
             results = self._evaluate(self.anchored.first_candidates())

@@ -49,7 +49,7 @@ class ClippedLoss(ClipPPOLoss):
 
 @torch.no_grad()
 def explained_variance(target: Tensor, value: Tensor) -> Tensor:
-    """Return the share of the variance of the targets that the values explain; [N, 1] each, result [1]."""
+    """Return the share of the variance of targets [N, 1] that values [N, 1] explain, [1]."""
     unexplained = torch.var(target - value, correction=0, dim=0)
     variance = torch.var(target, correction=0, dim=0) + torch.finfo(target.dtype).eps
     return 1.0 - unexplained / variance
@@ -57,6 +57,6 @@ def explained_variance(target: Tensor, value: Tensor) -> Tensor:
 
 @torch.no_grad()
 def effective_share(log_ratio: Tensor) -> Tensor:
-    """Return the effective sample size as a share of all samples, from their logarithmic weights [N]."""
+    """Return the effective sample size as a share of all N, from logarithmic weights [N]."""
     size = (2 * log_ratio.logsumexp(0) - (2 * log_ratio).logsumexp(0)).exp()
     return size / len(log_ratio)

@@ -1,4 +1,4 @@
-"""Critics of actions as one module, for the policies and losses that compare the values of actions."""
+"""Critics of actions as one module, for policies and losses that compare values of actions."""
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -8,10 +8,11 @@ from torchrl.objectives import REDQLoss, SACLoss
 
 
 class Critics(TensorDictModuleBase):
-    """The critics of a loss of TorchRL, all at once; they read entries that have been normalised already.
+    """The critics of a loss of TorchRL, all at once.
 
-    As a module it writes their uncertainty: the standard deviation of the values of an action, in
-    the unit of the return, as `("next", "uncertainty")` [*B, 1].
+    They read entries that have been normalised already. As a module it writes their uncertainty:
+    the standard deviation of the values of an action, in the unit of the return, as `("next",
+    "uncertainty")` [*B, 1].
 
     Args:
         loss: has the critics.

@@ -63,7 +63,8 @@ class DQN(OffPolicy):
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.run.rollout import Rollout
         >>> from coil_rl.transforms import DiscreteActions
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train"), num_envs=64), DiscreteActions(5))
+        >>> cones = ConeTrackEnv(shipped_tracks("train"), num_envs=64)
+        >>> env = TransformedEnv(cones, DiscreteActions(5))
         >>> dqn = DQN(env, starts=256)
         >>> metrics = dqn.update(Rollout(env, dqn.policy, steps=8, keys=dqn.keys).collect())
     """
@@ -144,7 +145,7 @@ class DQN(OffPolicy):
         self.extend([], self.policy)
 
     def build_policy(self, env: EnvBase) -> TensorDictSequential:
-        """Return the policy: the network, perhaps a bonus for the advised action, the choice, and noise."""
+        """Return the policy: values, perhaps a bonus for the advised action, choice and noise."""
         modules: list[TensorDictModuleBase] = [] if self.normaliser is None else [self.normaliser]
         values, choice = self.network.module
         modules.append(values)

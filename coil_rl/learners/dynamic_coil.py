@@ -1,4 +1,4 @@
-"""Dynamic COIL (paper section 3.3): an agent that observes advice, and guides that learn through the agent.
+"""Dynamic COIL (paper section 3.3): an agent that observes advice, guides that learn through it.
 
 Guides and agent form one differentiable network: the agent observes the actions of the guides. In
 an agent phase the guides are frozen, which is COIL. In a guide phase the agent is frozen and one
@@ -65,7 +65,7 @@ class AfterFrames:
 
 @dataclass(frozen=True)
 class AtConvergence:
-    """Stop rule: a phase ends when consecutive evaluations have not improved on the best one before them.
+    """Stop rule: a phase ends when some evaluations have not improved on the best one before.
 
     An evaluation is the mean reward per step in the batch of one update.
 
@@ -135,7 +135,7 @@ class PhaseSchedule:
         self.phase = self._next()
 
     def advance(self, frames: int, reward: float) -> bool:
-        """Count an update, given the frames and the mean reward of its batch; return whether its phase ends."""
+        """Count an update with these frames and this mean reward; return whether a phase ends."""
         self.frames += frames
         self.rewards.append(reward)
         stop = self.agent_phase if self.phase.agent else self.guide_phase
@@ -255,7 +255,8 @@ class DynamicCoil(PPO):
         parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
         if len({id(parameter) for parameter in parameters}) < len(parameters):
             raise ValueError(
-                "two guides share parameters, so one of them cannot be frozen while the other learns"
+                "two guides share parameters, so one of them cannot be frozen while the other "
+                "learns"
             )
         self.guides: dict[str, TensorDictModuleBase] = dict(guides)
         self.initial = [
@@ -307,7 +308,7 @@ class DynamicCoil(PPO):
         return [self.agent_parameters, list(self.critic.parameters()), *guides]
 
     def learning_rates(self, progress: float) -> list[float]:
-        """Return the learning rates of the parameter groups in this phase, 0 for networks that do not learn."""
+        """Return the learning rates of the parameter groups in this phase; 0: frozen."""
         phase = self.phases.phase
         factor = self.shrink**phase.earlier
         agent, guide = self.learning_rate(progress), self.guide_learning_rate(progress) * factor
@@ -346,7 +347,7 @@ class DynamicCoil(PPO):
 
     @torch.no_grad()
     def moved(self, batch: TensorDictBase) -> dict[str, float]:
-        """Return the mean absolute difference of the action of each guide to that of the initial guide."""
+        """Return the mean absolute change of the action of each guide since the start."""
         distances = {}
         for (name, guide), initial in zip(self.guides.items(), self.initial, strict=True):
             observed = batch.select(*guide.in_keys)

@@ -1,4 +1,7 @@
-"""What a network is made of: how it reads the entries of an env, and its layers. Named in YAML by `learner.network`."""
+"""What a network is made of: how it reads the entries of an env, and its layers.
+
+A YAML file names an architecture by `learner.network`.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,9 +30,10 @@ STATE = "policy_state"  # what an env carries for a network with a memory
 def entry_specs(
     env: EnvBase, in_keys: Sequence[NestedKey], shapes: Shapes | None = None
 ) -> list[TensorSpec]:
-    """Return the specs of entries of an env; those in `shapes`, which the env does not write, are numbers.
+    """Return the specs of entries of an env.
 
-    An entry that it does not have is a `KeyError`.
+    Entries in `shapes`, which the env does not write, are numbers. One that it does not have is a
+    `KeyError`.
     """
     spec, extra = env.observation_spec, shapes or {}
     available = [*spec.keys(True, True), *extra]
@@ -48,9 +52,16 @@ def entry_specs(
 
 
 class ReadEntry(nn.Module):
-    """One entry of an env as a vector of the network's dtype: an index is one-hot, a byte is divided by 255.
+    """One entry of an env as a vector of the network's dtype.
 
-    `width` is the length of the vector.
+    An index becomes one-hot, a byte is divided by 255.
+
+    Args:
+        spec: of the entry.
+        batch_dims: number of batch dimensions of the spec.
+
+    Attributes:
+        width: length of the vector.
     """
 
     def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
@@ -84,7 +95,13 @@ class ReadEntry(nn.Module):
 
 
 class ReadImage(ReadEntry):
-    """An image, [C, H, W], or [H, W, C] if its last dimension is the smallest, as a vector by convolutions."""
+    """An image as a vector by convolutions.
+
+    Args:
+        spec: of the entry, [C, H, W], or [H, W, C] if its last dimension is the smallest.
+        batch_dims: number of batch dimensions of the spec.
+        network: has the convolutions.
+    """
 
     def __init__(self, spec: TensorSpec, batch_dims: int, network: "Cnn") -> None:
         super().__init__(spec, batch_dims)
@@ -108,13 +125,17 @@ class ReadImage(ReadEntry):
 
 
 class ConcatObservations(nn.Module):
-    """Concatenation of entries `in_keys` of an env, each flattened beyond the batch dimensions; `width` is its length.
+    """Concatenation of entries of an env, each flattened beyond the batch dimensions.
 
     Args:
-        env, in_keys: as for `entry_specs`.
+        env: the env, for its specs.
+        in_keys: the entries.
         shapes: shapes of entries that the env does not write, without the batch dimensions.
         network: a `Cnn` reads entries of three dimensions; otherwise they are flattened like
             others.
+
+    Attributes:
+        width: length of the concatenation.
     """
 
     def __init__(
@@ -133,18 +154,18 @@ class ConcatObservations(nn.Module):
                 try:
                     entry = ReadImage(spec, dims, images)
                 except RuntimeError as error:
-                    layers = f"kernels={list(images.kernels)} with strides={list(images.strides)}"
-                    problem = (
-                        f"the image {key} of shape {list(entry.shape)} is too small for {layers}"
-                    )
-                    raise ValueError(f"{problem}; take smaller or fewer ones") from error
+                    raise ValueError(
+                        f"the image {key} of shape {list(entry.shape)} is too small for "
+                        f"kernels={list(images.kernels)} with strides={list(images.strides)}; "
+                        "take smaller or fewer ones"
+                    ) from error
             entries.append(entry)
         self.entries = nn.ModuleList(entries)
         self.width = sum(entry.width for entry in entries)
         if images and not any(isinstance(entry, ReadImage) for entry in entries):
-            needed = f"an image among {', '.join(map(str, in_keys))}, an entry of three dimensions"
             raise ValueError(
-                f"a convolutional network needs {needed}, but there is none; use network=mlp"
+                f"a convolutional network needs an image among {', '.join(map(str, in_keys))}, an "
+                "entry of three dimensions, but there is none; use network=mlp"
             )
 
     def forward(self, *inputs: Tensor) -> Tensor:
@@ -155,16 +176,20 @@ class ConcatObservations(nn.Module):
 
 @dataclass(frozen=True)
 class Mlp:
-    """A network that reads concatenated entries. With tanh its weights are orthogonal, else PyTorch's initial ones.
+    """A network that reads concatenated entries.
 
-    Layers that are empty, or too large for the memory of a typical machine, are a `ValueError`.
+    With tanh its initial weights are orthogonal, else PyTorch's. Layers that are empty, or too
+    large for the memory of a typical machine, are a `ValueError`.
+
+    Args:
+        hidden: widths of the hidden layers.
+        activation: tanh, relu, elu or silu.
+        layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
-    hidden: Sequence[int] = (64, 64)  # widths of the hidden layers
-    activation: str = "tanh"  # or relu, elu, silu
-    layer_norm: bool = field(
-        default=False, kw_only=True
-    )  # of the numbers of a hidden layer, before its activation
+    hidden: Sequence[int] = (64, 64)
+    activation: str = "tanh"
+    layer_norm: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         check_choice(tuple(ACTIVATIONS), activation=self.activation)
@@ -209,12 +234,20 @@ class Cnn(Mlp):
 
     The lists for the convolutions must be as long as each other. When it is built, an entry must be
     an image, and none may be too small; else it raises a `ValueError`.
+
+    Args:
+        hidden: widths of the hidden layers after the convolutions.
+        activation: of all layers: tanh, relu, elu or silu.
+        channels: output channels of each convolution.
+        kernels: width of each convolution.
+        strides: step of each convolution.
+        layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
-    hidden: Sequence[int] = (512,)  # widths of the hidden layers after the convolutions
-    activation: str = "relu"  # of all layers
+    hidden: Sequence[int] = (512,)
+    activation: str = "relu"
     channels: Sequence[int] = (32, 64, 64)
-    kernels: Sequence[int] = (8, 4, 3)  # widths of each convolution
+    kernels: Sequence[int] = (8, 4, 3)
     strides: Sequence[int] = (4, 2, 1)
 
     def __post_init__(self) -> None:
@@ -222,7 +255,8 @@ class Cnn(Mlp):
         lengths = {name: len(getattr(self, name)) for name in ("channels", "kernels", "strides")}
         if len(set(lengths.values())) > 1 or not self.channels:
             raise ValueError(
-                f"channels, kernels and strides must have one number for each convolution, not {lengths}"
+                "channels, kernels and strides must have one number for each convolution, "
+                f"not {lengths}"
             )
         for name in lengths:
             for number in getattr(self, name):
@@ -238,18 +272,25 @@ class Gru(Mlp):
     Critics have no memory of their own: their hidden layers read the entries and the state that the
     policy had before the step.
 
+    Args:
+        hidden: widths of the hidden layers after the GRU.
+        activation: of the hidden layers: tanh, relu, elu or silu.
+        state: width of the state of the GRU.
+        layer_norm: whether the numbers of a hidden layer are normalised before its activation.
+
     Example:
         >>> from torchrl.envs import Compose, TransformedEnv
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.learners import PPO
         >>> gru = Gru(state=32)
-        >>> env = TransformedEnv(ConeTrackEnv(shipped_tracks("train")), Compose(*gru.env_transforms()))
+        >>> cones = ConeTrackEnv(shipped_tracks("train"))
+        >>> env = TransformedEnv(cones, Compose(*gru.env_transforms()))
         >>> PPO(env, network=gru).policy(env.reset())["next", "policy_state"].shape
         torch.Size([64, 1, 32])
     """
 
-    hidden: Sequence[int] = (64,)  # widths of the hidden layers after the GRU
-    state: int = 64  # width of the state of the GRU
+    hidden: Sequence[int] = (64,)
+    state: int = 64
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -261,7 +302,7 @@ class Gru(Mlp):
         return Mlp(self.hidden, self.activation, layer_norm=self.layer_norm)
 
     def env_transforms(self) -> list[Transform]:
-        """Return transforms by which an env marks the starts of episodes and carries the state, as TorchRL expects."""
+        """Return transforms by which an env marks the starts of episodes and carries the state."""
         return [
             InitTracker(),
             TensorDictPrimer({STATE: Unbounded((1, self.state))}, expand_specs=True),
@@ -269,21 +310,25 @@ class Gru(Mlp):
 
 
 def without_memory(network: Mlp, learner: str) -> Mlp:
-    """Return the network of a learner that cannot train a memory; raises a `ValueError` for one that has a memory."""
+    """Return the network of a learner that cannot train a memory; a memory is a `ValueError`."""
     if isinstance(network, Gru):
-        remedy = "take network=mlp, or learner=ppo, a2c or reinforce"
-        raise ValueError(f"{learner} cannot train a network with a memory; {remedy}")
+        raise ValueError(
+            f"{learner} cannot train a network with a memory; "
+            "take network=mlp, or learner=ppo, a2c or reinforce"
+        )
     return network
 
 
 class ObservationNetwork(nn.Module):
-    """A network that reads entries `in_keys` of an env.
+    """A network that reads entries of an env.
 
     Args:
+        env: the env, for its specs.
+        in_keys: the entries.
         network: its architecture.
         outputs: number of its outputs.
         gain: scale of the initial weights of the last layer.
-        shapes: as for `ConcatObservations`.
+        shapes: shapes of entries that the env does not write, without the batch dimensions.
         dtype: of its outputs; PyTorch's default by default, as that of its weights.
     """
 

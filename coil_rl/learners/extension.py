@@ -1,4 +1,4 @@
-"""What is not part of an algorithm but changes its updates: anchors, losses for imitation, statistics."""
+"""What is not part of an algorithm but changes its updates: anchors, statistics, further losses."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,4 +1,4 @@
-"""Steps of an optimiser on the losses of minibatches, one operation after another or as machine code."""
+"""Steps of an optimiser on the losses of minibatches, as they are or as machine code."""
 
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,31 +23,40 @@ class GradientStep(Stateful):
     """One step of Adam on the weighted losses of a minibatch.
 
     Another value of `compile`, or true if the step cannot be compiled, is a `ValueError`.
+
+    Args:
+        losses: returns scalars by name for a minibatch.
+        groups: parameters, grouped by learning rate.
+        modules: hold the tensors that the losses read, besides the parameters.
+        rates: returns the learning rate of each group for the progress of the run.
+        eps: of Adam.
+        max_grad_norm: gradients are scaled down to this norm, over all parameters together.
+        after: is called after each step.
+        compile: whether to compile the step, which changes the last digits; "auto": after the first
+            update with any steps, if the run will have `ENOUGH` steps or more.
+        compilable: whether the step can be compiled.
     """
 
     parts: ClassVar[tuple[str, ...]] = ("adam", "steps", "begun", "compile")
 
-    losses: Callable[[TensorDictBase], TensorDictBase]  # returns scalars by name for a minibatch
-    groups: Sequence[Sequence[nn.Parameter]]  # parameters, grouped by learning rate
-    modules: Sequence[nn.Module]  # hold the tensors that the losses read, besides the parameters
-    rates: Callable[
-        [float], Sequence[float]
-    ]  # learning rates of the groups by the progress of the run
+    losses: Callable[[TensorDictBase], TensorDictBase]
+    groups: Sequence[Sequence[nn.Parameter]]
+    modules: Sequence[nn.Module]
+    rates: Callable[[float], Sequence[float]]
     _: KW_ONLY
-    eps: float  # of Adam
-    max_grad_norm: float  # gradients are scaled down to this norm, over all parameters together
-    after: Callable[[], Any] | None = None  # what follows each step
-    # Whether to compile the step, which changes the last digits; "auto": after the first update
-    # with any, if the run will have 2,000 steps or more.
+    eps: float
+    max_grad_norm: float
+    after: Callable[[], Any] | None = None
     compile: bool | Literal["auto"] = "auto"
-    compilable: bool = True  # whether it can be compiled
+    compilable: bool = True
 
     def __post_init__(self) -> None:
         check_choice(("true", "false", "auto"), compile=str(self.compile).lower())
         self.required = self.compile is True
         if self.required and not self.compilable:
             raise ValueError(
-                "compile=true: this learner's update depends on data in its shapes; take compile=auto"
+                "compile=true: this learner's update depends on data in its shapes; take "
+                "compile=auto"
             )
         self.compile = self.compile if self.compilable else False
         self.parameters = [parameter for group in self.groups for parameter in group]
@@ -62,7 +71,7 @@ class GradientStep(Stateful):
         self.state: list[Tensor] = []  # all tensors that a step reads, besides its minibatch
 
     def begin(self, progress: float) -> None:
-        """Set the learning rates of an update, and decide for "auto" at the second update that takes steps."""
+        """Set the learning rates of an update; decide for "auto" at the second with any steps."""
         for group, rate in zip(self.adam.param_groups, self.rates(progress), strict=True):
             group["lr"] = rate
         if not self.steps:
@@ -71,9 +80,10 @@ class GradientStep(Stateful):
             self.compile = self.steps * (1 - self.begun) / (progress - self.begun) >= ENOUGH
 
     def __call__(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
-        """Take a step on the sum of the losses times `weights`; returns all losses, in the order of `names`.
+        """Take a step on the sum of the losses times `weights`.
 
-        If `compile` is true and there is no C++ compiler, that is a `UserError`.
+        Returns all losses, in the order of `names`. If `compile` is true and there is no C++
+        compiler, that is a `UserError`.
         """
         self.steps += 1
         if self.compile is True:
@@ -123,28 +133,24 @@ class GradientStep(Stateful):
             if parameter not in state:  # as Adam does at the first step
                 moments = {name: torch.zeros_like(parameter) for name in ("exp_avg", "exp_avg_sq")}
                 state[parameter] = {"step": torch.zeros((), device=parameter.device), **moments}
-        tensors = [
-            *self.parameters,
-            *(value for parameter in self.parameters for value in state[parameter].values()),
-        ]
-        tensors += [
-            tensor
-            for module in self.modules
-            for tensor in (*module.parameters(), *module.buffers())
-        ]
+        tensors: list[Tensor] = [*self.parameters]
+        for parameter in self.parameters:
+            tensors += state[parameter].values()
+        for module in self.modules:
+            tensors += [*module.parameters(), *module.buffers()]
         return list({id(tensor): tensor for tensor in tensors}.values())
 
     def _on_tensors(self, numbers: Tensor, *tensors: Tensor) -> list[Tensor]:
-        """Take a step on the entries of a minibatch, for compilation; `tensors` end with those of `_state`."""
+        """Take a step on the entries of a minibatch, for compilation.
+
+        `tensors` are the entries `keys`, then those of `_state`.
+        """
         minibatch = TensorDict(dict(zip(self.keys, tensors, strict=False)), len(tensors[0]))
-        for module in (
-            self.modules
-        ):  # TorchRL's losses keep detached parameters, which would be constants here
+        # TorchRL's losses keep detached parameters, which would be constants here.
+        for module in self.modules:
             module.__dict__.get("_cache", {}).clear()
-        weights, rates = (
-            numbers[: len(self.weighted)].unbind(0),
-            numbers[len(self.weighted) :].unbind(0),
-        )
+        count = len(self.weighted)
+        weights, rates = numbers[:count].unbind(0), numbers[count:].unbind(0)
         losses = self.losses(minibatch)
         self.names = list(losses.keys())
         total = sum(

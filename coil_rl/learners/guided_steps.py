@@ -10,17 +10,21 @@ AGENT_ACTS = "agent_acts"  # entry [*batch, 1]: whether the agent acted in a ste
 
 
 def guide_may_act(env: EnvBase) -> bool:
-    """Return whether a guide acts in some of the steps of an env, which then writes `agent_acts`."""
+    """Return whether a guide acts in some steps of an env, which then writes `agent_acts`."""
     return AGENT_ACTS in env.observation_spec
 
 
 def of_agent(steps: TensorDictBase) -> TensorDictBase:
-    """Return those of some steps [N] in which the agent acted; all without the entry `agent_acts`."""
-    return steps[steps[AGENT_ACTS].squeeze(-1)] if AGENT_ACTS in steps.keys() else steps
+    """Return the steps of [N] in which the agent acted; all without the entry `agent_acts`."""
+    if AGENT_ACTS not in steps:
+        return steps
+    return steps[steps[AGENT_ACTS].squeeze(-1)]
 
 
 class LossesOfAgentSteps:
-    """The losses of a minibatch: those of the policy from the agent's steps, that of the critic from all steps.
+    """The losses of a minibatch in which a guide may have acted.
+
+    Those of the policy are from the agent's steps, that of the critic from all steps.
 
     Args:
         losses: returns the losses of steps [N] by name, with `loss_objective`, `loss_critic` and
@@ -47,6 +51,6 @@ class LossesOfAgentSteps:
     def _without_policy(self, minibatch: TensorDictBase) -> TensorDictBase:
         losses = self.losses(minibatch)
         for name in ("loss_objective", "loss_entropy"):
-            if name in losses.keys():
+            if name in losses:
                 losses[name] = losses[name] * 0
         return losses

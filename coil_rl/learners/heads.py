@@ -1,4 +1,4 @@
-"""Heads of policies: they turn what a network gives into the parameters of a distribution of actions."""
+"""Heads of policies: the parameters of a distribution of actions from what a network gives."""
 
 import math
 
@@ -11,10 +11,12 @@ from coil_rl.learners.encoders import ObservationNetwork
 
 
 class GlobalScaleHead(nn.Module):
-    """Normal distribution with a mean from a network and a standard deviation that is the same in every state.
+    """Normal distribution with a mean from a network, and one standard deviation for all states.
 
-    The network's outputs are the numbers of an action, of shape `event`; `scale` is the initial
-    standard deviation.
+    Args:
+        network: gives the mean of each number of an action.
+        event: shape of an action.
+        scale: initial standard deviation.
     """
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
@@ -31,7 +33,14 @@ class GlobalScaleHead(nn.Module):
 
 
 class GaussianHead(nn.Module):
-    """Normal distribution with mean and standard deviation from a network; an output of 0 gives `scale`."""
+    """Normal distribution with mean and standard deviation from a network.
+
+    Args:
+        network: gives the means of the numbers of an action, then as many outputs that become
+            standard deviations.
+        event: shape of an action.
+        scale: standard deviation where the network gives 0.
+    """
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, scale: float) -> None:
         super().__init__()
@@ -45,10 +54,14 @@ class GaussianHead(nn.Module):
 
 
 class ChoicesHead(nn.Module):
-    """Logits of several choices at once from a network, padded with minus infinity to the longest choice.
+    """Logits of several choices at once from a network.
 
-    The network gives logits for all choices, each of as many as the longest one has. An action has
-    the shape `event`, one index for each choice; so have the `options`, their numbers.
+    They are padded with minus infinity to the longest choice.
+
+    Args:
+        network: gives logits for all choices, of each as many as the longest one has.
+        event: shape of an action, which is one index for each choice.
+        options: number of options of each choice, of shape `event`.
     """
 
     def __init__(self, network: ObservationNetwork, event: torch.Size, options: Tensor) -> None:
@@ -63,9 +76,11 @@ class ChoicesHead(nn.Module):
 
 
 class Choices(Independent):
-    """Distribution of several independent choices, of each by the logits of its options [*batch, *event, n].
+    """Distribution of several independent choices.
 
-    An action, one index for each choice, has `event_dims` dimensions.
+    Args:
+        logits: of the options of each choice, [*batch, *event, n].
+        event_dims: number of dimensions of an action, which is one index for each choice.
     """
 
     def __init__(self, logits: Tensor, event_dims: int) -> None:

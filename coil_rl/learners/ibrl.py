@@ -1,4 +1,4 @@
-"""SAC that chooses between the guide's action and its own: IBRL (Hu et al. 2024), with the variants of PEX and EXPO.
+"""IBRL (Hu et al. 2024): SAC that chooses between the guide's action and its own.
 
 The guide proposes g and the policy b. The executed one has the larger value, the minimum of the
 target critics, and the critics learn from the same choice in the next state, without an entropy
@@ -37,10 +37,11 @@ ADVICE = "guide_action"
 
 
 class IBRL(SAC):
-    """The IBRL learner; the env writes `guide_action` (else a `KeyError`), which the networks need not observe.
+    """The IBRL learner.
 
-    What `SAC` refuses, an option that it does not take, and `edit` for an action without bounds are
-    a `ValueError`.
+    The env writes `guide_action`, else that is a `KeyError`; the networks need not observe it. What
+    `SAC` refuses, an option that it does not take, and `edit` for an action without bounds are a
+    `ValueError`.
 
     Args:
         env: the env, with continuous actions and advice.
@@ -49,7 +50,7 @@ class IBRL(SAC):
             mean value, as in PEX; None: the better one. In evaluation it is always the better one.
         edit: largest change of the guide's action by the third proposal, as a fraction of half the
             range of the action, as in EXPO; 0: there is none.
-        guide: row of the advice.
+        guide: index of the guide in the advice.
         hidden: widths of the hidden layers of all networks, without `network`.
         network: architecture of all networks; None: `Mlp(hidden)`.
         action_scale: initial standard deviation of the policy, before squashing.
@@ -123,7 +124,8 @@ class IBRL(SAC):
             raise ValueError("IBRL compares all critics; leave target_critics and uncertainty out")
         if ADVICE not in env.observation_spec:
             raise KeyError(
-                f"IBRL chooses between actions, but the env has no {ADVICE}; put GuideActions before it"
+                f"IBRL chooses between actions, but the env has no {ADVICE}; "
+                "put GuideActions before it"
             )
         self.choice = partial(Proposals, guide=guide, sharpness=sharpness, edit=edit)
         super().__init__(
@@ -167,10 +169,11 @@ class IBRL(SAC):
         if self.choice.keywords["edit"]:
             if space.bounds is None or not torch.stack(space.bounds).isfinite().all():
                 raise ValueError(
-                    "edit is a fraction of the range of the action, but it has no bounds; take edit=0"
+                    "edit is a fraction of the range of the action, but it has no bounds; "
+                    "take edit=0"
                 )
             editor = self.build_actor(env, [*in_keys, ADVICE], network, anchor=None)
-        loss = ProposalLoss(partial(self.choice, space=space, editor=editor), **arguments)
+        loss = ProposalLoss(partial(self.choice, space=space, editor=editor), arguments)
         loss.target_entropy  # noqa: B018  becomes part of the state at the first access
         return loss
 
@@ -180,12 +183,12 @@ class IBRL(SAC):
         return TensorDictSequential(*before, self.loss.proposals)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return the losses of a minibatch [N] and other values, with the share of the guide in the target."""
+        """Return the losses of a minibatch [N] and other values, such as the `guide_share`."""
         return super().losses(minibatch).set("guide_share", self.loss.guide_share)
 
 
 class Proposals(Critics):
-    """The choice between the actions of the guide, the policy and perhaps an editor; it writes `action`.
+    """The choice between the actions of guide, policy and perhaps an editor; it writes `action`.
 
     Args:
         actor: the policy.
@@ -250,12 +253,14 @@ class Proposals(Critics):
 
 
 class ProposalLoss(SACLoss):
-    """TorchRL's loss of SAC with the target of IBRL, and the loss of the second policy if there is one.
+    """TorchRL's loss of SAC with the target of IBRL, and perhaps the loss of the second policy.
 
-    `choice` makes `Proposals` of a policy and this loss, with the keyword `editor`.
+    Args:
+        choice: makes `Proposals` of a policy and this loss, and has the keyword `editor`.
+        arguments: of TorchRL's loss.
     """
 
-    def __init__(self, choice: partial[Proposals], **arguments: Any) -> None:
+    def __init__(self, choice: partial[Proposals], arguments: dict[str, Any]) -> None:
         super().__init__(**arguments)
         self.make_proposals = partial(choice, arguments["actor_network"])
         self.editor = choice.keywords["editor"]
@@ -278,7 +283,7 @@ class ProposalLoss(SACLoss):
         return target
 
     def actor_loss(self, tensordict: TensorDictBase) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return the loss of the policy, with that of the second one added, and TorchRL's other values."""
+        """Return the loss of the policy plus that of the second one, and TorchRL's other values."""
         loss, values = super().actor_loss(tensordict)
         if self.editor is None:
             return loss, values

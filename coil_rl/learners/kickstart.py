@@ -1,4 +1,4 @@
-"""Kickstarting (Schmitt et al. 2018): a loss for the distance of a policy from its guide's action."""
+"""Kickstarting (Schmitt et al. 2018): a loss for the distance of a policy from a guide's action."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -28,9 +28,9 @@ class ActionValues(Protocol):
 
 @dataclass(eq=False)
 class KickstartLoss(Extension):
-    """A further loss of a policy: its distance from the action g of a guide. The metric is `loss_guide`.
+    """A further loss of a policy: its distance from the action g of a guide.
 
-    An unknown kind, or a scale that is not positive, is a `ValueError`.
+    The metric is `loss_guide`. An unknown kind, or a scale that is not positive, is a `ValueError`.
 
     Args:
         coefficient: weight of the loss, a number or a schedule.
@@ -81,7 +81,7 @@ class KickstartLoss(Extension):
         return self.each(policy, minibatch).mean()
 
     def each(self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase) -> Tensor:
-        """Return the loss of each row of a minibatch, [N]; for discrete actions it is the cross-entropy."""
+        """Return the loss of each row of a minibatch, [N]; for choices it is the cross-entropy."""
         advice = minibatch[self.advice_key][..., self.guide, :]
         distribution = policy.get_dist(minibatch.select(*policy.in_keys))
         if isinstance(distribution, Categorical):
@@ -113,10 +113,11 @@ class KickstartLoss(Extension):
 
 @dataclass(eq=False)
 class FilteredKickstartLoss(KickstartLoss):
-    """As `KickstartLoss`, weighted by the critics' opinion of g, for a learner with critics of actions: SAC.
+    """As `KickstartLoss`, but weighted by what critics think of g.
 
-    The weight of a state is 1 where the critics' mean value of g is larger than that of the
-    policy's action, else 0 (Q-filter, Nair et al. 2018).
+    It is for learners with critics of actions, such as SAC. The weight of a state is 1 where the
+    critics' mean value of g is larger than that of the policy's action, else 0 (Q-filter, Nair et
+    al. 2018).
 
     Args:
         coefficient: weight of the loss, a number or a schedule.
@@ -135,7 +136,8 @@ class FilteredKickstartLoss(KickstartLoss):
         """Entries that it reads; raises a `ValueError` for a learner without action values."""
         if self.critics is None:
             raise ValueError(
-                "FilteredKickstartLoss compares values of actions; take learner=sac, or KickstartLoss"
+                "FilteredKickstartLoss compares values of actions; take learner=sac, or "
+                "KickstartLoss"
             )
         return super().keys
 

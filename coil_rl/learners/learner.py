@@ -65,7 +65,7 @@ class Learner(ABC):
         return []
 
     def check_batch(self, frames: int) -> None:  # noqa: B027  optional
-        """Raise a `ValueError` if a batch of that many frames, B * T, is too small to learn from."""
+        """Raise a `ValueError` if a batch of that many frames, B * T, is too small."""
 
     def export(self, folder: Path) -> None:  # noqa: B027  optional
         """Write what others need besides the policy into the folder of a finished run."""
@@ -92,7 +92,7 @@ class Callback(Protocol):
         """
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Act after an update, 0 is before the first one, and return numbers for the log by name."""
+        """Act after an update, 0 is before the first, and return numbers for the log by name."""
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,9 @@ class CaseResults:
 
 
 class Cases(Protocol):
-    """The fixed cases of a run in which policies are selected: an episode of the training env in each.
+    """The fixed cases of a run in which policies are selected: an episode of the env in each.
 
     An evaluation changes neither the policy of the learner nor the random numbers of the run.
-
     """
 
     @property
@@ -127,7 +126,11 @@ class Cases(Protocol):
         """Return that many cases."""
 
     def evaluate(self, states: Sequence[dict[str, Any]]) -> CaseResults:
-        """Evaluate copies of the learner's policy, each with another state, deterministically in all cases."""
+        """Evaluate copies of the learner's policy deterministically in all cases.
+
+        Args:
+            states: state of each copy, as from the `state_dict` of the policy.
+        """
 
     def evaluate_random(self) -> Tensor:
         """Return the returns of random actions, [C], which are the same at each call."""

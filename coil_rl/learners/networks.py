@@ -1,6 +1,6 @@
 """Policy and value networks, built from the specs of an env."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -52,7 +52,15 @@ DEFAULT = Mlp()
 
 
 class FastTensorDictModule(TensorDictModuleBase):
-    """A `TensorDictModule` with less overhead per call: no dispatch, no search for optional packages."""
+    """A `TensorDictModule` with less overhead per call.
+
+    There is no dispatch, and no search for optional packages.
+
+    Args:
+        module: takes the entries `in_keys`, and returns a tensor or a tuple of them.
+        in_keys: entries that it reads.
+        out_keys: entries that it writes.
+    """
 
     def __init__(
         self, module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
@@ -72,20 +80,30 @@ class FastTensorDictModule(TensorDictModuleBase):
 
 
 class Sample(SafeProbabilisticModule):
-    """Module that samples from a distribution; it writes the sample, and its logarithmic probability `action_log_prob`.
+    """Module that samples from a distribution.
 
-    If a rollout has written `exploration_noise`, standard normal numbers, a normal distribution
-    takes these.
+    It writes the sample, and its logarithmic probability as `action_log_prob`. If a rollout has
+    written `exploration_noise`, standard normal numbers, a normal distribution takes these.
+
+    Args:
+        parameters: entries with the parameters of the distribution.
+        key: entry for the sample.
+        distribution: its class.
+        options: further arguments of the distribution by name; None: there are none.
     """
 
     def __init__(
-        self, parameters: Sequence[str], key: NestedKey, distribution: type, **options: Any
+        self,
+        parameters: Sequence[str],
+        key: NestedKey,
+        distribution: type,
+        options: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__(
             list(parameters),
             [key],
             distribution_class=distribution,
-            distribution_kwargs=options,
+            distribution_kwargs=dict(options or {}),
             return_log_prob=True,
             log_prob_key="action_log_prob",
         )
@@ -109,10 +127,15 @@ class ClippedNormal(Sample):
 
     It writes `unclipped_action`, the sample, with `action_log_prob`, and the action, which the env
     executes.
+
+    Args:
+        low: lower bounds, of the shape of an action.
+        high: upper bounds, of the shape of an action.
+        action_key: entry for the action.
     """
 
     def __init__(self, low: Tensor, high: Tensor, action_key: NestedKey = "action") -> None:
-        super().__init__(["loc", "scale"], UNCLIPPED, IndependentNormal, event_dim=low.ndim)
+        super().__init__(["loc", "scale"], UNCLIPPED, IndependentNormal, {"event_dim": low.ndim})
         self.low, self.high, self.action_key = low, high, action_key
 
     @property
@@ -127,7 +150,10 @@ class ClippedNormal(Sample):
 
 
 def action_spec(env: EnvBase) -> TensorSpec:
-    """Return the spec of the action of an env; several actions, or one no policy can choose, are a `ValueError`."""
+    """Return the spec of the action of an env.
+
+    Several actions, or one that no policy can choose, are a `ValueError`.
+    """
     if len(env.action_keys) != 1:
         names = ", ".join(map(str, env.action_keys))
         raise ValueError(
@@ -275,7 +301,7 @@ def _several_choices(
     return _ActionPart(
         head,
         ["logits"],
-        Sample(["logits"], env.action_key, Choices, event_dims=len(event)),
+        Sample(["logits"], env.action_key, Choices, {"event_dims": len(event)}),
         pull_to_choice(head.valid),
     )
 
@@ -292,21 +318,14 @@ def _normal_head(
 
 def _unbounded(env: EnvBase, head: nn.Module, event: torch.Size) -> _ActionPart:
     """Return the part for numbers of shape `event` without bounds."""
-    sample = Sample(["loc", "scale"], env.action_key, IndependentNormal, event_dim=len(event))
+    sample = Sample(["loc", "scale"], env.action_key, IndependentNormal, {"event_dim": len(event)})
     return _ActionPart(head, ["loc", "scale"], sample, pull_to_number)
 
 
 def _squashed(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
     """Return the part for numbers that tanh squashes to their bounds."""
-    sample = Sample(
-        ["loc", "scale"],
-        env.action_key,
-        TanhNormal,
-        low=low,
-        high=high,
-        event_dims=low.ndim,
-        tanh_loc=False,
-    )
+    options = {"low": low, "high": high, "event_dims": low.ndim, "tanh_loc": False}
+    sample = Sample(["loc", "scale"], env.action_key, TanhNormal, options)
     pull = partial(pull_to_number, bounds=(low, high))
     return _ActionPart(head, ["loc", "scale"], sample, pull)
 
@@ -324,10 +343,10 @@ def memory(
     network: Gru,
     shapes: Shapes | None,
 ) -> list[TensorDictModuleBase]:
-    """Return the modules of a policy that remember the entries of an episode; they write `remembered` [*batch, H].
+    """Return the modules of a policy that remember the entries of an episode.
 
-    `read` are the keys under which the modules read the entries `in_keys` of the env. An env that
-    does not carry the state is a `ValueError`.
+    They write `remembered` [*batch, H]. `read` are the keys under which the modules read the
+    entries `in_keys` of the env. An env that does not carry the state is a `ValueError`.
     """
     carried = {
         key: spec.shape[len(env.batch_size) :]
@@ -352,7 +371,7 @@ def memory(
 def split_memory(
     policy: ProbabilisticTensorDictSequential,
 ) -> tuple[TensorDictSequential | None, ProbabilisticTensorDictSequential]:
-    """Return the part of a policy that writes `remembered`, None without a memory, and the part after it."""
+    """Return the part of a policy that writes `remembered`, or None, and the part after it."""
     modules = list(policy.module)
     for count, module in enumerate(modules, start=1):
         if isinstance(module, GRUModule):
@@ -373,7 +392,14 @@ def critic(
     network: Mlp = DEFAULT,
     normaliser: Normaliser | None = None,
 ) -> TensorDictModuleBase:
-    """Return a state-value network; it writes `state_value` [*batch, 1]. Of a memory it reads the stored state."""
+    """Return a state-value network; it writes `state_value` [*batch, 1].
+
+    Args:
+        env: the env, for its specs.
+        in_keys: entries that it observes; with a memory it also reads the stored state.
+        network: architecture, perhaps with a memory.
+        normaliser: normalises some of `in_keys`.
+    """
     if isinstance(network, Gru):
         in_keys, network = [*in_keys, STATE], network.after
     values = ObservationNetwork(
@@ -392,9 +418,13 @@ def action_critic(
     network: Mlp = DEFAULT,
     normaliser: Normaliser | None = None,
 ) -> FastTensorDictModule:
-    """Return an action-value network for continuous actions; it writes `state_action_value` [*batch, 1].
+    """Return an action-value network for numbers; it writes `state_action_value` [*batch, 1].
 
-    It reads entries that have been normalised already.
+    Args:
+        env: the env, for its specs.
+        in_keys: entries that it observes, besides the action.
+        network: architecture.
+        normaliser: has normalised some of `in_keys` already.
     """
     keys: list[NestedKey] = [*in_keys, "action"]
     values = ObservationNetwork(

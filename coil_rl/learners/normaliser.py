@@ -24,7 +24,7 @@ CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 
 
 class Normaliser(TensorDictModuleBase):
-    """Entries minus their mean, divided by their standard deviation, over everything that `learn` has seen.
+    """Entries of an env, normalised by mean and standard deviation of all that `learn` has seen.
 
     The results are written as `("normalised", KEY)`. Before the first `learn` they equal the
     entries. Advice, which shares the unit of the action, and entries of other than floating point

@@ -120,8 +120,8 @@ class OffPolicy(Stateful, Learner):
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
             raise ValueError(
-                f"prior={prior} needs steps in which a guide acts in place of the agent, as with the "
-                "transform Takeover, by an action that the agent could choose; or take prior=0"
+                f"prior={prior} needs steps in which a guide acts in place of the agent, as with "
+                "the transform Takeover, by an action that the agent could choose; or take prior=0"
             )
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [
@@ -245,7 +245,7 @@ class OffPolicy(Stateful, Learner):
         self.pending_updates += len(steps) * self.ratio / self.batch_size
 
     def samples(self) -> Sequence[TensorDictBase]:
-        """Return as many minibatches [N] as are due for the steps stored so far, with replacement."""
+        """Return as many minibatches [N] as are due for the steps stored so far."""
         due = int(self.pending_updates) if self.kept >= self.starts else 0
         if not due:
             return []
@@ -279,7 +279,7 @@ class OffPolicy(Stateful, Learner):
         return self.extensions.callbacks(self.policy, cases)
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return further metrics of the last minibatch of an update, which is None before learning starts."""
+        """Return further metrics of the last minibatch, which is None before learning starts."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -310,8 +310,8 @@ def check_replay(env: EnvBase, learner: str) -> None:
         if callable(getattr(transform, name, None)):
             raise ValueError(
                 f"{name} of {type(transform).__name__} changes over the run, so stored steps would "
-                "no longer show the effect of an action; make it a number, or use a learner without "
-                "replay, such as PPO"
+                "no longer show the effect of an action; make it a number, or use a learner "
+                "without replay, such as PPO"
             )
     if (keys := [*env.action_keys, *env.reward_keys]) != ["action", "reward"]:
         raise ValueError(
@@ -321,7 +321,7 @@ def check_replay(env: EnvBase, learner: str) -> None:
 
 
 def stored_of_guide(env: EnvBase) -> Literal["executed", "zero", "nothing"]:
-    """Return which action of the agent had the same effect as that of a guide which acted in its place."""
+    """Return which action of the agent has the same effect as that of a guide in its place."""
     combined = [transform for transform in env.modules() if isinstance(transform, CombinedAction)]
     adds = any(each.adds for each in combined)
     if not guide_may_act(env) or (len(combined) > 1 and adds):

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation with clipped probability ratios (paper equation 92; Schulman et al. 2017).
+"""Proximal policy optimisation, PPO (paper equation 92; Schulman et al. 2017).
 
 A critic turns a batch of rollouts into advantages A (generalised advantage estimation). The policy
 then takes several passes over the batch in minibatches. Clipping the probability ratio keeps it
@@ -174,7 +174,7 @@ class PPO(Stateful, Learner):
         network: Mlp,
         make_actor: Callable[..., ProbabilisticTensorDictSequential],
     ) -> ProbabilisticTensorDictSequential:
-        """Return the policy; `make_actor` is `networks.actor` with the learner's other arguments."""
+        """Return the policy; `make_actor` is `networks.actor` with the other arguments set."""
         return make_actor(env, in_keys, network)
 
     def build_critic(
@@ -257,14 +257,14 @@ class PPO(Stateful, Learner):
         return self.extensions.weights(weights, progress)
 
     def all_losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return all losses of a minibatch [N] by name, and the values that TorchRL's loss reports."""
+        """Return all losses of a minibatch [N] by name, and other values that are reported."""
         losses = self.objective(minibatch)
         for name, loss in self.extensions.losses(self.head, minibatch).items():
             losses[name] = loss
         return losses
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
-        """Return TorchRL's losses of a minibatch [N]: scalars, `loss_objective`, `loss_critic` and others."""
+        """Return TorchRL's losses of a minibatch [N]: `loss_objective`, `loss_critic`, others."""
         return self.loss(minibatch)
 
     def critic_loss(self, minibatch: TensorDictBase) -> Tensor:

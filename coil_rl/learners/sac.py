@@ -114,7 +114,8 @@ class SAC(OffPolicy):
         check_range(2, 1_000, critics=critics)
         if target_critics is not None and not 1 <= target_critics < critics:
             raise ValueError(
-                f"target_critics={target_critics} must be at least 1 and less than critics={critics}"
+                f"target_critics={target_critics} must be at least 1 and less than "
+                f"critics={critics}"
             )
         check_range(0, action_gain=action_gain)
         check_range(0, above=True, action_scale=action_scale, temperature=temperature)
@@ -192,7 +193,7 @@ class SAC(OffPolicy):
         target_critics: int | None,
         arguments: dict[str, Any],
     ) -> LossModule:
-        """Return TorchRL's loss for networks that observe `in_keys`; `arguments` are those of TorchRL."""
+        """Return TorchRL's loss, given its `arguments`; the networks observe `in_keys`."""
         if target_critics is None:
             loss = SACLoss(**arguments)
         else:
@@ -224,7 +225,7 @@ class SAC(OffPolicy):
 
     @torch.no_grad()
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
-        """Return the mean uncertainty about the actions of the last minibatch, 0 before learning starts."""
+        """Return the mean uncertainty about the last minibatch, 0 before learning starts."""
         if not self.writes_uncertainty:
             return {}
         if minibatch is None:

@@ -60,8 +60,8 @@ class TRPO(PPO):
         minibatches: of the critic per pass.
         max_grad_norm: gradients of the critic are scaled down to this norm.
         anchor: makes the policy start as its guide.
-        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`), which are part of the
-            objective.
+        auxiliary: further extensions, such as losses of the policy (`KickstartLoss`), which are
+            part of the objective.
         seed: of the order of minibatches.
     """
 
@@ -192,7 +192,7 @@ class TRPO(PPO):
         return evaluate
 
     def natural_step(self, loss: Tensor, divergence: Tensor) -> Tensor:
-        """Return the change of the policy's weights, a vector, along the natural gradient of a loss.
+        """Return the change of the policy's weights along the natural gradient of a loss, a vector.
 
         To second order the `divergence` of the policy from itself becomes the bound.
         """
@@ -209,7 +209,7 @@ class TRPO(PPO):
 
     @torch.no_grad()
     def line_search(self, evaluate: Surrogate, loss: Tensor, step: Tensor) -> dict[str, Any] | None:
-        """Take a step, or the longest part of it with a smaller total loss and a divergence in bounds.
+        """Take the longest part of a step with a smaller loss and a divergence within the bound.
 
         Returns:
             The losses after the step, `kl` and `step`; None if no part will do.
@@ -257,7 +257,7 @@ def conjugate_gradients(
 
 
 def derivative(value: Tensor, weights: Sequence[Tensor], differentiable: bool = False) -> Tensor:
-    """Return the derivative of a scalar with respect to all weights, as one vector; the graph is kept."""
+    """Return the derivative of a scalar by all weights, as one vector; the graph is kept."""
     return parameters_to_vector(
         torch.autograd.grad(value, weights, retain_graph=True, create_graph=differentiable)
     )

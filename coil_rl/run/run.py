@@ -330,7 +330,7 @@ class Run:
             logger=self.logger() if self.logger is not None else None,
             watch=self.watch,
             checkpoint_every=self.budget.checkpoint_every,
-            callbacks=[*learner.callbacks(self._selection(learner)), *self.callbacks(learner)],
+            callbacks=[*learner.callbacks(self.selection(learner)), *self.callbacks(learner)],
             curve=self._curve(learner.policy),
             identity=self.identity,
             stages=self.budget.stages,
@@ -343,7 +343,7 @@ class Run:
             checkpoint.save(checkpoint.load(Path(self.init or "")), copy)
         return copy
 
-    def _selection(self, learner: Learner) -> SelectionCases:
+    def selection(self, learner: Learner) -> SelectionCases:
         """Return the cases in which the learner may compare policies."""
 
         def make(policies: int, count: int) -> EnvBase:

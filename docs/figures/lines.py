@@ -21,7 +21,7 @@ from matplotlib.patches import Patch
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
-from coil_rl.config.build import build_evaluation, guide_results
+from coil_rl.config.build import assemble, build_evaluation, guide_results
 from coil_rl.config.nodes import build
 from coil_rl.config.saved import read_config
 from coil_rl.envs.track import SIDES, Track
@@ -29,6 +29,7 @@ from coil_rl.listening.sections import LEFT, RIGHT, classify, smooth_line
 from coil_rl.report import markdown_table, style
 from coil_rl.report.style import lighten, picture
 from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.parts import TEST
 
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track

@@ -5,7 +5,7 @@ import torch
 import worlds
 
 from coil_rl.learners import PPO, Advisor, KickstartLoss
-from coil_rl.learners.ppo import standardise
+from coil_rl.learners.advantages import standardise
 from coil_rl.run.rollout import Rollout
 
 

@@ -12,7 +12,11 @@ from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.learners import A2C, DQN, PPO, SAC, TRPO, Anchor, Gru, Reinforce
-from coil_rl.learners.anchor import Look
+from coil_rl.learners.anchor import (
+    AnchoredUpdate,
+    Brake,
+)
+from coil_rl.learners.learner import CaseResults
 from coil_rl.run.rollout import Rollout
 from coil_rl.transforms import GuideActions
 
@@ -60,6 +64,12 @@ def learner(env, kind=PPO, minibatches=2, options=None, **anchor):
     )
 
 
+def anchored(learner):
+    """Return the extension of an anchored learner."""
+    (found,) = [each for each in learner.extensions.each if isinstance(each, AnchoredUpdate)]
+    return found
+
+
 def acted(policy, data):
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         return policy(data.copy())["action"]
@@ -83,9 +93,9 @@ def test_first_policy_is_the_guide(name):
 def test_weight_moves_the_mean_from_the_network_to_the_guide():
     env = advised(Unbounded((2,)), lambda observation: torch.full_like(observation[..., :2], 3.0))
     ppo = learner(env)
-    ppo.anchor.head.weight.fill_(0.25)
+    anchored(ppo).head.weight.fill_(0.25)
     data = env.reset()
-    own = ppo.anchor.head.head(data["observation"], data["guide_action"])[0]
+    own = anchored(ppo).head.head(data["observation"], data["guide_action"])[0]
     torch.testing.assert_close(acted(ppo.policy, data), own + 0.75)
 
 
@@ -124,7 +134,7 @@ def test_sac_starts_at_the_guide_and_its_policy_waits_for_the_critics():
     torch.testing.assert_close(acted(sac.policy, data), first)
     assert sac.update(rollout.collect(), 0.75)["anchor"] == 1
     assert (acted(sac.policy, data) - first).abs().max() > 0
-    sac.anchor.head.weight.zero_()
+    anchored(sac).head.weight.zero_()
     sampled = sac.loss.actor_network_params["module", "0", "module", "weight"]
     assert torch.equal(sampled, torch.zeros(1)), "the loss has the same weight"
 
@@ -132,7 +142,7 @@ def test_sac_starts_at_the_guide_and_its_policy_waits_for_the_critics():
 @pytest.mark.parametrize(
     ("weight", "advised_acts"), [(1.0, True), (0.6, True), (0.4, False), (0.0, False)]
 )
-def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_than_the_weighted_range(
+def test_dqn_takes_the_advised_option_unless_it_is_worse_by_more_than_the_weighted_range(
     weight, advised_acts
 ):
     env = advised(
@@ -143,7 +153,7 @@ def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_t
         "without any knowledge of the values"
     )
     values = dqn.policy.module[1]
-    dqn.anchor.head.weight.fill_(weight)
+    anchored(dqn).head.weight.fill_(weight)
     numbers = torch.tensor([[4.0, 2.0, 0.0]])
     data = env.reset()[:1].set("action_value", numbers)
     assert values(data)["action_value"].argmax().item() == (1 if advised_acts else 0)
@@ -151,45 +161,53 @@ def test_dqn_takes_the_advised_option_unless_it_is_worse_than_the_best_by_more_t
     assert metrics["epsilon"] == pytest.approx(0.3), "little noise"
 
 
-def look(*returns, failures=(0, 0, 0, 0, 0)):
-    return Look(torch.tensor(returns), failures[: len(returns)])
+def results(*returns, failures=(0, 0, 0, 0, 0)):
+    return CaseResults(torch.tensor(returns), failures[: len(returns)])
 
 
-def first_look(*returns):
-    """Return a look with two guides, the policy of its own, and opposites of the guides that are worse than that."""
-    return look(*returns, *[[value - 1 for value in returns[2]]] * 2)
+def first_results(*returns):
+    """Return results of two guides, the policy of its own, and worse opposites of the guides."""
+    return results(*returns, *[[value - 1 for value in returns[2]]] * 2)
 
 
 @pytest.fixture
 def anchor():
     env = advised(Bounded(-1, 1, (2,)), two_numbers, lambda observation: -two_numbers(observation))
-    return learner(env).anchor
+    return anchored(learner(env))
+
+
+def brake(anchor):
+    return Brake(anchor, anchor.head, cases=None)
 
 
 def test_best_guide_holds_if_it_is_better_than_a_new_policy_and_random_actions(anchor):
     anchor.begin(
-        first_look([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]), torch.tensor([0.0, 1, 2]), anchor.head
+        first_results([5.0, 6, 7], [9.0, 10, 12], [1.0, 2, 3]),
+        torch.tensor([0.0, 1, 2]),
+        anchor.head,
     )
-    assert anchor.holds
+    assert anchor.active
     assert anchor.head.weight.tolist() == [0, 1]
-    assert anchor.best.tolist() == [9, 10, 12]
+    assert anchor.best_returns.tolist() == [9, 10, 12]
 
 
 def test_opposite_of_the_worst_guide_holds_if_it_is_the_best_and_lets_go_like_a_guide(anchor):
     bad = [-20.0, -20, -20]
-    looked = look(bad, bad, [0.0, 0, 0], [5.0, 6, 7], [100.0, 100, 100], failures=(9, 9, 9, 9, 1))
-    anchor.begin(looked, torch.zeros(3), anchor.head)
+    compared = results(
+        bad, bad, [0.0, 0, 0], [5.0, 6, 7], [100.0, 100, 100], failures=(9, 9, 9, 9, 1)
+    )
+    anchor.begin(compared, torch.zeros(3), anchor.head)
     assert anchor.head.weight.tolist() == [0, -1]
-    assert (anchor.weight, anchor.best.tolist(), anchor.guide_failures) == (1, [100] * 3, 1)
-    anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
+    assert (anchor.weight, anchor.best_returns.tolist(), anchor.guide_failures) == (1, [100] * 3, 1)
+    anchor.decide(results([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
     assert anchor.head.weight.tolist() == pytest.approx([0, -0.95])
-    anchor.decide(look([90.0, 90, 90], [90.0, 90, 90]), anchor.head)
+    anchor.decide(results([90.0, 90, 90], [90.0, 90, 90]), anchor.head)
     assert anchor.head.weight.tolist() == [0, -1]
     assert anchor.set_noise(0.0)["anchor"] == -1
     for _ in range(30):
-        anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
+        anchor.decide(results([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
     assert anchor.weight == 0
-    anchor.head.weight.copy_(anchor.weights(0.1))
+    anchor.head.weight.copy_(anchor.weights_of_guides(0.1))
     assert anchor.head.weight.tolist() == pytest.approx([0, -0.1]), "zero keeps the sign"
 
 
@@ -199,84 +217,106 @@ def test_opposite_of_the_worst_guide_holds_if_it_is_the_best_and_lets_go_like_a_
     ids=["as its own", "as random actions", "better by less than a standard error"],
 )
 def test_guide_that_is_no_better_does_not_hold(anchor, own, random):
-    anchor.begin(first_look([9.0, 10, 12], [0.0, 0, 0], own), torch.tensor(random), anchor.head)
-    assert not anchor.holds
+    anchor.begin(first_results([9.0, 10, 12], [0.0, 0, 0], own), torch.tensor(random), anchor.head)
+    assert not anchor.active
     assert anchor.weight == 0
-    assert not any(anchor.due(update, 24) for update in range(24))
-    assert not anchor.waits(0.0)
-    assert not anchor.kept
+    assert not any(brake(anchor).due(update, 24, {}) for update in range(1, 24))
+    weights = {"loss_objective": 1.0, "loss_critic": 1.0}
+    assert anchor.weights(weights, 0.0) == weights, "the policy learns at once"
+    assert not anchor.best_state
 
 
 def begun(anchor, weight=1.0):
     opposites = [[-100.0, -100, -100]] * len(anchor.head.weight)
     guides = [[100.0, 100, 100], [0.0, 0, 0]][: len(opposites)]
-    anchor.begin(look(*guides, [0.0, 0, 0], *opposites), torch.zeros(3), anchor.head)
-    anchor.head.weight.copy_(anchor.weights(weight))
-    anchor.decide(look([100.0, 100, 100], [0.0, 0, 0]), anchor.head)
+    anchor.begin(results(*guides, [0.0, 0, 0], *opposites), torch.zeros(3), anchor.head)
+    anchor.head.weight.copy_(anchor.weights_of_guides(weight))
+    anchor.decide(results([100.0, 100, 100], [0.0, 0, 0]), anchor.head)
     return anchor
 
 
-def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_the_tolerance_of_its_steps(
+def test_weight_falls_by_a_step_while_one_lower_by_the_margin_loses_at_most_its_tolerances(
     anchor,
 ):
-    assert torch.stack(begun(anchor).tried()).tolist() == [[1, 0], pytest.approx([0.7, 0])]
-    assert not anchor.decide(look([100.0, 100, 100], [94.5, 94, 94]), anchor.head)
+    assert torch.stack(begun(anchor).candidates()).tolist() == [[1, 0], pytest.approx([0.7, 0])]
+    assert not anchor.decide(results([100.0, 100, 100], [94.5, 94, 94]), anchor.head)
     assert anchor.weight == pytest.approx(0.95)
-    assert not anchor.decide(look([100.0, 100, 100], [93.5, 93.5, 93.5]), anchor.head)
+    assert not anchor.decide(results([100.0, 100, 100], [93.5, 93.5, 93.5]), anchor.head)
     assert anchor.weight == pytest.approx(0.95), "the lower one loses too much"
     assert not anchor.decide(
-        look([100.0, 100, 100], [100.0, 100, 100], failures=(0, 1)), anchor.head
+        results([100.0, 100, 100], [100.0, 100, 100], failures=(0, 1)), anchor.head
     )
     assert anchor.weight == pytest.approx(0.95), "the lower one fails"
 
 
 def test_weight_falls_by_the_margin_if_the_lower_one_is_much_better_than_all_before(anchor):
-    begun(anchor).decide(look([100.0, 100, 100], [104.0, 104, 104]), anchor.head)
+    begun(anchor).decide(results([100.0, 100, 100], [104.0, 104, 104]), anchor.head)
     assert anchor.weight == pytest.approx(0.7)
-    anchor.decide(look([102.0, 102, 102], [104.0, 104, 104]), anchor.head)
+    anchor.decide(results([102.0, 102, 102], [104.0, 104, 104]), anchor.head)
     assert anchor.weight == pytest.approx(0.65)
 
 
 @pytest.mark.parametrize("kind", [PPO, SAC, DQN])
-def test_policy_goes_back_to_the_best_look_after_a_failure_or_a_loss(kind):
+def test_policy_goes_back_to_the_best_check_up_after_a_failure_or_a_loss(kind):
     torch.manual_seed(0)
     action = OneHot(3) if kind is DQN else Bounded(-1, 1, (2,))
     guide = (
         (lambda observation: F.one_hot(option(3)(observation), 3)) if kind is DQN else two_numbers
     )
     trained = kind(advised(action, guide), KEYS, action_gain=0.0, anchor=Anchor())
-    anchor, policy, good = begun(trained.anchor, 0.5), trained.policy, [100.0, 100, 100]
-    for bad in (look(good, good, failures=(1, 0)), look([96.5, 96.5, 96.5], good)):
-        assert not anchor.decide(look(good, [0.0, 0, 0]), policy)
+    anchor, policy, good = begun(anchored(trained), 0.5), trained.policy, [100.0, 100, 100]
+    for bad in (results(good, good, failures=(1, 0)), results([96.5, 96.5, 96.5], good)):
+        assert not anchor.decide(results(good, [0.0, 0, 0]), policy)
         before = {name: value.clone() for name, value in policy.state_dict().items()}
         for value in policy.parameters():
             value.data += 1
-        anchor.head.weight.copy_(anchor.weights(0.2))
+        anchor.head.weight.copy_(anchor.weights_of_guides(0.2))
         assert anchor.decide(bad, policy)
         assert anchor.weight == pytest.approx(0.5)
         assert all(torch.equal(value, before[name]) for name, value in policy.state_dict().items())
 
 
+@pytest.mark.parametrize(("loss", "goes_back"), [(2.99, False), (3.01, True)])
+def test_policy_goes_back_after_a_loss_of_more_than_three_tolerances(anchor, loss, goes_back):
+    begun(anchor)
+    assert anchor.tolerance == pytest.approx(1.0)
+    assert anchor.decide(results([100 - loss] * 3, [0.0, 0, 0]), anchor.head) is goes_back
+
+
+@pytest.mark.parametrize(("errors", "goes_back"), [(1.99, False), (2.01, True)])
+def test_policy_goes_back_after_a_loss_of_more_than_two_standard_errors(anchor, errors, goes_back):
+    """Losses m - d, m, m + d in three cases: the standard error of their mean is d / root 3."""
+    begun(anchor)
+    spread = 30.0
+    mean = errors * spread / 3**0.5
+    assert mean > 3 * anchor.tolerance
+    returns = [100 - mean + spread, 100 - mean, 100 - mean - spread]
+    assert anchor.decide(results(returns, [0.0, 0, 0]), anchor.head) is goes_back
+
+
 def test_loss_in_a_single_case_may_be_chance(anchor):
     begun(anchor)
-    assert not anchor.decide(look([100.0, 100, 40], [0.0, 0, 0]), anchor.head)
-    assert anchor.decide(look([80.0, 80, 80], [0.0, 0, 0]), anchor.head)
+    assert not anchor.decide(results([100.0, 100, 40], [0.0, 0, 0]), anchor.head)
+    assert anchor.decide(results([80.0, 80, 80], [0.0, 0, 0]), anchor.head)
 
 
 def test_weight_stops_at_zero(anchor):
     begun(anchor, 0.07)
     for _ in range(3):
-        assert not anchor.tried()[1].any()
-        anchor.decide(look([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
+        assert not anchor.candidates()[1].any()
+        anchor.decide(results([100.0, 100, 100], [100.0, 100, 100]), anchor.head)
     assert anchor.weight == 0
 
 
 @pytest.mark.parametrize("updates", [3, 32, 49, 1000])
-def test_looks_are_spread_over_the_run(updates, anchor):
-    looks = [update for update in range(updates + 1) if anchor.due(update, updates)]
-    assert len(looks) == min(anchor.looks, updates)
-    assert looks[-1] == updates
-    gaps = [after - before for before, after in itertools.pairwise(looks)]
+def test_check_ups_are_spread_over_the_run(updates, anchor):
+    first, *due = [
+        update for update in range(updates + 1) if brake(anchor).due(update, updates, {})
+    ]
+    assert first == 0
+    assert len(due) == min(anchor.anchor.looks, updates)
+    assert due[-1] == updates
+    gaps = [after - before for before, after in itertools.pairwise(due)]
     assert not gaps or max(gaps) - min(gaps) <= 1
 
 
@@ -285,7 +325,7 @@ def test_only_the_critic_learns_at_first_and_the_noise_follows_its_schedule(kind
     torch.manual_seed(0)
     env = advised(Bounded(-1, 1, (2,)), two_numbers)
     trained = learner(env, kind, warmup=0.5, noise=lambda progress: 0.3 - 0.2 * progress)
-    trained.anchor.begin(look([1.0, 1], [0.0, 0], [0.0, 0]), torch.zeros(2), trained.policy)
+    anchored(trained).begin(results([1.0, 1], [0.0, 0], [0.0, 0]), torch.zeros(2), trained.policy)
     rollout = Rollout(env, trained.policy, 8, trained.keys)
     data = env.reset()
     first, value = acted(trained.policy, data), trained.critic(data.copy())["state_value"].detach()
@@ -296,7 +336,7 @@ def test_only_the_critic_learns_at_first_and_the_noise_follows_its_schedule(kind
     assert metrics["noise"] == pytest.approx(0.25)
     trained.update(rollout.collect(), 0.75)
     assert (acted(trained.policy, data) - first).abs().max() > 0
-    assert float(trained.anchor.head.head.log_scale.detach().exp()[0]) == pytest.approx(0.15)
+    assert float(anchored(trained).head.head.log_scale.detach().exp()[0]) == pytest.approx(0.15)
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO])
@@ -307,8 +347,10 @@ def test_update_does_not_depend_on_the_unit_of_the_reward(kind):
         torch.manual_seed(0)
         trained = learner(env, kind)
         best = [unit * 2, unit * 2]
-        trained.anchor.begin(look(best, [0.0, 0], [-unit, -unit]), torch.zeros(2), trained.policy)
-        assert trained.anchor.unit == 2 * unit
+        anchored(trained).begin(
+            results(best, [0.0, 0], [-unit, -unit]), torch.zeros(2), trained.policy
+        )
+        assert anchored(trained).reward_scale == 2 * unit
         batch = Rollout(env, trained.policy, 8, trained.keys).collect()
         batch["next", "reward"] = torch.sin(torch.arange(64.0)).view(8, 8, 1) * unit
         trained.update(batch)
@@ -319,13 +361,13 @@ def test_update_does_not_depend_on_the_unit_of_the_reward(kind):
 def test_state_brings_back_the_weight_and_the_brake():
     env = advised(Bounded(-1, 1, (2,)), two_numbers)
     first, second = learner(env), learner(env)
-    anchor = begun(first.anchor, 0.8)
-    anchor.decide(look([110.0, 110, 110], [110.0, 110, 110]), first.policy)
+    anchor = begun(anchored(first), 0.8)
+    anchor.decide(results([110.0, 110, 110], [110.0, 110, 110]), first.policy)
     second.load_state_dict(copy.deepcopy(first.state_dict()))
-    assert second.anchor.weight == anchor.weight == pytest.approx(0.75)
-    torch.testing.assert_close(second.anchor.state_dict(), anchor.state_dict())
-    second.anchor.decide(look([0.0, 0, 0], [0.0, 0, 0]), second.policy)
-    assert second.anchor.weight == pytest.approx(0.8), "the policy of the best look is in the state"
+    assert anchored(second).weight == anchor.weight == pytest.approx(0.75)
+    torch.testing.assert_close(anchored(second).state_dict(), anchor.state_dict())
+    anchored(second).decide(results([0.0, 0, 0], [0.0, 0, 0]), second.policy)
+    assert anchored(second).weight == pytest.approx(0.8), "the best policy is in the state"
 
 
 def test_anchor_without_advice_or_out_of_range_is_refused():
@@ -333,4 +375,7 @@ def test_anchor_without_advice_or_out_of_range_is_refused():
         PPO(AnyEnv(), anchor=Anchor())
     with pytest.raises(ValueError, match=r"margin=0\.01 must be at least 0\.05"):
         Anchor(margin=0.01)
-    assert math.isnan(Anchor().allowed)
+
+
+def test_tolerance_is_unknown_before_training(anchor):
+    assert math.isnan(anchor.tolerance)

@@ -1,4 +1,4 @@
-"""Learners solve CartPole-v1: a mean of 475 steps over 100 episodes; DQN with deterministic actions."""
+"""Learners solve CartPole-v1: a mean of 475 steps over 100 episodes; DQN without random actions."""
 
 import pytest
 import torch

@@ -27,7 +27,7 @@ def make(env=None, **options):
 
 @pytest.mark.parametrize("double", [True, False])
 def test_loss_is_the_squared_distance_to_the_target(double):
-    """y = r + gamma Q'(s', b) with b the best action of Q (double) or of Q', and y = r where an episode terminated."""
+    """y = r + gamma Q'(s', b), b the best action of Q (double) or Q'; y = r at the last step."""
     dqn, rollout = make(double=double, gamma=0.9, tau=0.0, learning_rate=0.1)
     minibatch = rollout.collect().select(*dqn.keys).reshape(-1)
     minibatch["next", "terminated"][::3] = True

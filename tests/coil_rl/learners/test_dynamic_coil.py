@@ -145,7 +145,7 @@ def updates(learner, env, count):
     return result
 
 
-def test_each_phase_changes_its_networks_only_with_a_smaller_learning_rate_than_the_last_of_its_kind():
+def test_each_phase_changes_its_networks_only_and_at_a_smaller_rate_than_the_last_of_its_kind():
     result = updates(make(env := cars(), shrink=0.5, epochs=1), env, 4)
     agent_phase, first, second = (
         [True, True, False, False],

@@ -13,7 +13,7 @@ GAMMA, LAMBDA = 0.9, 0.8
 
 
 def make(kind, **options):
-    """A learner, and a batch of three cars and six steps with a crash, a truncation and unfinished episodes."""
+    """A learner and a batch, 3 cars x 6 steps: a crash, a truncation and unfinished episodes."""
     torch.manual_seed(0)
     env = worlds.cones(cars=3)
     learner = kind(env, action_gain=0.5, gamma=GAMMA, **options)
@@ -78,7 +78,7 @@ def close(one, other):
     ],
 )
 def test_equations_67_and_76(kind, decay, weight, options):
-    """The advantage of Reinforce is the bootstrapped return minus the baseline: lambda is 1, and V 0 without one."""
+    """The advantage of Reinforce is the bootstrapped return minus the baseline: lambda is 1."""
     learner, batch = make(kind, **options)
     loss_objective, loss_critic = losses_of(learner, batch)
     advantage = backwards(learner, batch, GAMMA * decay)
@@ -101,7 +101,7 @@ def test_equation_92():
 
 
 def test_equations_89_and_90():
-    """The metrics of a step: mean of ratio times advantage, and divergence of the normal distributions."""
+    """The metrics of a step: mean of ratio times advantage, and divergence of the distributions."""
     learner, batch = make(TRPO, gae_lambda=LAMBDA, max_kl=0.05)
     learner.advantage(batch)
     rows = batch.select(*learner.minibatch_keys).reshape(-1)

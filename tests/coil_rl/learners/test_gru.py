@@ -1,4 +1,4 @@
-"""Policies with a memory: they solve what needs one, and train, resume and are evaluated as any other."""
+"""Policies with a memory solve what needs one, and train, resume and are evaluated as any other."""
 
 import copy
 import shutil
@@ -63,7 +63,7 @@ TINY = [
 
 
 class Recall(SeededEnv):
-    """B rows whose first observation is -1 or 1, later ones are 0; after 5 steps the sign is the right action (0, 1).
+    """B rows whose first observation is -1 or 1; after 5 steps of 0 the sign is the right action.
 
     The reward is 1 or -1 in the last step, else 0.
     """
@@ -164,7 +164,7 @@ def test_update_sees_the_log_probabilities_and_states_of_the_rollout(action, opt
     )
     rows = learner.prepare(batch, 0.0)
     order = torch.randperm(len(rows))
-    steps = learner.remember(rows[order])
+    steps = learner.sampler.remember(rows[order])
     expected = batch[order].reshape(-1)["action_log_prob"]
     assert expected.std() > 0.1
     torch.testing.assert_close(learner.head.get_dist(steps).log_prob(steps["action"]), expected)

@@ -61,7 +61,7 @@ def test_better_proposal_of_guide_and_policy_is_executed():
 
 @pytest.mark.parametrize("sharpness", [None, 0.0, 2.0])
 def test_critics_learn_the_value_of_the_choice_in_the_next_state(sharpness):
-    """y = r + gamma * max of min Q', or the mean over softmax(sharpness * min Q'), without an entropy reward."""
+    """y = r + gamma * max of min Q', or mean over softmax(sharpness * min Q'), without entropy."""
     ibrl, rollout = make(gamma=0.9, sharpness=sharpness, temperature=5.0)
     data = rollout.collect().select(*ibrl.keys)
     data["next", "terminated"][::3] = True

@@ -108,7 +108,7 @@ SWITCHES = {
 
 @pytest.mark.parametrize("name", SWITCHES)
 def test_stored_steps_agree_with_the_env(name):
-    """A fresh env that is given the stored state and action returns the stored reward and next state."""
+    """A fresh env, given the stored state and action, returns the stored reward and next state."""
     env = worlds.pendulum(SWITCHES[name]())
     learner = SAC(
         env,
@@ -156,7 +156,7 @@ TINY = {"starts": 20, "batch_size": 16, "ratio": 2, "capacity": 90, "hidden": [8
 
 
 def make(kind, seed=0, **changes):
-    """A learner and its rollouts, with random, delayed advice, which cannot be computed again from an observation."""
+    """A learner and its rollouts, with random, delayed advice, which no observation determines."""
     torch.manual_seed(seed)
     advice = [GuideActions({"any": RandomGuide(seed=seed)}), DelayedAdvice(2)]
     discrete = [DiscreteActions(5)] if kind is DQN else []

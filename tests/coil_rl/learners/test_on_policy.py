@@ -15,8 +15,8 @@ from torchrl.objectives.value import GAE
 from coil_rl.envs import ConeTrackEnv
 from coil_rl.guides import RandomGuide
 from coil_rl.learners import A2C, PPO, TRPO, KickstartLoss, Reinforce
+from coil_rl.learners.advantages import Advantages
 from coil_rl.learners.networks import critic
-from coil_rl.learners.ppo import Advantages
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
 from coil_rl.transforms import JumpStart, Takeover
@@ -86,7 +86,7 @@ def test_policy_loss_depends_on_the_steps_of_the_agent_only():
     other["advantage"][of_guide] = 1e6
     other["action_log_prob"][of_guide] = -1e6
     other["value_target"][of_guide] += 1
-    losses, changed = ppo.masked_losses(rows), ppo.masked_losses(other)
+    losses, changed = ppo.objective(rows), ppo.objective(other)
     assert torch.equal(changed["loss_objective"], losses["loss_objective"])
     assert not torch.equal(changed["loss_critic"], losses["loss_critic"])
 

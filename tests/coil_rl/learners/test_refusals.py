@@ -1,4 +1,4 @@
-"""Refusals of the learners: values out of range, options without effect, unusable envs and guides."""
+"""Refusals of the learners: values out of range, options without effect, unusable envs, guides."""
 
 import math
 

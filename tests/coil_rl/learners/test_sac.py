@@ -46,7 +46,7 @@ def sample(sac, states):
 
 
 def test_critics_learn_the_soft_value_of_the_next_state():
-    """y = r + gamma (min Q'(s', b) - alpha log pi(b | s')), and y = r where an episode terminated."""
+    """y = r + gamma (min Q'(s', b) - alpha log pi(b | s')); y = r where an episode terminated."""
     sac, rollout = make(gamma=0.9, temperature=0.5)
     data, params = minibatch_of(sac, rollout), sac.loss.qvalue_network_params
     assert not torch.equal(*params["module", "layers", "0", "weight"])
@@ -72,7 +72,7 @@ def test_critics_learn_the_soft_value_of_the_next_state():
 
 
 def test_policy_and_temperature_learn_from_actions_of_the_policy():
-    """The policy's loss is alpha log pi(a | s) - min Q(s, a); the gradient for log alpha is -(log pi + target)."""
+    """The loss is alpha log pi(a | s) - min Q(s, a), that by log alpha -(log pi + target)."""
     sac, rollout = make(temperature=0.5, target_entropy=-2.0)
     data = minibatch_of(sac, rollout)
     torch.manual_seed(1)

@@ -39,8 +39,31 @@ def test_conjugate_gradients_solve_a_linear_system(size):
     assert (conjugate_gradients(lambda vector: matrix @ vector, 0 * target, 5) == 0).all()
 
 
+def order_of_weights(learner):
+    """Return the places of weight, bias and logarithmic scale of a linear policy in `weights`."""
+    names = [name for name, _ in learner.policy.named_parameters()]
+    return [
+        next(i for i, name in enumerate(names) if name.endswith(end))
+        for end in ("weight", "bias", "log_scale")
+    ]
+
+
+def natural_step(inputs, standard, advantage, scale, bound):
+    """Return the exact step of the weight, the bias and the logarithmic scale of a linear policy.
+
+    Fisher matrix and gradient of a normal distribution are known: F = diag(E[x x^T] / s^2, 2).
+    """
+    gradient = torch.cat(
+        [(advantage * standard / scale * inputs).mean(0), (advantage * (standard**2 - 1)).mean(0)]
+    )
+    fisher = torch.zeros(3, 3, dtype=torch.float64)
+    fisher[:2, :2] = inputs.T @ inputs / len(inputs) / scale**2
+    fisher[2, 2] = 2
+    natural = torch.linalg.solve(fisher, gradient)
+    return natural * math.sqrt(2 * bound / (gradient @ natural))
+
+
 def test_step_is_the_exact_natural_gradient_scaled_to_the_bound():
-    """Fisher matrix and gradient of a normal distribution are known: F = diag(E[x x^T] / s^2, 2)."""
     bound = 1e-6  # so small that the divergence is its second order
     learner, rows = linear(max_kl=bound, iterations=10)
     head = learner.policy.module[0].module
@@ -52,23 +75,11 @@ def test_step_is_the_exact_natural_gradient_scaled_to_the_bound():
     standard = ((rows["action"] / 2).clamp(-1 + 1e-6, 1 - 1e-6).atanh() - mean).double() / scale
     advantage = rows["advantage"].double()
     advantage = (advantage - advantage.mean()) / advantage.std()
-    gradient = torch.cat(
-        [(advantage * standard / scale * inputs).mean(0), (advantage * (standard**2 - 1)).mean(0)]
-    )
-    fisher = torch.zeros(3, 3, dtype=torch.float64)
-    fisher[:2, :2] = inputs.T @ inputs / len(inputs) / scale**2
-    fisher[2, 2] = 2
-    natural = torch.linalg.solve(fisher, gradient)
-    expected = natural * math.sqrt(2 * bound / (gradient @ natural))
+    expected = natural_step(inputs, standard, advantage, scale, bound)
 
-    names = [name for name, _ in learner.policy.named_parameters()]
-    order = [
-        next(i for i, name in enumerate(names) if name.endswith(end))
-        for end in ("weight", "bias", "log_scale")
-    ]
     before = weights(learner)
     report = learner.improve(rows)
-    step = (weights(learner) - before)[order].double()
+    step = (weights(learner) - before)[order_of_weights(learner)].double()
     torch.testing.assert_close(step / report["step"], expected, rtol=0.02, atol=2e-6)
     assert report["kl"] <= bound
 

@@ -1,16 +1,14 @@
 """The brake of an anchored policy, on a pendulum that its guide swings up."""
 
-from functools import partial
-
 import pytest
 import torch
 from hydra import compose, initialize_config_module
 from torchrl.envs import EnvBase
 
-from coil_rl.config.build import build_env, build_learner, cases_node
+from coil_rl.config.build import assemble, build_learner, env_maker
+from coil_rl.errors import UserError
 from coil_rl.report.measures import Measure
-from coil_rl.run.brake import Brake
-from coil_rl.run.run import _probe
+from coil_rl.run.cases import SelectionCases
 
 pytest.importorskip("gymnasium.envs.classic_control")
 FAST = Measure("reward", "min", at_most=-10.0)  # true for an episode that was ever far from upright
@@ -23,17 +21,18 @@ def configured(*overrides):
             "train", ["method=coil_anchored", "budget.num_envs=2", "run_dir=unused", *overrides]
         )
     torch.manual_seed(0)
-    return config, build_learner(config, build_env(config))
+    return config, build_learner(config, env_maker(config)())
 
 
 def built(*overrides, failure=None):
-    """Return learner, brake, and a function that makes the env of the brake."""
+    """Return the anchor of a learner, its brake, and the cases in which the brake evaluates it."""
     config, learner = configured("env=pendulum", *overrides)
 
-    def build(policies: int) -> EnvBase:
-        return build_env(config, cases_node(config, "selection", policies))
+    def build(policies: int, count: int) -> EnvBase:
+        return env_maker(config)(policies * count, "selection", count=count)
 
-    return learner, Brake(learner.anchor, learner.policy, build, failure), partial(build, 1)
+    (brake,) = learner.callbacks(SelectionCases(learner.policy, build, 5, failure))
+    return brake.anchored, brake, brake.cases
 
 
 @pytest.mark.parametrize(
@@ -45,19 +44,22 @@ def built(*overrides, failure=None):
         ("learner.anchor.cases=7", 7),
     ],
 )
-def test_look_has_more_cases_where_failures_are_counted(overrides, cases):
-    assert _probe(*configured(*overrides.split())).build(2).batch_size == (2 * cases,)
+def test_check_up_has_more_cases_where_failures_are_counted(overrides, cases):
+    config, learner = configured(*overrides.split())
+    (brake,) = learner.callbacks(assemble(config).selection(learner))
+    assert brake.cases.count == cases
+    assert brake.cases.build(2, cases).batch_size == (2 * cases,)
 
 
 @pytest.mark.parametrize("action", ["continuous", "choices"])
 def test_first_policy_is_within_two_percent_of_the_guide(action):
-    learner, brake, build = built(f"action={action}")
-    first = brake(0)["look/return"]
-    guide = build()
-    returns = brake._drive(guide, lambda data: data.set("action", guided(data, action)))["return"]
-    assert learner.anchor.weight == 1
+    anchor, brake, cases = built(f"action={action}")
+    first = brake.after_update(0)["look/return"]
+    env = cases.build(1, cases.count)
+    returns = cases._totals(env, lambda data: data.set("action", guided(data, action)))["return"]
+    assert anchor.weight == 1
     assert first == pytest.approx(float(returns.mean()), rel=0.02)
-    assert float(learner.anchor.best.mean()) == pytest.approx(first)
+    assert float(anchor.best_returns.mean()) == pytest.approx(first)
 
 
 def guided(data, action):
@@ -66,50 +68,76 @@ def guided(data, action):
 
 
 def test_opposite_of_a_reversed_guide_is_as_good_as_the_guide():
-    learner, brake, _ = built("degrade=adversarial")
-    brake(0)
+    anchor, brake, _ = built("degrade=adversarial")
+    brake.after_update(0)
     good, brake_of_good, _ = built()
-    brake_of_good(0)
-    assert learner.anchor.head.weight.tolist() == [-1]
-    assert torch.allclose(learner.anchor.best, good.anchor.best)
+    brake_of_good.after_update(0)
+    assert anchor.head.weight.tolist() == [-1]
+    assert torch.allclose(anchor.best_returns, good.best_returns)
 
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
 def test_guide_that_is_of_no_use_does_not_hold(degrade):
-    learner, brake, _ = built(f"degrade={degrade}")
-    brake(0)
-    assert learner.anchor.weight == 0
+    anchor, brake, _ = built(f"degrade={degrade}")
+    brake.after_update(0)
+    assert anchor.weight == 0
     assert not any(brake.due(update, 20, {}) for update in range(1, 20))
 
 
-def test_look_leaves_the_policy_and_the_random_numbers_alone_and_can_be_repeated():
-    learner, brake, _ = built("learner.anchor.step=0", "learner.anchor.margin=0", failure=FAST)
-    brake(0)
-    before, state = (
-        {name: value.clone() for name, value in learner.policy.state_dict().items()},
-        torch.get_rng_state(),
-    )
-    first, second = brake(1), brake(2)
+def state_of(policy):
+    return {name: value.clone() for name, value in policy.state_dict().items()}
+
+
+def test_check_up_leaves_policy_and_random_numbers_alone_and_can_be_repeated():
+    _, brake, _ = built("learner.anchor.step=0", "learner.anchor.margin=0", failure=FAST)
+    brake.after_update(0)
+    before, random_state = state_of(brake.policy), torch.get_rng_state()
+    first, second = brake.after_update(1), brake.after_update(2)
     assert first == second
     assert first["look/return"] == first["look/lower_return"]
     assert first["look/failures"] == 5, "every episode begins far from upright"
     assert first["look/back"] == 0
-    assert torch.equal(torch.get_rng_state(), state)
-    assert all(
-        torch.equal(value, before[name]) for name, value in learner.policy.state_dict().items()
-    )
+    assert torch.equal(torch.get_rng_state(), random_state)
+    after = brake.policy.state_dict()
+    assert all(torch.equal(value, before[name]) for name, value in after.items())
 
 
 def test_weight_falls_where_the_network_does_what_the_guide_did_and_a_bad_policy_goes_back():
-    learner, brake, _ = built()
-    brake(0)
-    brake(1)
-    assert learner.anchor.weight in (1.0, pytest.approx(0.95))
-    first = {name: value.clone() for name, value in learner.anchor.kept.items()}
-    for value in learner.policy.parameters():
+    anchor, brake, _ = built()
+    brake.after_update(0)
+    brake.after_update(1)
+    assert anchor.weight in (1.0, pytest.approx(0.95))
+    first = {name: value.clone() for name, value in anchor.best_state.items()}
+    for value in brake.policy.parameters():
         value.data += 1
-    learner.anchor.best += 1000
-    assert brake(2)["look/back"] == 1
-    assert all(
-        torch.equal(value, first[name]) for name, value in learner.policy.state_dict().items()
-    )
+    anchor.best_returns += 1000
+    assert brake.after_update(2)["look/back"] == 1
+    after = brake.policy.state_dict()
+    assert all(torch.equal(value, first[name]) for name, value in after.items())
+
+
+def test_random_actions_are_those_of_seed_0_whatever_the_random_numbers_of_the_run():
+    _, _, cases = built()
+    env = cases.build(1, cases.count)
+    torch.manual_seed(0)
+    expected = cases._totals(env, env.rand_action)["return"]
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        assert torch.equal(cases.evaluate_random(), expected)
+
+
+def test_weight_of_the_guide_is_the_only_difference_between_the_candidates():
+    anchor, brake, cases = built()
+    anchor.set_weight(0.5)
+    results = brake._evaluate([torch.tensor([0.5]), torch.tensor([0.0])])
+    present = cases.evaluate([brake.policy.state_dict()])
+    assert torch.equal(results.returns[0], present.returns[0])
+    assert not torch.equal(results.returns[1], present.returns[0])
+
+
+def test_run_without_cases_is_told_what_an_anchor_needs():
+    config, learner = configured("env=pendulum")
+    config.evaluation.curve.cases = {}
+    (brake,) = learner.callbacks(assemble(config).selection(learner))
+    with pytest.raises(UserError, match=r"learner.anchor needs evaluation.curve.cases.selection"):
+        brake.after_update(0)
