@@ -5,6 +5,7 @@ an interruption (see `SeededRows`), names what is missing in one sentence, and l
 beside the env that need the env itself, not only its observation.
 """
 
+import importlib
 import inspect
 import pkgutil
 import re
@@ -50,9 +51,10 @@ class GymnasiumEnv(SeededRows):
     at which the env is drawn, NaN if it does not say.
 
     Args:
-        id: registered name; "MODULE:NAME" imports the module first.
+        id: registered name; "MODULE:NAME" imports the module first. Or a maker of an env: a class or
+            function, or the "MODULE:NAME" of one.
         num_envs: B, number of rows.
-        options: keyword arguments of `gymnasium.make`.
+        options: keyword arguments of `gymnasium.make`, or of the maker.
         wrappers: callables that take an env and return one, applied in this order.
         max_steps: steps after which an episode is truncated, instead of the registered number.
         seed: of the draw of the episodes' seeds, at least 0.
@@ -89,7 +91,7 @@ class GymnasiumEnv(SeededRows):
 
     def __init__(
         self,
-        id: str,
+        id: str | Callable[..., Env],
         num_envs: int = 1,
         *,
         options: Mapping[str, Any] | None = None,
@@ -110,10 +112,11 @@ class GymnasiumEnv(SeededRows):
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
-        makes = [partial(_make, id, wrappers, settings)] * num_envs
+        maker = _maker(id)
+        makes = [partial(_make, maker, wrappers, settings)] * num_envs
         self.shown = render and "rgb_array" in makes[0]().metadata.get("render_modes", ())
         if self.shown:
-            makes[0] = partial(_make, id, wrappers, settings | {"render_mode": "rgb_array"})
+            makes[0] = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
         rows = [_Row(make, makers, fresh) for make in makes]
         super().__init__(rows, seed, first_seed, cases, device)
         env = rows[0].env
@@ -121,10 +124,11 @@ class GymnasiumEnv(SeededRows):
         self.floats = torch.empty(0, dtype=dtype).numpy().dtype
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
+        name = _name(maker)
         self.entries = [
-            Entry(id, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
+            Entry(name, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
         ]
-        self._declare_specs(id, makers, dtype)
+        self._declare_specs(name, makers, dtype)
 
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
         action, number = action_spec(id, self.space, dtype), Unbounded(1, dtype=dtype)
@@ -169,6 +173,24 @@ class GymnasiumEnv(SeededRows):
         for row in self.rows:
             row.env.close()
         super().close(raise_if_closed=raise_if_closed)
+
+    def encode(self, observation: Any, *, first: bool) -> TensorDict:
+        """Return the entries of an env of one row for an observation that comes from elsewhere.
+
+        Controllers beside the env are asked too; the env itself is not stepped.
+
+        Args:
+            observation: as a Gymnasium env of this kind gives it.
+            first: whether it is the first one of an episode.
+        """
+        (row,) = self.rows
+        row.observe(observation, first=first)
+        return self._output(stepped=not first)
+
+    def decode(self, actions: torch.Tensor) -> Any:
+        """Return the action of an env of one row as a Gymnasium env of this kind takes it."""
+        (action,) = self._decode(actions.cpu().numpy())
+        return action
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
         if isinstance(self.space, spaces.Box):
@@ -231,6 +253,16 @@ class _Row:
             reset()
         self._advise()
 
+    def observe(self, observation: Any, *, first: bool) -> None:
+        """Take an observation that comes from elsewhere."""
+        if not hasattr(self, "observation"):
+            self.begin(0)  # controllers may read what an env has after its reset only
+        self.observation, self.reward, self.info = observation, 0.0, {}
+        if first:
+            for _, reset in self.controllers.values():
+                reset()
+        self._advise()
+
     def step(self, action: Any) -> None:
         if self.terminated or self.truncated:
             self.reward = 0.0
@@ -255,15 +287,51 @@ class _Row:
             self.advice[name] = advice - start(space)
 
 
-def _make(id: str, wrappers: Sequence[Callable[[Env], Env]], settings: Mapping[str, Any]) -> Env:
-    """Return an env of Gymnasium in its wrappers; a `ValueError` says why it cannot be made."""
+def _maker(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
+    """Return the maker that MODULE:NAME names, if it is no registered name; else `id` itself."""
+    if not isinstance(id, str) or ":" not in id:
+        return id
+    module, _, name = id.partition(":")
     try:
-        env: Env = gymnasium.make(id, **{"disable_env_checker": True, **settings})
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return id  # Gymnasium says what is wrong
+    return found if callable(found) and name not in gymnasium.registry else id
+
+
+def _name(maker: str | Callable[..., Env]) -> str:
+    return maker if isinstance(maker, str) else getattr(maker, "__qualname__", repr(maker))
+
+
+def _make(
+    maker: str | Callable[..., Env],
+    wrappers: Sequence[Callable[[Env], Env]],
+    settings: Mapping[str, Any],
+) -> Env:
+    """Return an env in its wrappers; a `ValueError` says why it cannot be made."""
+    try:
+        if isinstance(maker, str):
+            env: Env = gymnasium.make(maker, **{"disable_env_checker": True, **settings})
+        else:
+            env = _called(maker, settings)
     except (errors.Error, ImportError, TypeError, AssertionError, OSError, ValueError) as error:
-        raise ValueError(f"the env {id} cannot be made: {_reason(id, error)}") from error
+        name = _name(maker)
+        raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     for wrapper in wrappers:
         env = wrapper(env)
     return env
+
+
+def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
+    """Return the env of a maker, with the settings that `gymnasium.make` would handle itself."""
+    options = dict(settings)
+    steps = options.pop("max_episode_steps", None)
+    parameters = inspect.signature(maker).parameters.values()
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    if not takes_any and "render_mode" not in [parameter.name for parameter in parameters]:
+        options.pop("render_mode", None)
+    env = maker(**options)
+    return env if steps is None else gymnasium.wrappers.TimeLimit(env, steps)
 
 
 def _reason(id: str, error: Exception) -> str:

@@ -5,6 +5,7 @@ inside writes, or actions from a file. A configuration names them, so everything
 is refused at construction, in one sentence.
 """
 
+import copy
 import importlib
 import inspect
 import io
@@ -24,6 +25,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import did_you_mean
+from coil_rl.guides.functions import FunctionGuide
 from coil_rl.transforms.action_space import nested_key
 
 
@@ -123,17 +125,18 @@ class PerRow(TensorDictModuleBase):
 
 
 class ControllerGuide(TensorDictModuleBase):
-    """A controller that is named by `MODULE:NAME`. What is found there decides how it is used.
+    """A controller of somebody else. What it is decides how it is used.
 
     | it is | it becomes |
     | --- | --- |
-    | a class of TensorDictModules | the guide itself, with its own `in_keys` |
-    | another class of `nn.Module`s | a network from the entries [B, N] to the action [B, A] |
+    | a TensorDictModule, or a class of such | the guide itself, with its own `in_keys` |
+    | another `nn.Module`, or a class of such | a network from the entries [B, N] to actions [B, A] |
     | a class with a method `act` | `PerRow`: one object for each row of the env |
-    | a function | from the entries [B, N] to the action [B, A], tensors |
+    | an object with a method `act` | `PerRow`: one copy for each row of the env |
+    | a function | `FunctionGuide`: of one observation, or of a batch of them |
 
     Args:
-        of: such as `my_package.control:MyPID`.
+        of: the controller, or its name, such as `my_package.control:MyPID`.
         in_keys: entries to read; None for `observation`, or for those of a TensorDictModule.
         options: arguments of the class, or further ones of the function, by name.
 
@@ -143,35 +146,15 @@ class ControllerGuide(TensorDictModuleBase):
 
     def __init__(
         self,
-        of: str,
+        of: Any,
         in_keys: Sequence[NestedKey] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> None:
-        thing, options = load(of), dict(options or {})
-        keys = [nested_key(key) for key in in_keys or ["observation"]]
-        act = getattr(thing, "act", None)
-        guide: TensorDictModuleBase
-        if not inspect.isclass(thing):
-            if not callable(thing) or isinstance(thing, nn.Module):
-                raise ValueError(f"of={of} is {type(thing).__name__}; name a class or a function")
-            _check_call(thing, of, keys, options)
-            guide = TensorDictModule(partial(thing, **options), in_keys=keys, out_keys=["action"])
-        elif issubclass(thing, nn.Module):
-            _check_call(thing, of, [], options)
-            guide = module = thing(**options)
-            if not isinstance(module, TensorDictModuleBase):
-                guide = TensorDictModule(module, in_keys=keys, out_keys=["action"])
-            elif in_keys is not None:
-                raise ValueError(f"of={of} has its own in_keys={module.in_keys}; leave in_keys out")
-        elif callable(act):
-            _check_call(thing, of, [], options)
-            _check_call(act, f"{of}.act", ["self", *keys], {})
-            guide = PerRow(partial(thing, **options), keys)
-        else:
-            raise ValueError(
-                f"of={of} is a class without act(observation); give it this method, or name a "
-                "function"
-            )
+        thing = load(of) if isinstance(of, str) else of
+        title = of if isinstance(of, str) else type(of).__name__
+        keys = None if in_keys is None else [nested_key(key) for key in in_keys]
+        make = _of_class if inspect.isclass(thing) else _of_object
+        guide = make(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
         self.guide, self.pure = guide, getattr(thing, "pure", False)
@@ -179,6 +162,56 @@ class ControllerGuide(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
         return self.guide(tensordict)
+
+
+def _of_class(
+    kind: type, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
+) -> TensorDictModuleBase:
+    """Return the guide of a class, made with `options`."""
+    if issubclass(kind, nn.Module):
+        _check_call(kind, title, [], options)
+        return _of_module(kind(**options), title, keys)
+    act = getattr(kind, "act", None)
+    if not callable(act):
+        raise ValueError(
+            f"of={title} is a class without act(observation); give it this method, or name a "
+            "function"
+        )
+    read = keys or ["observation"]
+    _check_call(kind, title, [], options)
+    _check_call(act, f"{title}.act", ["self", *read], {})
+    return PerRow(partial(kind, **options), read)
+
+
+def _of_object(
+    thing: Any, title: str, keys: list[NestedKey] | None, options: dict[str, Any]
+) -> TensorDictModuleBase:
+    """Return the guide of a function, or of an object that is made already."""
+    is_module, acts = isinstance(thing, nn.Module), callable(getattr(thing, "act", None))
+    if (is_module or acts) and options:
+        raise ValueError(f"of={title} is an object, which takes no options; leave options out")
+    if is_module:
+        return _of_module(thing, title, keys)
+    read = keys or ["observation"]
+    if acts:
+        _check_call(thing.act, f"{title}.act", read, {})
+        return PerRow(partial(copy.deepcopy, thing), read)
+    if not callable(thing):
+        raise ValueError(
+            f"of={title} is {type(thing).__name__}; name a class, a function or an object with "
+            "act(observation)"
+        )
+    _check_call(thing, title, read, options)
+    return FunctionGuide(partial(thing, **options), read)
+
+
+def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
+    """Return the guide of a network."""
+    if not isinstance(module, TensorDictModuleBase):
+        return TensorDictModule(module, in_keys=keys or ["observation"], out_keys=["action"])
+    if keys is not None:
+        raise ValueError(f"of={title} has its own in_keys={module.in_keys}; leave in_keys out")
+    return module
 
 
 class EntryGuide(TensorDictModule):

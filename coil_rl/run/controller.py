@@ -9,6 +9,7 @@ action. It is the chain of an evaluation, step for step, without the env itself.
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,9 @@ from tensordict import TensorDict, TensorDictBase, is_tensor_collection
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
+
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.transforms import GuideActions
 
 
 class Controller:
@@ -46,6 +50,7 @@ class Controller:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
         self.env, self.policy = env.eval(), policy
         self.plant, self.folder = env.base_env, folder
+        self._check_read()
         self.reset()
 
     def reset(self) -> None:
@@ -92,6 +97,24 @@ class Controller:
         )
         self.env.transform.load_state_dict(state["transforms"])
 
+    def _check_read(self) -> None:
+        """Refuse a policy or guide that reads what is no part of an observation."""
+        guides = [part for part in self.env.transform.modules() if isinstance(part, GuideActions)]
+        for part in (self.policy, *guides):
+            for key in part.in_keys:
+                if isinstance(key, tuple) and key[0] == "info":
+                    raise ValueError(
+                        f"{'/'.join(key)} is read by the policy or its guide, but is no part of an "
+                        "observation"
+                    )
+        if isinstance(self.plant, GymnasiumEnv) and self.plant.rows[0].controllers:
+            names = ", ".join(self.plant.rows[0].controllers)
+            warnings.warn(
+                f"the controller {names} belongs to an env of its own, in which nothing happens: "
+                "its advice is right only if it reads nothing but the observation",
+                stacklevel=3,
+            )
+
     def _state(self, entries: TensorDictBase) -> TensorDictBase:
         """Return what the policy sees: the entries of the env after all transforms."""
         self.plant._complete_done(self.plant.full_done_spec, entries)
@@ -106,8 +129,8 @@ class Controller:
 
     def _entries(self, observation: Any) -> TensorDictBase:
         """Return the entries of the env for an observation, with the batch dimension."""
-        if hasattr(self.plant, "encode"):
-            return self.plant.encode(observation)
+        if isinstance(self.plant, GymnasiumEnv):
+            return self.plant.encode(observation, first=self._acted is None)
         spec = self.plant.full_observation_spec
         entries = spec.zero()
         if not isinstance(observation, Mapping) and not is_tensor_collection(observation):
@@ -128,7 +151,7 @@ class Controller:
         return entries
 
     def _decoded(self, action: Tensor) -> Any:
-        if hasattr(self.plant, "decode"):
+        if isinstance(self.plant, GymnasiumEnv):
             return self.plant.decode(action)
         return action.reshape(action.shape[len(self.env.batch_size) :]).cpu().numpy()
 
