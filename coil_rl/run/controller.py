@@ -123,6 +123,9 @@ class Controller:
             transform._reset_env_preprocess(None)
             return transform._reset(entries.empty(), entries)
         entries.update(self.plant.full_reward_spec.zero())
+        memory = self._acted.get("next", None)
+        if memory is not None:  # what the policy remembers, as an env keeps it
+            entries.update(memory.exclude(*entries.keys(True, True)))
         after = transform._step(self._executed, entries)
         after = self.env._step_proc_data(after)
         return self.env.step_mdp(self._acted.set("next", after))

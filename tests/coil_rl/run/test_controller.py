@@ -5,17 +5,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from outside_package.install import PROXY, SOURCE, TINY
+from outside_package.install import PROXY, SOURCE
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
+from coil_rl.run.controller import Controller
 from coil_rl.run.parts import TEST
 
 CONF = Path(__file__).parents[3] / "conf"
 METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
-STEPS = 30
-# Methods that train their guides need a guide that fits the env for their proxies.
-WITH_CHOICES = {"advisor"}
+STEPS = 20
+TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
+TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
+REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
+ON_POLICY = ["learner.minibatches=2", "learner.action_gain=1"]
+FOREST = ["learner.regressor.estimator.n_estimators=3"]
+# What makes a method small, and its policy do something before it has learned anything.
+OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
+OPTIONS |= {"dagger": FOREST, "oil": FOREST, "guide": [], "coil_anchored": ON_POLICY[:1]}
+# Learners that refuse a network with a memory.
+WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
+WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
 
 
 @pytest.fixture(autouse=True)
@@ -24,43 +34,114 @@ def package(monkeypatch):
     monkeypatch.syspath_prepend(SOURCE)
 
 
+def learned(folder, method, *overrides, guide="thermostat.control:PI", env="thermostat:Room-v0"):
+    """Return the folder of a run that has learned from one batch."""
+    words = [*TINY, *PROXY, *OPTIONS.get(method, ON_POLICY), f"proxy.folder={folder}_proxies"]
+    run = coil_rl.prepare(
+        env,
+        guide=None if method == "ppo" else guide,
+        method=method,
+        frames=32,
+        folder=folder,
+        overrides=[*words, *overrides],
+    )
+    run.begin()
+    if method != "guide":
+        run.learn()
+    return folder
+
+
 def executed(run):
     """Return observations of the plant and what it was given, in an episode of an evaluation."""
-    env = run.make_env(1, TEST).eval()
-    policy = run.policy(env)
-    plant, observations, actions = env.base_env, [], []
+    if run.make_learner is None:
+        env, policy = run.make_env.guided(1, TEST)
+    else:
+        env = run.make_env(1, TEST)
+        policy = run.policy(env)
+    plant, observations, actions = env.eval().base_env, [], []
     carrier = env.reset()
     with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
         for _ in range(STEPS):
             observations.append(plant.rows[0].observation)
             _, carrier = env.step_and_maybe_reset(policy(carrier))
-            actions.append(plant._decode(plant.actions[-1])[0])
+            actions.append(plant.decode(torch.from_numpy(plant.actions[-1])))
     return observations, actions
 
 
-def trained(folder, method, *overrides):
-    guide = None if method == "ppo" else "thermostat.control:PI"
-    return coil_rl.train(
-        "thermostat:Room-v0",
-        guide=guide,
-        method=method,
-        folder=folder,
-        overrides=[*TINY, *PROXY, f"proxy.folder={folder}/proxies_of_all", *overrides],
-    )
-
-
-@pytest.mark.parametrize("network", ["mlp", "gru"])
-@pytest.mark.parametrize("method", METHODS)
-def test_controller_acts_as_the_policy_does_in_an_evaluation(method, network, tmp_path):
-    folder = tmp_path / "run"
-    try:
-        run = trained(folder, method, *([] if network == "mlp" else ["network=gru"]))
-    except coil_rl.UserError as refusal:
-        pytest.skip(str(refusal))
-    observations, actions = executed(run)
+def check_same(folder):
+    observations, actions = executed(coil_rl.open_run(folder))
     controller = coil_rl.open_run(folder).controller()
     for _ in range(2):
         controller.reset()
         sent = [controller.act(observation) for observation in observations]
         np.testing.assert_allclose(sent, actions, rtol=0, atol=1e-6)
+    return observations, actions, controller
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
+    _, actions, _ = check_same(learned(tmp_path / "run", method))
     assert np.ptp(actions) > 1e-3
+
+
+@pytest.mark.parametrize(
+    "method", [method for method in METHODS if method not in {*WITHOUT_MEMORY, "guide"}]
+)
+def test_controller_has_the_memory_of_its_policy(method, tmp_path):
+    observations, actions, controller = check_same(
+        learned(tmp_path / "run", method, "network=gru", "learner.minibatches=1")
+    )
+    controller.reset()
+    for observation in observations[:7]:
+        controller.act(observation)
+    other = coil_rl.open_run(tmp_path / "run").controller()
+    other.load_state_dict(controller.state_dict())
+    np.testing.assert_allclose(other.act(observations[7]), actions[7], rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [["learner.normalise=true"], ["degrade=[delayed]"]])
+def test_controller_has_normaliser_and_degraded_advice_inside(options, tmp_path):
+    check_same(learned(tmp_path / "run", "coil", *options))
+
+
+def test_action_is_in_the_numbering_of_the_env(tmp_path):
+    folder = learned(tmp_path / "run", "ppo", env="CartPole-v1")
+    _, actions, controller = check_same(folder)
+    assert set(actions) <= {0, 1}
+    assert controller.act([0.0, 0.0, 0.0, 0.0]) in (0, 1)
+
+
+def test_controller_is_the_guide_of_another_run(tmp_path):
+    first = coil_rl.open_run(learned(tmp_path / "first", "residual"))
+    observations, actions = executed(first)
+    second = learned(tmp_path / "second", "guide", guide=first.controller())
+    guided = coil_rl.open_run(second).controller()
+    sent = [guided.act(observation) for observation in observations]
+    np.testing.assert_allclose(sent, actions, rtol=0, atol=1e-6)
+
+
+def test_env_with_several_rows_is_refused(tmp_path):
+    run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
+    env = run.make_env(2)
+    with pytest.raises(ValueError, match=r"a controller needs an env of one row, not \[2\]"):
+        Controller(env, run.policy(env))
+
+
+def test_cone_world_is_sent_its_steering(tmp_path):
+    folder = tmp_path / "run"
+    small = [*TINY[:2], "track=generated", "track.train.count=1", "track.test.count=1"]
+    small += [*ON_POLICY, "evaluation.gif=false", "logger=none", "evaluation.curve.cases={}"]
+    run = coil_rl.prepare(
+        "cone_track", guide="spline", method="residual", frames=32, folder=folder, overrides=small
+    )
+    run.begin()
+    run.learn()
+    env = run.make_env(1, TEST)
+    policy, controller = run.policy(env), run.controller()
+    carrier, read = env.eval().reset(), list(env.base_env.observation_spec.keys())
+    with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+        for _ in range(STEPS):
+            observation = carrier.select(*read)[0]
+            step, carrier = env.step_and_maybe_reset(policy(carrier))
+            sent = torch.as_tensor(controller.act(observation))
+            torch.testing.assert_close(sent, step["next", "executed_action"][0], rtol=0, atol=1e-6)
