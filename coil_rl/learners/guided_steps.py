@@ -1,6 +1,6 @@
 """Learning where a guide acts in some of the steps: the policy learns from its own steps only."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -29,13 +29,13 @@ class LossesOfAgentSteps:
     Args:
         losses: returns the losses of steps [N] by name, with `loss_objective`, `loss_critic` and
             perhaps `loss_entropy`.
-        critic_loss: returns the loss of the critic of steps [N].
+        critic_loss: returns the loss of the critic of steps [N], and more.
     """
 
     def __init__(
         self,
         losses: Callable[[TensorDictBase], TensorDictBase],
-        critic_loss: Callable[[TensorDictBase], Tensor],
+        critic_loss: Callable[[TensorDictBase], Sequence[Tensor]],
     ) -> None:
         self.losses, self.critic_loss = losses, critic_loss
 
@@ -45,7 +45,7 @@ class LossesOfAgentSteps:
         if len(agent_steps) < 2:  # one advantage cannot be standardised
             return self._without_policy(minibatch)
         losses = self.losses(agent_steps)
-        losses["loss_critic"] = self.critic_loss(minibatch)
+        losses["loss_critic"] = self.critic_loss(minibatch)[0].mean()
         return losses
 
     def _without_policy(self, minibatch: TensorDictBase) -> TensorDictBase:

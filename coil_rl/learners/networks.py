@@ -1,9 +1,8 @@
 """Policy and value networks, built from the specs of an env."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -24,12 +23,10 @@ from torchrl.data import (
     Unbounded,
 )
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.modules import (
     GRUModule,
     IndependentNormal,
     OneHotCategorical,
-    SafeProbabilisticModule,
     TanhNormal,
 )
 
@@ -45,9 +42,10 @@ from coil_rl.learners.encoders import (
 )
 from coil_rl.learners.heads import Choices, ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
+from coil_rl.learners.sampling import ClippedNormal, Sample
 from coil_rl.transforms.action_space import choices_of
 
-UNCLIPPED, REMEMBERED, NOISE = "unclipped_action", "remembered", "exploration_noise"
+REMEMBERED = "remembered"  # what a memory gives to the layers after it
 DEFAULT = Mlp()
 
 
@@ -77,76 +75,6 @@ class FastTensorDictModule(TensorDictModuleBase):
         ):
             tensordict.set(key, result)
         return tensordict
-
-
-class Sample(SafeProbabilisticModule):
-    """Module that samples from a distribution.
-
-    It writes the sample, and its logarithmic probability as `action_log_prob`. If a rollout has
-    written `exploration_noise`, standard normal numbers, a normal distribution takes these.
-
-    Args:
-        parameters: entries with the parameters of the distribution.
-        key: entry for the sample.
-        distribution: its class.
-        options: further arguments of the distribution by name; None: there are none.
-    """
-
-    def __init__(
-        self,
-        parameters: Sequence[str],
-        key: NestedKey,
-        distribution: type,
-        options: Mapping[str, Any] | None = None,
-    ) -> None:
-        super().__init__(
-            list(parameters),
-            [key],
-            distribution_class=distribution,
-            distribution_kwargs=dict(options or {}),
-            return_log_prob=True,
-            log_prob_key="action_log_prob",
-        )
-
-    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
-        """Write the sample and its logarithmic probability."""
-        noise = tensordict.get(NOISE, None)
-        if noise is None or exploration_type() is not ExplorationType.RANDOM:
-            return super().forward(tensordict, *args, **options)
-        distribution = self.get_dist(tensordict)
-        sample = tensordict["loc"] + tensordict["scale"] * noise
-        for transform in getattr(distribution, "transforms", ()):
-            sample = transform(sample)
-        return tensordict.set(self.out_keys[0], sample).set(
-            "action_log_prob", distribution.log_prob(sample)
-        )
-
-
-class ClippedNormal(Sample):
-    """Sample of a normal distribution, clipped to the bounds of an action.
-
-    It writes `unclipped_action`, the sample, with `action_log_prob`, and the action, which the env
-    executes.
-
-    Args:
-        low: lower bounds, of the shape of an action.
-        high: upper bounds, of the shape of an action.
-        action_key: entry for the action.
-    """
-
-    def __init__(self, low: Tensor, high: Tensor, action_key: NestedKey = "action") -> None:
-        super().__init__(["loc", "scale"], UNCLIPPED, IndependentNormal, {"event_dim": low.ndim})
-        self.low, self.high, self.action_key = low, high, action_key
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Keys of the entries that `forward` writes."""
-        return [*super().out_keys, self.action_key]
-
-    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
-        """Write the sample and the action."""
-        tensordict = super().forward(tensordict, *args, **options)
-        return tensordict.set(self.action_key, tensordict[UNCLIPPED].clamp(self.low, self.high))
 
 
 def action_spec(env: EnvBase) -> TensorSpec:

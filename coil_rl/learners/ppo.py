@@ -14,7 +14,7 @@ from typing import ClassVar, Literal
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from tensordict.utils import NestedKey
-from torch import Tensor, nn
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule
 
@@ -31,6 +31,7 @@ from coil_rl.learners.guided_steps import AGENT_ACTS, LossesOfAgentSteps, guide_
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.minibatches import minibatches_of
 from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
@@ -151,7 +152,7 @@ class PPO(Stateful, Learner):
         self.loss = self.build_loss(clip, critic)
         self.objective: Callable[[TensorDictBase], TensorDictBase] = self.losses
         if guide_may_act(env):
-            self.objective = LossesOfAgentSteps(self.losses, self.critic_loss)
+            self.objective = LossesOfAgentSteps(self.losses, self.loss.loss_critic)
 
         self.epochs, self.minibatches = epochs, minibatches
         self.sampler = minibatches_of(memory, epochs, minibatches, seed)
@@ -199,8 +200,8 @@ class PPO(Stateful, Learner):
 
     def _set_keys(self, env: EnvBase, in_keys: Sequence[NestedKey]) -> None:
         """Set the entries that batches and minibatches need."""
-        clips = networks.UNCLIPPED in self.policy.out_keys
-        self.sample_key = networks.UNCLIPPED if clips else env.action_key
+        clips = UNCLIPPED in self.policy.out_keys
+        self.sample_key = UNCLIPPED if clips else env.action_key
         observed = dict.fromkeys([*in_keys, *self.policy.in_keys])
         read = [*observed, self.sample_key, "action_log_prob", *self.extensions.keys]
         if guide_may_act(env):
@@ -266,10 +267,6 @@ class PPO(Stateful, Learner):
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
         """Return TorchRL's losses of a minibatch [N]: `loss_objective`, `loss_critic`, others."""
         return self.loss(minibatch)
-
-    def critic_loss(self, minibatch: TensorDictBase) -> Tensor:
-        """Return the loss of the critic of a minibatch [N], a scalar."""
-        return self.loss.loss_critic(minibatch)[0].mean()
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
         """Return the callbacks of the extensions."""

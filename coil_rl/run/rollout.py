@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
-from coil_rl.learners.networks import NOISE
+from coil_rl.learners.sampling import NOISE
 from coil_rl.transforms.guide_transform import set_progress
 
 

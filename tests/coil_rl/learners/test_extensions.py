@@ -1,0 +1,216 @@
+"""Extensions of learners: what is not part of an algorithm, handed over as one list."""
+
+import ast
+import copy
+import inspect
+from pathlib import Path
+
+import pytest
+import torch
+import worlds
+from any_env import AnyEnv
+from torchrl.data import Bounded, Unbounded
+
+import coil_rl.learners
+from coil_rl.learners import (
+    A2C,
+    DQN,
+    IBRL,
+    PPO,
+    SAC,
+    TRPO,
+    Advisor,
+    DynamicCoil,
+    KickstartLoss,
+    Reinforce,
+)
+from coil_rl.learners.extension import Extension
+from coil_rl.learners.extensions import Extensions
+from coil_rl.learners.learner import Learner
+from coil_rl.learners.minibatches import Minibatches
+from coil_rl.learners.several_agents import SummedRewards
+from coil_rl.train.rollout import Rollout
+
+FOLDER = Path(coil_rl.learners.__file__).parent
+
+
+class Counting(Extension):
+    """Writes down what is called, draws the policy to no noise, and halves the other losses."""
+
+    def __init__(self):
+        self.calls, self.updates = [], 0
+
+    def prepare(self, batch):
+        self.calls.append("prepare")
+        batch["next", "reward"] = batch["next", "reward"] * 0
+
+    def losses(self, policy, minibatch):
+        self.calls.append("losses")
+        distribution = policy.get_dist(minibatch.select(*policy.in_keys))
+        return {"loss_noise": distribution.base_dist.scale.mean()}
+
+    def weights(self, weights, progress):
+        self.calls.append("weights")
+        return {name: weight / 2 for name, weight in weights.items()} | {"loss_noise": progress}
+
+    def finish(self, batch, progress):
+        self.calls.append("finish")
+        self.updates += 1
+        return {"updates": float(self.updates)}
+
+    def state_dict(self):
+        return {"updates": self.updates}
+
+    def load_state_dict(self, state):
+        self.updates = state["updates"]
+
+
+def make(*extensions, kind=PPO, **options):
+    torch.manual_seed(0)
+    env = AnyEnv(4, Unbounded((2,)))
+    learner = kind(env, minibatches=2, auxiliary=extensions, **options)
+    return learner, Rollout(env, learner.policy, 8, learner.keys)
+
+
+def test_update_calls_an_extension_in_order():
+    counting = Counting()
+    learner, rollout = make(counting, epochs=3)
+    metrics = learner.update(rollout.collect(), 0.5)
+    assert counting.calls == ["prepare", "weights", *["losses"] * 6, "finish"]
+    assert metrics["updates"] == 1
+    assert 0 < metrics["loss_noise"] < 1
+    assert learner.loss_weights(0.5) == {
+        "loss_objective": 0.5,
+        "loss_critic": 0.5,
+        "loss_noise": 0.5,
+    }
+
+
+def test_extension_changes_the_batch_before_the_advantages():
+    learner, rollout = make(Counting(), gamma=0.0, gae_lambda=0.0)
+    rows = learner.prepare(rollout.collect(), 0.0)
+    assert (rows["value_target"] == 0).all()
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO])
+def test_loss_of_an_extension_trains_the_policy_of_each_on_policy_learner(kind):
+    learner, rollout = make(Counting(), kind=kind)
+    before = learner.update(rollout.collect(), 0.5)["loss_noise"]
+    for _ in range(5):
+        after = learner.update(rollout.collect(), 0.5)["loss_noise"]
+    assert after < before
+
+
+def test_state_of_an_extension_is_part_of_that_of_the_learner():
+    learner, rollout = make(Counting())
+    learner.update(rollout.collect())
+    state = copy.deepcopy(learner.state_dict())
+    counting = Counting()
+    other, _ = make(counting)
+    other.load_state_dict(state)
+    assert counting.updates == 1
+
+
+def test_extension_without_methods_changes_nothing():
+    trained = []
+    for extensions in ((), (Extension(),)):
+        learner, rollout = make(*extensions)
+        learner.update(rollout.collect())
+        trained.append(torch.nn.utils.parameters_to_vector(learner.policy.parameters()))
+    assert torch.equal(*trained)
+
+
+def test_extensions_act_one_after_the_other():
+    both = Extensions([Counting(), KickstartLoss(3.0)])
+    assert both.weights({"loss": 1.0}, 0.5) == {"loss": 0.5, "loss_noise": 0.5, "loss_guide": 3.0}
+    assert both.keys == ["guide_action"]
+    assert both.callbacks(None, None) == []
+
+
+def test_rewards_of_agents_are_summed():
+    env = AnyEnv(
+        8, Bounded(-1, 1, (3, 2)), {("agents", "observation"): Unbounded((3, 4))}, agents=True
+    )
+    learner = PPO(env, [("agents", "observation")])
+    (extension,) = learner.extensions.each
+    assert isinstance(extension, SummedRewards)
+    batch = Rollout(env, learner.policy, 4, learner.keys).collect()
+    extension.prepare(batch)
+    assert torch.equal(batch["next", "reward"], batch["next", "agents", "reward"].sum(-2))
+
+
+def test_minibatches_of_a_pass_are_all_steps_once_in_another_order_each():
+    rows = worlds.cones(cars=6).reset().select("observation").set("number", torch.arange(6))
+    passes = []
+    for seed in range(3):
+        first, second = Minibatches(1, 2, seed).draw(rows)
+        passes.append([*first["number"].tolist(), *second["number"].tolist()])
+    assert all(sorted(numbers) == list(range(6)) for numbers in passes)
+    assert len(set(map(tuple, passes))) > 1
+
+
+@pytest.mark.parametrize(("frames", "fits"), [(8, True), (7, False)])
+def test_batch_must_have_two_frames_for_each_minibatch(frames, fits):
+    learner = PPO(AnyEnv(4), minibatches=4)
+    if fits:
+        learner.check_batch(frames)
+    else:
+        with pytest.raises(ValueError, match="minibatches=4 leaves less than 2 frames to each"):
+            learner.check_batch(frames)
+
+
+def test_learner_needs_only_an_update_and_a_state():
+    class Idle(Learner):
+        def update(self, batch, progress=0.0):
+            return {}
+
+        def state_dict(self):
+            return {}
+
+        def load_state_dict(self, state):
+            pass
+
+    idle = Idle()
+    idle.check_batch(0)
+    idle.export(Path("nowhere"))
+    assert idle.kind == "agent"
+    assert idle.callbacks(None) == []
+    assert not idle.guides
+    assert idle.critic is None
+
+
+@pytest.mark.parametrize("kind", [PPO, A2C, Reinforce, TRPO, Advisor, DynamicCoil, SAC, IBRL, DQN])
+def test_each_argument_of_a_learner_is_named_and_documented(kind):
+    _, *parameters = inspect.signature(kind.__init__).parameters.values()
+    assert all(each.kind is not each.VAR_KEYWORD for each in parameters)
+    described = inspect.getdoc(kind).partition("Args:\n")[2].partition("\n\n")[0]
+    lines = [line for line in described.splitlines() if not line.startswith(" " * 8)]
+    assert {line.strip().partition(":")[0] for line in lines} == {p.name for p in parameters}
+
+
+def test_no_file_of_the_learners_imports_itself_through_others():
+    imports = {}
+    for file in FOLDER.glob("*.py"):
+        if file.stem != "__init__":
+            imports[file.stem] = imported(file)
+
+    def reached(name):
+        found, waiting = set(), [name]
+        while waiting:
+            new = imports[waiting.pop()] - found
+            found |= new
+            waiting += new
+        return found
+
+    assert not [name for name in imports if name in reached(name)]
+
+
+def imported(file):
+    """Return the files of the learners that a file imports, also those for type checkers only."""
+    names = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module == "coil_rl.learners":
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module.startswith("coil_rl.learners."):
+            names.add(node.module.rpartition(".")[2])
+    return names
