@@ -73,7 +73,7 @@ def drive(path, scans=60, odometry=False, commands=False, seed=0):
 
 
 def labelling_drives(seeds):
-    """Simulated drives past the left cones alone and past the right cones alone, a pair for each seed."""
+    """Simulated drives past the left cones alone and past the right ones, a pair for each seed."""
     return [simulated_drive(side, seed) for seed in seeds for side in ("left", "right")]
 
 
@@ -93,7 +93,10 @@ def store(path, *messages, kind=SCAN, topic="/scan", **channel):
 
 
 def rosbag_of(folder, *messages, latched=()):
-    """A recording by the writer of rosbags: of messages with topic, type, time and fields; and with latched topics."""
+    """A recording by the writer of rosbags.
+
+    It is made of messages with topic, type, time and fields, and has the latched topics.
+    """
     transient = QosDurability.TRANSIENT_LOCAL
     always = QosTime(2147483647, 4294967295)
     qos = Qos(

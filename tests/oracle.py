@@ -1,6 +1,6 @@
-"""Independent implementation of the cone world for one car, in plain NumPy and SciPy, without code of `coil_rl`.
+"""Independent implementation of the cone world for one car, in plain NumPy and SciPy.
 
-Every step tests every cone of the track.
+It uses no code of `coil_rl`. Every step tests every cone of the track.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ def chord_length(points: Array) -> Array:
 
 
 def fit_cubic(points: Array, smoothing: float) -> tuple[Array, Curve]:
-    """Fit the natural cubic smoothing spline by chord length; return the parameters of the points and the curve.
+    """Fit the natural cubic smoothing spline by chord length.
 
-    Least squares of weight * |y - f|^2 + smoothing * integral |f''|^2: with the second derivatives
-    R^-1 Q' f at the inner points, the integral is |L^-1 Q' f|^2, where R = L L'.
+    Returns the parameters of the points, and the curve. Least squares of weight * |y - f|^2 +
+    smoothing * integral |f''|^2: with the second derivatives R^-1 Q' f at the inner points, the
+    integral is |L^-1 Q' f|^2, where R = L L'.
     """
     points, weights = merge(points)
     u = chord_length(points)
@@ -116,7 +117,10 @@ def guide_action(
     smoothing: float = 1.0,
     gain: float = 1.0,
 ) -> float:
-    """Return the advice of appendix A.1 for the visible cones (car frame, nearest first), a fraction of 80 degrees."""
+    """Return the advice of appendix A.1 for the visible cones, as a fraction of 80 degrees.
+
+    The cones are in the frame of the car, nearest first.
+    """
     points = midpoints(left, right)
     if len(points) < 2:
         return steering
@@ -232,11 +236,10 @@ class OneCar:
                 if entered and len(cones) < 2:
                     self.samples[side] = np.zeros((SAMPLES, 2))
             if len(cones) >= 2:
-                u, curve = (
-                    fit_cubic(cones, self.smoothing)
-                    if self.spline == "cubic"
-                    else fit_parabola(cones)
-                )
+                if self.spline == "cubic":
+                    u, curve = fit_cubic(cones, self.smoothing)
+                else:
+                    u, curve = fit_parabola(cones)
                 self.samples[side] = curve(np.linspace(0, u[-1], SAMPLES))
             samples = self.samples[side]
             if samples is None:
@@ -256,39 +259,12 @@ class OneCar:
         newest_first = (self.history[:-21:-1] + [0.0] * 20)[:20]
         roughness = abs(action - float(RECENT @ newest_first))
 
-        x, y, heading = self.pose
-        dt = 1 / self.rate
-        x += self.speed * np.cos(heading) * dt
-        y += self.speed * np.sin(heading) * dt
-        heading += self.speed / self.car_length * np.sin(action * MAX_STEERING) * dt
-        self.pose = np.array([x, y, heading])
+        self.move(action)
         self.history.append(action)
         self.steps += 1
-
-        inside = bool(np.linalg.norm(self.pose[:2] - self.finish) < FINISH_RADIUS)
-        entered = inside and not self.in_finish
-        self.in_finish = inside
-        lap_time = 0.0
-        if entered:
-            if self.lap_start is not None:
-                lap_time = (self.steps - self.lap_start) * dt
-                self.lap += 1
-            self.lap_start = self.steps
-
+        lap_time = self.count_laps()
         self.find_visible()
-        cone_sides, entered = 0, False
-        for side in range(2):
-            now = set(self.visible[side])
-            if lap_time:
-                self.rewarded[side] = set()
-            known = (
-                self.rewarded[side] if self.cone_bonus == "first_sighting" else self.before[side]
-            )
-            cone_sides += bool(now - known)
-            entered |= bool(now - self.before[side])
-            self.rewarded[side] |= now
-            self.before[side] = now
-
+        cone_sides, entered = self.count_new_cones(new_lap=lap_time > 0)
         observation, self.latest = self.latest, self.observe(entered)
         if not self.late_observation:
             observation = self.latest
@@ -317,6 +293,43 @@ class OneCar:
             terminated=terminated,
             truncated=not terminated and self.steps >= round(self.time_limit * self.rate),
         )
+
+    def move(self, action: float) -> None:
+        x, y, heading = self.pose
+        dt = 1 / self.rate
+        x += self.speed * np.cos(heading) * dt
+        y += self.speed * np.sin(heading) * dt
+        heading += self.speed / self.car_length * np.sin(action * MAX_STEERING) * dt
+        self.pose = np.array([x, y, heading])
+
+    def count_laps(self) -> float:
+        """Return the time of the lap just completed, else 0."""
+        inside = bool(np.linalg.norm(self.pose[:2] - self.finish) < FINISH_RADIUS)
+        entered = inside and not self.in_finish
+        self.in_finish = inside
+        lap_time = 0.0
+        if entered:
+            if self.lap_start is not None:
+                lap_time = (self.steps - self.lap_start) * (1 / self.rate)
+                self.lap += 1
+            self.lap_start = self.steps
+        return lap_time
+
+    def count_new_cones(self, *, new_lap: bool) -> tuple[int, bool]:
+        """Return the number of sides with a rewarded cone, and whether a cone came into view."""
+        cone_sides, entered = 0, False
+        for side in range(2):
+            now = set(self.visible[side])
+            if new_lap:
+                self.rewarded[side] = set()
+            known = self.before[side]
+            if self.cone_bonus == "first_sighting":
+                known = self.rewarded[side]
+            cone_sides += bool(now - known)
+            entered |= bool(now - self.before[side])
+            self.rewarded[side] |= now
+            self.before[side] = now
+        return cone_sides, entered
 
 
 @dataclass

@@ -89,7 +89,10 @@ def reloaded(state):
 
 
 def continued(make):
-    """Return the second batch of a rollout, and that of one with another seed that was restored after the first."""
+    """Return the second batch of a rollout, and that of a restored one.
+
+    The latter has another seed and was restored after the first batch.
+    """
     first, second = make(3), make(4)
     first.collect()
     second.load_state_dict(reloaded(first.state_dict()))

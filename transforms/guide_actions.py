@@ -65,14 +65,7 @@ class Guides(TensorDictModuleBase):
         if not guides:
             raise ValueError("at least one guide is required, none was given")
         for name, guide in guides.items():
-            if action_key not in guide.out_keys:
-                raise ValueError(
-                    f"guide {name!r} must write {action_key!r}; it writes {guide.out_keys}"
-                )
-            if not name or "." in name or hasattr(nn.ModuleDict, name):
-                raise ValueError(
-                    f"{name!r} cannot be the name of a guide: PyTorch reserves it; use another name"
-                )
+            _check_guide(name, guide, action_key)
             if trainable and next(guide.parameters(), None) is None:
                 raise ValueError(
                     f"guide {name!r} has no parameters to train; imitate it with a network "
@@ -143,6 +136,16 @@ class Guides(TensorDictModuleBase):
             of_entries = {each.dtype for each in read if each.is_floating_point()}
             if len(of_guide) == 1 and of_entries - of_guide:
                 self._input_dtype[name] = of_guide.pop()
+
+
+def _check_guide(name: str, guide: TensorDictModuleBase, action_key: NestedKey) -> None:
+    """Raise a `ValueError` for a guide that does not write `action_key` or has an invalid name."""
+    if action_key not in guide.out_keys:
+        raise ValueError(f"guide {name!r} must write {action_key!r}; it writes {guide.out_keys}")
+    if not name or "." in name or hasattr(nn.ModuleDict, name):
+        raise ValueError(
+            f"{name!r} cannot be the name of a guide: PyTorch reserves it; use another name"
+        )
 
 
 def _converted(value: Tensor, dtype: torch.dtype) -> Tensor:

@@ -409,28 +409,29 @@ def _ignore_other_types(
     contents.messages[topic] = [
         message for message in contents.messages[topic] if message.channel not in others
     ]
-    given = f"{others[0].message_type or 'no type'} in {others[0].encoding or 'no encoding'}"
+    kind = others[0].message_type or "no type"
+    encoding = others[0].encoding or "no encoding"
     needed = " or ".join(types)
     if len(others) < len(channels):
         return (
-            f"has messages of {given} on topic {topic}, not of {needed} in cdr, and they are "
-            "ignored"
+            f"has messages of {kind} in {encoding} on topic {topic}, not of {needed} in cdr, and "
+            "they are ignored"
         )
     other_topics = _topics(contents, types)
     if topic == scan and not other_topics:
         raise RecordingError(
-            f"{path} has messages of {given} on topic {topic}, not of {needed} in cdr; record the "
-            f"scans as {SCAN} with ROS 2."
+            f"{path} has messages of {kind} in {encoding} on topic {topic}, not of {needed} in "
+            f"cdr; record the scans as {SCAN} with ROS 2."
         )
     if topic == scan:
         raise RecordingError(
-            f"{path} has messages of {given} on topic {topic}, not of {needed} in cdr; give the "
-            f"topic of such messages, here {other_topics}."
+            f"{path} has messages of {kind} in {encoding} on topic {topic}, not of {needed} in "
+            f"cdr; give the topic of such messages, here {other_topics}."
         )
-    advice = f"; give the topic of such messages, here {other_topics}" if other_topics else ""
+    remedy = f"; give the topic of such messages, here {other_topics}" if other_topics else ""
     return (
-        f"has messages of {given} on topic {topic}, not of {needed} in cdr, and they are "
-        f"ignored{advice}"
+        f"has messages of {kind} in {encoding} on topic {topic}, not of {needed} in cdr, and they "
+        f"are ignored{remedy}"
     )
 
 

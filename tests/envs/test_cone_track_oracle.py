@@ -92,7 +92,7 @@ def drive(
 
 
 def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[float, float, Outcome]]:
-    """Yield the oracle's advice, its smallest gap between midpoints and its outcome under the same actions."""
+    """Yield the oracle's advice, smallest gap of midpoints and outcome for the same actions."""
     car = OneCar(track.left, track.right, track.start, **preset.env)
     for action in actions:
         cones = car.cones()
@@ -105,7 +105,7 @@ def retrace(track: Track, preset: Preset, actions: Array) -> Iterator[tuple[floa
 
 
 def assert_agreement(track: Track, preset: Preset, trace: dict[str, Array]) -> Outcome:
-    """Compare one car's episode, trace [steps, ...], with the oracle's; return the oracle's last outcome."""
+    """Compare the trace [steps, ...] of an episode with the oracle; return its last outcome."""
     advice, gaps, outcomes = zip(*retrace(track, preset, trace["action"][:, 0]), strict=True)
     expected = {
         key: np.array([getattr(outcome, key) for outcome in outcomes])

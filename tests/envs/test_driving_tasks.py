@@ -36,7 +36,7 @@ def drive(
 
 
 def one_step(ring: Track, position: float, action: float, **kwargs: Any) -> TensorDictBase:
-    """Drive one step to this lateral position on a round track, 1 at the left boundary; [1, ...]."""
+    """Drive one step to a lateral position on a round track, 1 at the left boundary; [1, ...]."""
     env = DrivingTasksEnv([ring], 1, tasks=TASKS, **kwargs)
     state = env.reset()
     length = env.speed / env.rate

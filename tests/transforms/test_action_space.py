@@ -176,7 +176,7 @@ KEYS = {"action_key": ("agents", "action"), "advice_key": ("agents", "advice")}
 
 @pytest.mark.parametrize("number", [False, True])
 def test_advice_of_several_agents(number):
-    """Each agent of a row has its own advice, and the other transforms find it under nested keys."""
+    """Each agent of a row has its own advice; the other transforms find it under nested keys."""
     spec = Bounded(-9, 9, (4, 3, 1)) if number else Categorical(5, (4, 3))
     guide = TensorDictModule(
         lambda x: (x[..., :1] if number else x[..., 0].long()).clamp(max=4),

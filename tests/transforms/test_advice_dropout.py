@@ -7,7 +7,10 @@ from coil_rl.transforms import AdviceDropout
 
 
 def given(env, steps=30):
-    """Return by step whether there is advice, whether it is zero, and where episodes begin, [steps, rows] each."""
+    """Return whether there is advice, whether it is zero, and where episodes begin.
+
+    Each is [steps, rows].
+    """
     data, rows = env.reset(), []
     for _ in range(steps):
         shown = data["advice_given"][:, 0]

@@ -1,4 +1,4 @@
-"""Training, evaluation and schedules of the transforms in TorchRL's own collectors and batches of envs."""
+"""Training, evaluation and schedules of the transforms in TorchRL's collectors and batches."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""Controllers of other people: Python objects, functions, networks, entries of the env, recordings."""
+"""Controllers of other people: objects, functions, networks, entries of the env, files."""
 
 import importlib
 import textwrap
@@ -266,7 +266,8 @@ def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tm
         (None, "actions.csv cannot be read as numbers"),
         (
             "0.1\nleft\n",
-            r"actions.csv cannot be read as numbers with commas \(could not convert string to float: 'left'",
+            r"actions.csv cannot be read as numbers with commas \(could not convert string to "
+            "float: 'left'",
         ),
         ("", "must hold at least one line of finite numbers"),
         ("a,b\n", "must hold at least one line of finite numbers"),

@@ -41,7 +41,10 @@ def advice(left, right, steering=0.0, **kwargs):
 
 
 def arc(x, y, turn=1.4):
-    """Steering for `turn` times the curvature 2 sin(alpha) / d of the arc to (x, y), for a car of 2 m."""
+    """Steering for `turn` times the curvature of the arc to (x, y), for a car of 2 m.
+
+    The curvature is 2 sin(alpha) / d.
+    """
     return math.asin(2 * turn * 2 * y / (x * x + y * y)) / math.radians(80)
 
 

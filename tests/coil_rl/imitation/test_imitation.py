@@ -41,7 +41,7 @@ def linear(**changes):
 
 @pytest.fixture(scope="module")
 def batches(env):
-    """Two batches of random driving with crashes and resets, with all entries that a guide may read."""
+    """Two batches of random driving with crashes and resets, with all that a guide may read."""
     torch.manual_seed(1)
     rollout = Rollout(
         env,

@@ -386,7 +386,8 @@ def test_damage_anywhere_is_found_or_harmless(tmp_path, compression):
         ({"scan": "/front"}, "has no topic /front; give the topic of the LiDAR, here /scan"),
         (
             {"scan": "/odom", "odometry": None},
-            f"has messages of {ODOMETRY} in cdr on topic /odom, not of {SCAN} in cdr; give the topic",
+            f"has messages of {ODOMETRY} in cdr on topic /odom, not of {SCAN} in cdr; give the "
+            "topic",
         ),
         ({"scan": "/odom"}, "must be different topics"),
     ],
@@ -413,10 +414,8 @@ def test_other_encodings_and_types_are_refused(tmp_path, channel):
         channel.get("kind", SCAN) or "no type",
         channel.get("encoding", "cdr") or "no encoding",
     )
-    assert (
-        f"has messages of {kind} in {encoding} on topic /scan, not of {SCAN} in cdr; record the scans"
-        in message
-    )
+    found = f"has messages of {kind} in {encoding} on topic /scan"
+    assert f"{found}, not of {SCAN} in cdr; record the scans" in message
 
 
 OTHERS = {
@@ -475,7 +474,10 @@ def scanners(path, *, frames=("front", "rear"), ranges=(12.0, 12.0), senders=(""
 
 def test_of_several_scanners_on_a_topic_the_chosen_one_is_read(tmp_path):
     path = scanners(tmp_path / "a.mcap")
-    words = r"several scanners on topic /scan, of which the first is read: front \(4 scans.*, rear \(3 .*frame=NAME$"
+    words = (
+        r"several scanners on topic /scan, of which the first is read: "
+        r"front \(4 scans.*, rear \(3 .*frame=NAME$"
+    )
     with pytest.warns(UserWarning, match=words):
         first = read_recording(path)
     assert (first.frame, len(first.ranges)) == ("front", 4)
