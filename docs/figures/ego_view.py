@@ -78,7 +78,15 @@ def draw_field_of_view(axes: Axes, sight: float, half_angle: float) -> None:
 
 
 def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples: Array) -> None:
-    """Draw the boundary estimate of a side, if it is valid, and its samples [5, 2] m: hollow if they are remembered."""
+    """Draw the estimate of a boundary, if it is valid, and its samples.
+
+    Args:
+        axes: of the panel.
+        boundary: the splines of both sides.
+        side: index of the side.
+        valid: whether the estimate is valid; if not, the samples are remembered, and hollow.
+        samples: [5, 2] m.
+    """
     colour = LINE_COLOURS[side]
     if valid:
         curve = boundary.equidistant(CURVE_POINTS)[:, :, side, 0]
