@@ -1,4 +1,4 @@
-"""Train on a disk that is full at random moments, resume with room, and compare with an uninterrupted run.
+"""Train on a disk that is full at random moments, resume, and compare with an uninterrupted run.
 
     python tests/full_disk.py --runs 10 [--seed 0] [--folder FOLDER] [--disk FOLDER] [OVERRIDES of
     coil-train ...]
@@ -27,7 +27,7 @@ from kill_and_resume import describe_state, differences, finish, start
 def interrupted_by_full_disk(
     folder: Path, overrides: list[str], room: int, disk: Path | None
 ) -> list[str]:
-    """Start a run with so many bytes of room, and return its lines on standard error without the progress."""
+    """Start a run with so many bytes of room; return its standard error without the progress."""
     filler = folder.parent / "filler"
     limit = (
         None
@@ -88,7 +88,8 @@ def main(argv: list[str] | None = None) -> int:
             if arguments.disk:
                 shutil.rmtree(folder)
     print(
-        f"{arguments.runs - wrong} of {arguments.runs} runs with a full disk ended like the uninterrupted one"
+        f"{arguments.runs - wrong} of {arguments.runs} runs with a full disk "
+        "ended like the uninterrupted one"
     )
     return int(wrong > 0)
 

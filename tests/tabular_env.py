@@ -1,4 +1,4 @@
-"""A finite Markov decision process as a batched env, with known optimal policies for tests of learners."""
+"""A finite Markov decision process as a batched env, whose optimal policies are known."""
 
 import torch
 from tensordict import TensorDict
@@ -9,7 +9,9 @@ from coil_rl.envs.cone_track import SeededEnv
 
 
 class TabularEnv(SeededEnv):
-    """B agents; `action` [B] and one-hot `observation` [B, S]; absorbing states without reward terminate.
+    """B agents with `action` [B] and one-hot `observation` [B, S].
+
+    Absorbing states without reward terminate.
 
     `P` and `R` [S, A, S] are probabilities and rewards, `start` [S] the probabilities of the first
     state (uniform).

@@ -28,7 +28,7 @@ def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the sources in which the links are small text files, as Git writes them on Windows.
+    """Return a copy of the sources in which the links are small text files, as on Windows.
 
     A nested YAML and a track are added to test the globs.
     """

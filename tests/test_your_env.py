@@ -1,4 +1,7 @@
-"""docs/your_env.md: its commands and Python blocks run, at toy size, and its other code is that of the package."""
+"""docs/your_env.md: its commands and Python blocks run, at toy size.
+
+Its other code is that of the package.
+"""
 
 import math
 import re

@@ -29,5 +29,8 @@ def test_type_checkers_see_the_same_names():
 
 
 def test_import_of_the_package_is_light():
-    script = "import sys, coil_rl; assert not {'torch', 'hydra'} & set(sys.modules); from coil_rl import UserError"
+    script = (
+        "import sys, coil_rl; assert not {'torch', 'hydra'} & set(sys.modules); "
+        "from coil_rl import UserError"
+    )
     subprocess.run([sys.executable, "-c", script], check=True)
