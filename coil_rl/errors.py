@@ -43,6 +43,9 @@ def is_no_bug(error: BaseException) -> bool:
     """Return whether an error has a cause outside of the program.
 
     That is the input, the configuration or the disk.
+
+    Args:
+        error: of a program.
     """
     outside = isinstance(error, (UserError, OmegaConfBaseException))
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
@@ -78,7 +81,11 @@ def did_you_mean(given: str, known: Iterable[str]) -> str:
 
 
 def sentence(error: BaseException) -> str:
-    """Return the message of an error of the user, of Hydra or of OmegaConf on one line."""
+    """Return the message of an error of the user, of Hydra or of OmegaConf on one line.
+
+    Args:
+        error: the error.
+    """
     return " ".join(_message(error).split())
 
 

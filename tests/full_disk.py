@@ -29,12 +29,9 @@ def interrupted_by_full_disk(
 ) -> list[str]:
     """Start a run with so many bytes of room; return its standard error without the progress."""
     filler = folder.parent / "filler"
-    limit = (
-        None
-        if disk
-        else partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-    )
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
     if disk:
+        limit = None
         with filler.open("wb") as file:
             file.write(bytes(max(0, shutil.disk_usage(disk).free - room)))
     process = start(folder, overrides, stderr=subprocess.PIPE, preexec_fn=limit)
@@ -75,12 +72,11 @@ def main(argv: list[str] | None = None) -> int:
             found = differences(place / "whole", folder)
             is_one_sentence = len(lines) == 1 and "cannot be" in lines[0]
             # A limit may be larger than all files.
-            verdict = (
-                "OK"
-                if not found and (is_one_sentence or lines == ["exit code 0"])
-                else f"WRONG: {found} {lines}"
-            )
-            wrong += verdict != "OK"
+            if not found and (is_one_sentence or lines == ["exit code 0"]):
+                verdict = "OK"
+            else:
+                verdict = f"WRONG: {found} {lines}"
+                wrong += 1
             print(
                 f"{number:3}  {room:8} bytes: {state:40} {(lines or [''])[-1]}  {verdict}",
                 flush=True,

@@ -229,7 +229,8 @@ def keys_of(node: DictConfig, path: str = "") -> list[str]:
     """Return the full keys of all values and nodes of a configuration."""
     names = []
     for key in node:
-        names.append(name := f"{path}.{key!s}".lstrip("."))
+        name = f"{path}.{key!s}".lstrip(".")
+        names.append(name)
         value = node._get_node(key)
         if (
             isinstance(value, DictConfig)
@@ -345,9 +346,8 @@ class Fuzzer:
             given.append(f"learner={learner}")
             usual += f" {LEARNERS[learner]}"
         tracks = ["generated", "generated", "folder track.dir=levels", "robot"]
-        if "generated" in (
-            track := draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])
-        ):
+        track = draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])
+        if "generated" in track:
             track += (
                 f" track.train.count={draw.choice([1, 2])} track.test.count={draw.choice([1, 2])}"
             )
@@ -435,7 +435,8 @@ class Fuzzer:
     def _start(case: Case, place: Path) -> int:
         """Run the program of a case in a forked process and return how it ended."""
         sys.stdout.flush()
-        if pid := os.fork():
+        pid = os.fork()
+        if pid:
             _, status, used = os.wait4(pid, 0)
             case.seconds = used.ru_utime + used.ru_stime
             return os.waitstatus_to_exitcode(status)
@@ -472,22 +473,21 @@ class Fuzzer:
         lines = [line for line in error.splitlines() if line.strip() and not NOTES.search(line)]
         changed = {name for name, state in self._files(place).items() if before.get(name) != state}
         stopped, repository = status == 130 and case.patient, self._repository()
+        outside = {name for name in changed if not _may_write(case, name)}
+        outside |= repository - self.repository
         case.outcome = {0: "ran", 2: "refused", 130: "stopped"}.get(status, f"exit code {status}")
         if "Traceback" in error:
             case.failure, case.cause = "traceback", _cause(error)
         elif "File" in stacks and not stopped:
             case.failure = "hang" if case.seconds > PATIENCE else "crash"
             stack = re.split(r"\n(?!  File)", stacks[stacks.find("  File") :])[0]
-            case.cause = _cause(
-                "\n".join(stack.splitlines()[::-1])
-            )  # as a traceback, the innermost line last
+            # As a traceback, the innermost line last.
+            case.cause = _cause("\n".join(stack.splitlines()[::-1]))
         elif status not in (0, 2) and not stopped:
             case.failure = "exit code"
         elif status and (len(lines) != 1 or not lines[0].startswith(f"{case.words[0]}: ")):
             case.failure, case.cause = "sentences", " | ".join(lines)[:200]
-        elif outside := {name for name in changed if not _may_write(case, name)} | (
-            repository - self.repository
-        ):
+        elif outside:
             case.failure, case.cause = "outside", ", ".join(sorted(outside))[:200]
         elif half := _half_written(case, place, changed, status):
             case.failure, case.cause = "half-written", ", ".join(sorted(half))[:200]

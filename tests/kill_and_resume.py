@@ -72,11 +72,8 @@ def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Pope
 
 def marks(folder: Path) -> int:
     """Return the progress of a run: rows of its log and finished files."""
-    rows = (
-        (folder / "metrics.csv").read_bytes().count(b"\n")
-        if (folder / "metrics.csv").exists()
-        else 0
-    )
+    log = folder / "metrics.csv"
+    rows = log.read_bytes().count(b"\n") if log.exists() else 0
     return rows + sum((folder / name).exists() for name in MILESTONES)
 
 

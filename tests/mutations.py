@@ -8,7 +8,7 @@ import json
 import math
 import random
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -104,9 +104,12 @@ def junk(draw: random.Random) -> Any:
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:
     """Yield every container and key of a tree."""
-    for key in (
-        tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
-    ):
+    keys: Iterable[Any] = ()
+    if isinstance(tree, dict):
+        keys = tree
+    elif isinstance(tree, list):
+        keys = range(len(tree))
+    for key in keys:
         yield tree, key
         yield from places(tree[key])
 

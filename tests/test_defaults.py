@@ -59,11 +59,9 @@ def defaults(target: Any) -> dict[str, Any]:
     function = target.__init__ if inspect.isclass(target) else target
     parameters = inspect.signature(function).parameters.values()
     passes_on = inspect.isclass(target) and any(p.kind is p.VAR_KEYWORD for p in parameters)
-    inherited = (
-        defaults(target.__bases__[0])
-        if passes_on and target.__module__.startswith("coil_rl.")
-        else {}
-    )
+    inherited = {}
+    if passes_on and target.__module__.startswith("coil_rl."):
+        inherited = defaults(target.__bases__[0])
     return inherited | {p.name: p.default for p in parameters if p.default is not p.empty}
 
 

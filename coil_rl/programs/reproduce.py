@@ -100,6 +100,9 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 def requested(config: DictConfig) -> list[str]:
     """Return the names in `results` of the requested results, at least one.
 
+    Args:
+        config: of the program.
+
     Raises:
         UserError: if nothing is requested, or something unknown.
     """

@@ -124,11 +124,10 @@ def draw_advice(axes: Axes, degrees: float, length: float) -> None:
     tip = (-length * math.sin(angle), length * math.cos(angle))
     arrow = {"arrowstyle": "-|>", "color": ADVICE_COLOUR, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tip, (0, 0), arrowprops=arrow, zorder=8.5)
-    text = (
-        "straight on"
-        if abs(degrees) < 0.5
-        else f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
-    )
+    if abs(degrees) < 0.5:
+        text = "straight on"
+    else:
+        text = f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
     axes.text(
         1,
         0.02,

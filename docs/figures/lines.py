@@ -217,15 +217,11 @@ def main() -> None:
     tracks, drives = drive(options.runs, options.tracks, options.policy)
     straight = [StraightTrack(track) for track in tracks]
     draw(options.output / "lines.png", straight, drives)
-    rows = [
-        {
-            "driver": name,
-            **episode,
-            "path": of_track.path_ratio(line_of(result, index)) if episode["laps"] else None,
-        }
-        for name, result in drives.items()
-        for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True))
-    ]
+    rows = []
+    for name, result in drives.items():
+        for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True)):
+            ratio = of_track.path_ratio(line_of(result, index)) if episode["laps"] else None
+            rows.append({"driver": name, **episode, "path": ratio})
     columns = {
         "driver": ("driver", ""),
         "case": ("track", ""),

@@ -22,9 +22,9 @@ def test_type_checkers_see_the_same_names():
         for node in ast.parse(Path(coil_rl.__file__).read_text()).body
         if isinstance(node, ast.If)
     ]
-    names = {
-        alias.asname: f"{node.module}.{alias.name}" for node in block.body for alias in node.names
-    }
+    names = {}
+    for node in block.body:
+        names |= {alias.asname: f"{node.module}.{alias.name}" for alias in node.names}
     assert names == {name: f"{coil_rl._MODULES[name]}.{name}" for name in coil_rl.__all__}
 
 

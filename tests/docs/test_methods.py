@@ -6,6 +6,7 @@ The options are named with their defaults.
 import json
 import re
 import shlex
+from itertools import chain
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -36,11 +37,8 @@ def table(page, *headings):
     tables = re.findall(
         rf"^\| {head} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE
     )
-    return [
-        [cell.strip() for cell in row.strip("|").split("|")]
-        for rows in tables
-        for row in rows.splitlines()
-    ]
+    rows = chain.from_iterable(rows.splitlines() for rows in tables)
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
 
 
 INDEX = {

@@ -472,11 +472,10 @@ def leaves(node, path=""):
     for key in node:
         name = f"{path}.{key}".lstrip(".")
         value = node._get_node(key)
-        yield from (
-            leaves(value, name)
-            if isinstance(value, DictConfig) and not value._is_interpolation()
-            else [name]
-        )
+        if isinstance(value, DictConfig) and not value._is_interpolation():
+            yield from leaves(value, name)
+        else:
+            yield name
 
 
 with initialize_config_module("coil_rl.conf", version_base="1.3"):
