@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench reproduce test test-all kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce test test-all test-bench kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -28,9 +28,8 @@ train: $(INSTALLED) ## train an agent with a guide's advice, e.g. ARGS='seed=1'
 evaluate: $(INSTALLED) ## evaluate a trained agent, e.g. ARGS='run=outputs/train/THE_RUN'
 	$(BIN)/coil-evaluate $(ARGS)
 
-# Stable-Baselines3 is needed for this comparison only.
-bench: $(INSTALLED) ## measure the speed of everything, e.g. ARGS='--device cuda'
-	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
+# A comparison of speeds means something only if both compute the same.
+bench: test-bench ## measure the speed of everything, e.g. ARGS='--device cuda'
 	$(BIN)/python -m benchmarks $(ARGS)
 
 reproduce: $(INSTALLED) ## make every result of the paper at the smallest budget (BUDGET=paper for the real one)
@@ -41,6 +40,11 @@ test: $(INSTALLED) ## run the fast tests
 
 test-all: $(INSTALLED) ## run all tests, also the slow ones
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m '' $(ARGS)
+
+# Stable-Baselines3 is needed for this comparison only; without it these tests are skipped.
+test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that compare with it
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/coil_rl/learners/test_ppo_sb3.py tests/benchmarks/test_beside_sb3.py
 
 kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
 	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)

@@ -1,1 +1,1 @@
-"""Speed measurements, outside the installed package: `make bench` or `python -m benchmarks --help`."""
+"""Speed measurements: `make bench` or `python -m benchmarks --help`. They are not installed."""

@@ -1,4 +1,7 @@
-"""Command line of the speed measurements: measure the parts, compare with the goals, write benchmark.md and .json."""
+"""Command line of the speed measurements.
+
+The parts are measured and compared with the goals; the results are benchmark.md and benchmark.json.
+"""
 
 from __future__ import annotations
 
@@ -56,6 +59,7 @@ PARTS: Mapping[str, tuple[str, Callable[[Namespace], list[Row] | str]]] = {
     "command": ("coil-train with its defaults, from the command to its pictures", measure_command),
     "compiled": ("The guide's drives in steps per second, with compiled steps", measure_compiled),
 }
+# Part of the results, text of the row, key of the number, and the bound that it is to keep.
 GOALS = [
     ("training", "PPO / by hand, {batch}", "ppo / by hand", ">=", 0.9),
     ("training", "COIL / by hand, {batch}", "coil / by hand", ">=", 0.9),
@@ -135,9 +139,9 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
     )
     args = parser.parse_intermixed_args(argv)
     sizes = QUICK if args.quick else FULL
-    vars(args).update(
-        {key: value for key, value in sizes.items() if getattr(args, key, None) is None}
-    )
+    for key, value in sizes.items():
+        if getattr(args, key, None) is None:
+            setattr(args, key, value)
     if args.compile:
         args.parts = [*args.parts, "compiled"]
     if (args.output / "benchmark.json").exists():
@@ -149,12 +153,11 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
 
 def check_configuration(args: Namespace) -> None:
     """Raise a `UserError` for the first mistake in the overrides."""
-    if method := [
-        override for override in args.overrides if re.match(r"[+~]*method(@\w*)?=", override)
-    ]:
-        raise UserError(
-            f"{method[0]} has no effect: the methods ppo and coil are compared; leave it out"
-        )
+    for override in args.overrides:
+        if re.match(r"[+~]*method(@\w*)?=", override):
+            raise UserError(
+                f"{override} has no effect: the methods ppo and coil are compared; leave it out"
+            )
     try:
         check_parts(train_config(args, "coil"))
     except HydraException as error:
@@ -167,24 +170,17 @@ def goals(results: Mapping[str, Any]) -> list[Row]:
     for part, subject, key, sign, bound in GOALS:
         for row in results.get(part, []):
             if key in row:
-                met = row[key] >= bound if sign == ">=" else row[key] < bound
-                rows.append(
-                    {
-                        "subject": subject.format(**row),
-                        "value": row[key],
-                        "goal": f"{sign} {bound}",
-                        "met": met,
-                    }
-                )
+                goal: Row = {"subject": subject.format(**row), "value": row[key]}
+                goal["goal"] = f"{sign} {bound}"
+                goal["met"] = row[key] >= bound if sign == ">=" else row[key] < bound
+                rows.append(goal)
     return rows
 
 
 def page(results: Mapping[str, Any]) -> str:
     """Return the results as Markdown tables."""
-    sections = [
-        ("Goals", results["goals"]),
-        *((title, results.get(part)) for part, (title, _) in PARTS.items()),
-    ]
+    sections = [("Goals", results["goals"])]
+    sections += [(title, results.get(part)) for part, (title, _) in PARTS.items()]
     return "\n\n".join(f"## {title}\n\n{_table(rows)}" for title, rows in sections if rows)
 
 
@@ -211,9 +207,8 @@ def _run(args: Namespace) -> None:
     check_configuration(args)
     torch.set_num_threads(args.threads)
     torch.manual_seed(0)
-    os.environ.setdefault(
-        "KINETO_LOG_LEVEL", "99"
-    )  # the profiler prints its start and end otherwise
+    # The profiler prints its start and end otherwise.
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")
     args.output.mkdir(parents=True, exist_ok=True)
     settings = {key: value for key, value in vars(args).items() if key != "output"}
     results: dict[str, Any] = {"versions": versions(), "settings": settings, "goals": []}

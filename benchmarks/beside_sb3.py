@@ -1,4 +1,6 @@
-"""Our learners beside those of Stable-Baselines3: the same hyper-parameters, frames and Gymnasium envs.
+"""Our learners beside those of Stable-Baselines3.
+
+Both train with the same hyper-parameters and frames on the same Gymnasium envs.
 
     python -m benchmarks.beside_sb3 ppo Pendulum-v1 --frames 40000 --seeds 3
 
@@ -89,15 +91,48 @@ EPISODES, FIRST_SEED = 20, 100_000  # of the evaluation
 def ours(
     algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int
 ) -> tuple[Act, float]:
-    """Train our learner and return its deterministic policy, and the gradient steps per CPU second of its updates."""
+    """Train our learner.
+
+    Args:
+        algorithm: "ppo", "sac" or "dqn".
+        env_id: Gymnasium's name of the env.
+        values: hyper-parameters, see `VALUES`.
+        frames: of the training.
+        seed: of the env and of the learner.
+
+    Returns:
+        The deterministic policy, and the gradient steps per CPU second of the updates.
+    """
     torch.manual_seed(seed)
     env = GymnasiumEnv(env_id, values["envs"], seed=seed)
-    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")} | {
-        "seed": seed
+    learner = our_learner(algorithm, env, values, seed)
+    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
+    stopwatch, steps = updates_of(learner, "update"), 0.0
+    for count in range(frames // rollout.frames):
+        metrics = learner.update(rollout.collect(), count * rollout.frames / frames)
+        epochs = values.get("epochs", 0)
+        steps += metrics.get("minibatches", epochs * rollout.frames / values["minibatch"])
+
+    def act(observation: Tensor) -> Tensor:
+        state = TensorDict({"observation": observation}, observation.shape[:1])
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            action: Tensor = learner.policy(state)["action"]
+        return action
+
+    return act, per_second(steps, stopwatch)
+
+
+def our_learner(
+    algorithm: str, env: GymnasiumEnv, values: Mapping[str, Any], seed: int
+) -> PPO | SAC | DQN:
+    """Return our learner with the values of Stable-Baselines3; see `ours`."""
+    common: dict[str, Any] = {
+        "learning_rate": values["learning_rate"],
+        "gamma": values["gamma"],
+        "seed": seed,
     }
-    learner: PPO | SAC | DQN
     if algorithm == "ppo":
-        learner = PPO(
+        return PPO(
             env,
             hidden=(64, 64),
             action_scale=1.0,
@@ -108,62 +143,58 @@ def ours(
             entropy=values["entropy"],
             **common,
         )
-    else:
-        replay = (
-            common | {name: values[name] for name in ("tau", "starts")} | {"capacity": CAPACITY}
-        )
-        replay |= {
-            "batch_size": values["minibatch"],
-            "ratio": values["minibatch"] / values["every"],
-        }
-        network = Mlp(values["hidden"], "relu")
-        if algorithm == "sac":
-            # The default of Stable-Baselines3 is for actions in [-1, 1], ours for those of the env.
-            high, size = env.action_spec.space.high, env.action_spec.shape[-1]
-            entropy = -size + size * math.log(float(high.max()))
-            learner = SAC(
-                env,
-                network=network,
-                target_entropy=entropy,
-                temperature=1.0,
-                max_grad_norm=1e6,
-                **replay,
-            )
-        else:
-            epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
-            learner = DQN(env, network=network, epsilon=epsilon, double=False, **replay)
-    rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
-    stopwatch, steps = updates_of(learner, "update"), 0.0
-    for count in range(frames // rollout.frames):
-        metrics = learner.update(rollout.collect(), count * rollout.frames / frames)
-        steps += metrics.get(
-            "minibatches", values.get("epochs", 0) * rollout.frames / values["minibatch"]
-        )
-
-    def act(observation: Tensor) -> Tensor:
-        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
-            action: Tensor = learner.policy(
-                TensorDict({"observation": observation}, observation.shape[:1])
-            )["action"]
-        return action
-
-    return act, per_second(steps, stopwatch)
+    common |= {
+        "network": Mlp(values["hidden"], "relu"),
+        "tau": values["tau"],
+        "starts": values["starts"],
+        "capacity": CAPACITY,
+        "batch_size": values["minibatch"],
+        "ratio": values["minibatch"] / values["every"],
+    }
+    if algorithm == "sac":
+        # The default of Stable-Baselines3 is for actions in [-1, 1], ours for those of the env.
+        high, size = env.action_spec.space.high, env.action_spec.shape[-1]
+        entropy = -size + size * math.log(float(high.max()))
+        return SAC(env, target_entropy=entropy, temperature=1.0, max_grad_norm=1e6, **common)
+    epsilon = Linear(1.0, values["epsilon"], until=values["explore"])
+    return DQN(env, epsilon=epsilon, double=False, **common)
 
 
 def theirs(
     algorithm: str, env_id: str, values: Mapping[str, Any], frames: int, seed: int
 ) -> tuple[Act, float]:
-    """Train the learner of Stable-Baselines3, and return its policy and its gradient steps per CPU second as `ours`."""
-    import stable_baselines3
+    """Train the learner of Stable-Baselines3; see `ours`."""
     from stable_baselines3.common.env_util import make_vec_env
 
     # Its default, rgb_array, makes LunarLander slower and slower: particles are added, but no
     # picture removes them.
     envs = make_vec_env(env_id, values["envs"], seed=seed, env_kwargs={"render_mode": None})
-    common: dict[str, Any] = {name: values[name] for name in ("learning_rate", "gamma")}
-    common |= {"batch_size": values["minibatch"], "seed": seed, "device": "cpu"}
+    model = their_learner(algorithm, envs, values, seed)
+    stopwatch = updates_of(model, "train")
+    model.learn(frames)
+    steps = model._n_updates
+    if algorithm == "ppo":  # which counts epochs
+        steps *= values["envs"] * values["steps"] / values["minibatch"]
+
+    def act(observation: Tensor) -> Tensor:
+        return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
+
+    return act, per_second(steps, stopwatch)
+
+
+def their_learner(algorithm: str, envs: Any, values: Mapping[str, Any], seed: int) -> Any:
+    """Return the learner of Stable-Baselines3 for its vector of envs; see `ours`."""
+    import stable_baselines3
+
+    common: dict[str, Any] = {
+        "learning_rate": values["learning_rate"],
+        "gamma": values["gamma"],
+        "batch_size": values["minibatch"],
+        "seed": seed,
+        "device": "cpu",
+    }
     if algorithm == "ppo":
-        model = stable_baselines3.PPO(
+        return stable_baselines3.PPO(
             "MlpPolicy",
             envs,
             n_steps=values["steps"],
@@ -172,37 +203,24 @@ def theirs(
             ent_coef=values["entropy"],
             **common,
         )
-    else:
-        common |= {
-            "tau": values["tau"],
-            "learning_starts": values["starts"],
-            "buffer_size": CAPACITY,
-        }
-        steps = values["envs"] * values["steps"] // values["every"]
-        common |= {"train_freq": values["steps"], "gradient_steps": steps}
-        common["policy_kwargs"] = {"net_arch": list(values["hidden"]), "activation_fn": nn.ReLU}
-        if algorithm == "sac":
-            model = stable_baselines3.SAC("MlpPolicy", envs, **common)
-        else:
-            model = stable_baselines3.DQN(
-                "MlpPolicy",
-                envs,
-                target_update_interval=values["every"],
-                exploration_fraction=values["explore"],
-                exploration_final_eps=values["epsilon"],
-                **common,
-            )
-    stopwatch = updates_of(model, "train")
-    model.learn(frames)
-    # Its PPO counts epochs.
-    steps = model._n_updates * (
-        values["envs"] * values["steps"] / values["minibatch"] if algorithm == "ppo" else 1
+    common |= {
+        "tau": values["tau"],
+        "learning_starts": values["starts"],
+        "buffer_size": CAPACITY,
+        "train_freq": values["steps"],
+        "gradient_steps": values["envs"] * values["steps"] // values["every"],
+        "policy_kwargs": {"net_arch": list(values["hidden"]), "activation_fn": nn.ReLU},
+    }
+    if algorithm == "sac":
+        return stable_baselines3.SAC("MlpPolicy", envs, **common)
+    return stable_baselines3.DQN(
+        "MlpPolicy",
+        envs,
+        target_update_interval=values["every"],
+        exploration_fraction=values["explore"],
+        exploration_final_eps=values["epsilon"],
+        **common,
     )
-
-    def act(observation: Tensor) -> Tensor:
-        return torch.from_numpy(model.predict(observation.numpy(), deterministic=True)[0])
-
-    return act, per_second(steps, stopwatch)
 
 
 def updates_of(learner: object, method: str) -> Stopwatch:
@@ -220,11 +238,8 @@ def per_second(steps: float, stopwatch: Stopwatch) -> float:
 def mean_return(env_id: str, act: Act) -> float:
     """Return the mean return of one episode from each of the fixed seeds."""
     env = GymnasiumEnv(env_id, EPISODES, first_seed=FIRST_SEED)
-    carrier, running, total = (
-        env.reset(),
-        torch.ones(EPISODES, 1, dtype=torch.bool),
-        torch.zeros(EPISODES, 1),
-    )
+    carrier = env.reset()
+    running, total = torch.ones(EPISODES, 1, dtype=torch.bool), torch.zeros(EPISODES, 1)
     while running.any():
         step = env.step(carrier.set("action", act(carrier["observation"])))
         total += step["next", "reward"] * running
@@ -263,13 +278,8 @@ def main(argv: Sequence[str] | None = None) -> None:
         speed = [statistics.median(numbers[name]) for numbers in (rates, steps)]
         rows.append([name, statistics.mean(returns[name]), spread, *speed])
     print(f"{args.algorithm}, {args.env}, {args.frames} frames, {args.seeds} runs, {values}")
-    print(
-        tabulate(
-            rows,
-            ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"],
-            floatfmt=".0f",
-        )
-    )
+    headings = ["", "return", "sd", "frames per CPU s", "gradient steps per CPU s"]
+    print(tabulate(rows, headings, floatfmt=".0f"))
 
 
 if __name__ == "__main__":

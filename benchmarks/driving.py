@@ -34,15 +34,8 @@ from coil_rl.transforms import GuideActions
 def train_config(args: Namespace, method: str, *more: str) -> DictConfig:
     """Return the configuration of `coil-train` with the overrides of the command line."""
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        given = [
-            f"method={method}",
-            f"device={args.device}",
-            "logger=none",
-            "run_dir=unused",
-            *args.overrides,
-            *more,
-        ]
-        return compose("train", given)
+        fixed = [f"method={method}", f"device={args.device}", "logger=none", "run_dir=unused"]
+        return compose("train", [*fixed, *args.overrides, *more])
 
 
 def driving_env(args: Namespace, cars: int, guide: bool) -> EnvBase:
@@ -89,9 +82,8 @@ def measure_driving(args: Namespace) -> list[Row]:
     """Return a row for each number of cars."""
     rows = []
     for cars in args.cars:
-        bare, guided = (
-            Driving(driving_env(args, cars, guide)).until_resets() for guide in (False, True)
-        )
+        bare = Driving(driving_env(args, cars, guide=False)).until_resets()
+        guided = Driving(driving_env(args, cars, guide=True)).until_resets()
         following = Driving(driving_env(args, cars, True), follow=True)
         rates = measure(args, {"env": bare, "advice": guided, "follow": following})
         median = medians(rates)
@@ -111,24 +103,24 @@ def measure_driving(args: Namespace) -> list[Row]:
 
 
 def measure_cores(args: Namespace) -> list[Row]:
-    """Return the steps per second of cars that the guide drives, shared by one process on each core."""
+    """Return the speed of cars that the guide drives, shared by one process on each core."""
     count, context = os.cpu_count() or 1, torch.multiprocessing.get_context("spawn")
     cars, queue = args.compare_cars // count, context.SimpleQueue()
     torch.multiprocessing.spawn(
         _drive_at_once, (args, cars, context.Barrier(count), queue), nprocs=count
     )
-    rates = {
-        "together (steps/s)": [
-            sum(turn) for turn in zip(*(queue.get() for _ in range(count)), strict=True)
-        ]
-    }
+    by_process = [queue.get() for _ in range(count)]
+    rates = {"together (steps/s)": [sum(turn) for turn in zip(*by_process, strict=True)]}
     return [{"cars": cars * count, "processes": count, **medians(rates), "rounds": rates}]
 
 
 def _drive_at_once(
     process: int, args: Namespace, cars: int, barrier: Barrier, queue: SimpleQueue
 ) -> None:
-    """Put the steps per second of each turn into the queue; all processes begin a turn at the same time."""
+    """Put the steps per second of each turn into the queue.
+
+    All processes begin a turn at the same time.
+    """
     torch.set_num_threads(1)
     driving = Driving(driving_env(args, cars, guide=True), follow=True)
     turn, rates = Namespace(repeats=1, seconds=args.seconds / args.repeats), []
@@ -150,21 +142,18 @@ def measure_compiled(args: Namespace) -> list[Row]:
         seconds = time.perf_counter() - start
         eager = Driving(driving_env(args, cars, guide=True), follow=True)
         rates = measure(args, {"eager": eager, "compiled": compiled})
-        ratio = median_ratio(rates["compiled"], rates["eager"])
-        rows.append(
-            {
-                "cars": cars,
-                **medians(rates),
-                "ratio": ratio,
-                "compiling (s)": seconds,
-                "rounds": rates,
-            }
-        )
+        row: Row = {"cars": cars, **medians(rates)}
+        row["ratio"] = median_ratio(rates["compiled"], rates["eager"])
+        row["compiling (s)"], row["rounds"] = seconds, rates
+        rows.append(row)
     return rows
 
 
 def profile_operators(args: Namespace, steps: int = 20) -> str:
-    """Return the profiler's table of the operators with most own time in batched steps with advice."""
+    """Return the profiler's table of the slowest operators in batched steps with advice.
+
+    They are ordered by the time of their own.
+    """
     driving = Driving(driving_env(args, args.compare_cars, guide=True)).until_resets()
     device = "device" if args.device.startswith("cuda") else "cpu"
     with profile() as profiler:
@@ -181,10 +170,8 @@ def measure_robot(args: Namespace) -> list[Row]:
         save_drive(simulated_drive("both", 0), path)
         recording = read_recording(path)
         ranges, angles = recording.ranges, recording.angles(0)
-        perceive, scan = (
-            Perception(simulated_cone_classifier()),
-            itertools.cycle(range(len(ranges))),
-        )
+        perceive = Perception(simulated_cone_classifier())
+        scan = itertools.cycle(range(len(ranges)))
 
         def single_scan() -> int:
             row = next(scan)

@@ -22,15 +22,25 @@ from coil_rl.schedules import schedule
 
 
 class Batch(NamedTuple):
-    """T steps of B cars."""
+    """T steps of B cars.
 
-    observation: Tensor  # [T, B, D], including the advice
-    raw: Tensor  # [T, B, A], action before tanh
-    log_prob: Tensor  # [T, B]
-    reward: Tensor  # [T, B]
-    terminated: Tensor  # [T, B]
-    done: Tensor  # [T, B]
-    after: Tensor  # [T, B, D], next observation before any reset
+    Attributes:
+        observation: [T, B, D], including the advice.
+        raw: [T, B, A], the action before tanh.
+        log_prob: [T, B], log-density of the action.
+        reward: [T, B].
+        terminated: [T, B].
+        done: [T, B], terminated or truncated.
+        after: [T, B, D], the next observation before any reset.
+    """
+
+    observation: Tensor
+    raw: Tensor
+    log_prob: Tensor
+    reward: Tensor
+    terminated: Tensor
+    done: Tensor
+    after: Tensor
 
 
 class PlainPPO:
@@ -94,13 +104,15 @@ class PlainPPO:
                 fresh = self.env._reset(TensorDict({"_reset": done}, self.env.batch_size))
                 self.observation = after.clone()
                 self.observation[done] = self.observe(fresh.select(*keys)[done])
-            rows.append(
-                (observation, raw, self.log_prob(raw, mean), reward, terminated, done, after)
-            )
+            log_prob = self.log_prob(raw, mean)
+            rows.append((observation, raw, log_prob, reward, terminated, done, after))
         return Batch(*(torch.stack(column) for column in zip(*rows, strict=True)))
 
     def log_prob(self, raw: Tensor, mean: Tensor) -> Tensor:
-        """Return the log-density [...] of tanh(raw): that of the normal raw minus the log-derivative of tanh."""
+        """Return the log-density of tanh(raw), [...], summed over the action's components.
+
+        It is the log-density of the normal raw action minus the log-derivative of tanh.
+        """
         standard = (raw - mean) * (-self.log_scale).exp()
         normal = -0.5 * standard.square() - self.log_scale - 0.5 * math.log(2 * math.pi)
         return (normal - 2 * (math.log(2) - raw - F.softplus(-2 * raw))).sum(-1)
@@ -138,14 +150,12 @@ class PlainPPO:
         for group in self.optimiser.param_groups:
             group["lr"] = self.learning_rate(progress)
         columns = (batch.observation, batch.raw, batch.log_prob, *self.advantages(batch))
-        flat = [
-            column.transpose(0, 1).flatten(0, 1) for column in columns
-        ]  # car by car, as a TorchRL batch
+        # Car by car, as a TorchRL batch.
+        flat = [column.transpose(0, 1).flatten(0, 1) for column in columns]
         size = len(flat[0]) // self.hyper.minibatches
         for _ in range(self.hyper.epochs):
-            order = torch.randperm(len(flat[0]), generator=self.generator)[
-                : size * self.hyper.minibatches
-            ]
+            order = torch.randperm(len(flat[0]), generator=self.generator)
+            order = order[: size * self.hyper.minibatches]
             for rows in order.to(flat[0].device).split(size):
                 loss = self.loss(*(column[rows] for column in flat))
                 self.optimiser.zero_grad()

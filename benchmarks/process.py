@@ -1,4 +1,6 @@
-"""Start-up time and memory of fresh processes, as modules are imported once and peak memory never decreases.
+"""Start-up time and memory of fresh processes.
+
+They are fresh because modules are imported only once, and peak memory never decreases.
 
 `python -m benchmarks.process CARS STEPS DEVICE THREADS` prints one line of JSON.
 """
@@ -18,27 +20,30 @@ ROOT = Path(__file__).parents[1]
 
 
 def measure_processes(args: Namespace) -> list[Row]:
-    """Return a row for each number of cars in `memory_cars`, and one for an update of COIL with the first batch."""
+    """Return a row for each number of cars in `memory_cars`, and one for an update of COIL.
+
+    The update is that with the first one of `batches`.
+    """
     rows = []
-    for cars, steps in [*((cars, 0) for cars in args.memory_cars), args.batches[0]]:
-        command = [
-            sys.executable,
-            "-m",
-            __name__,
-            str(cars),
-            str(steps),
-            args.device,
-            str(args.threads),
-        ]
+    sizes = [(cars, 0) for cars in args.memory_cars]
+    for cars, steps in [*sizes, args.batches[0]]:
+        options = [str(cars), str(steps), args.device, str(args.threads)]
+        command = [sys.executable, "-m", __name__, *options]
         done = subprocess.run(command, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
-        rows.append(
-            {"cars": cars, "trained steps": steps, **json.loads(done.stdout.splitlines()[-1])}
-        )
+        numbers = json.loads(done.stdout.splitlines()[-1])
+        rows.append({"cars": cars, "trained steps": steps, **numbers})
     return rows
 
 
 def main(cars: int, steps: int, device: str, threads: int) -> Row:
-    """Import, build an env with advice and step it; with steps > 0 also train COIL once on a batch of that length."""
+    """Import, build an env with advice and step it, and perhaps train COIL once.
+
+    Args:
+        cars: number of cars.
+        steps: length of the batch of the training; 0 for no training.
+        device: of the env.
+        threads: of torch.
+    """
     start = time.perf_counter()
     import torch
     from torchrl.envs import Compose, RewardSum, TransformedEnv
@@ -64,26 +69,32 @@ def main(cars: int, steps: int, device: str, threads: int) -> Row:
         learner.update(Rollout(env, learner.policy, steps, learner.keys).collect())
     else:
         env.rollout(5, break_when_any_done=False)
-    state_bytes = sum(
-        b.numel() * b.element_size() for b in env.base_env.buffers() if cars in b.shape
-    )
+    state_bytes = 0
+    for buffer in env.base_env.buffers():
+        if cars in buffer.shape:
+            state_bytes += buffer.numel() * buffer.element_size()
+    on_gpu = device.startswith("cuda")
     return {
         "import (s)": imported - start,
         "building (s)": built - imported,
         "first step (s)": stepped - built,
         "state per car (B)": state_bytes / cars,
         "peak (MB)": peak_memory(),
-        "device peak (MB)": torch.cuda.max_memory_allocated() / 1e6
-        if device.startswith("cuda")
-        else None,
+        "device peak (MB)": torch.cuda.max_memory_allocated() / 1e6 if on_gpu else None,
     }
 
 
 def peak_memory() -> float | None:
-    """Return the peak resident memory since `reset_peak` in MB; that of `getrusage` includes the parent process."""
+    """Return the peak resident memory since `reset_peak` in MB; None if it is unknown.
+
+    The peak of `getrusage` would include the parent process.
+    """
     status = Path("/proc/self/status")
-    lines = status.read_text().splitlines() if status.exists() else []
-    return next((int(line.split()[1]) / 1e3 for line in lines if line.startswith("VmHWM:")), None)
+    if status.exists():
+        for line in status.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) / 1e3
+    return None
 
 
 def reset_peak() -> None:

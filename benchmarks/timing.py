@@ -55,7 +55,13 @@ def synchronise() -> None:
 
 
 class Stopwatch:
-    """Total time of methods by name, by a clock. A timed method inside another counts for the outer one."""
+    """Total time of methods by name.
+
+    A timed method that another one calls counts for the outer one.
+
+    Args:
+        clock: returns seconds.
+    """
 
     def __init__(self, clock: Clock = time.perf_counter) -> None:
         self.clock = clock
@@ -63,7 +69,13 @@ class Stopwatch:
         self.running = False
 
     def wrap(self, owner: object, method: str, name: str) -> None:
-        """Time all further calls of a method of one object."""
+        """Time all further calls of a method of one object.
+
+        Args:
+            owner: the object.
+            method: name of the method.
+            name: under which its time is added up.
+        """
         inner = getattr(owner, method)
 
         def timed(*args: Any, **kwargs: Any) -> Any:

@@ -1,4 +1,7 @@
-"""Training speed beside yardsticks: PPO by hand, Stable-Baselines3, and one car in NumPy and SciPy."""
+"""Training speed beside yardsticks.
+
+These are PPO by hand, Stable-Baselines3, and one car in NumPy and SciPy.
+"""
 
 from __future__ import annotations
 
@@ -45,6 +48,13 @@ class Training:
     """Training of `coil-train`; each call is one update and returns its frames.
 
     Replay of off-policy learners is filled first.
+
+    Args:
+        args: options of the benchmark.
+        method: name of the method.
+        cars: number of cars.
+        steps: length of a rollout.
+        compile: whether the update is compiled.
     """
 
     def __init__(
@@ -70,15 +80,14 @@ class Training:
     def watch(self, stopwatch: Stopwatch) -> None:
         """Time the parts of later updates, by the names of `SHARES`."""
         env, learner = self.experiment.rollout.env, self.experiment.learner
-        timed = [(env.base_env, "_step", "env"), (env.base_env, "_reset", "env")]
-        for guides in (module for module in env.transform if isinstance(module, GuideActions)):
-            timed += [(guides, "_call", "guide"), (guides, "_reset", "guide")]
-        for owner, method, name in [
-            *timed,
-            (learner.policy, "forward", "policy"),
-            (learner, "update", "update"),
-        ]:
-            stopwatch.wrap(owner, method, name)
+        stopwatch.wrap(env.base_env, "_step", "env")
+        stopwatch.wrap(env.base_env, "_reset", "env")
+        for transform in env.transform:
+            if isinstance(transform, GuideActions):
+                stopwatch.wrap(transform, "_call", "guide")
+                stopwatch.wrap(transform, "_reset", "guide")
+        stopwatch.wrap(learner.policy, "forward", "policy")
+        stopwatch.wrap(learner, "update", "update")
 
 
 def has_yardstick(args: Namespace) -> bool:
@@ -102,48 +111,43 @@ def by_hand(args: Namespace, method: str, cars: int, steps: int) -> Work:
 
 
 def measure_training(args: Namespace) -> list[Row]:
-    """Return a row for each batch: frames per second with and without a guide, of PPO also by hand."""
+    """Return a row for each batch: frames per second with and without a guide, also by hand."""
     rows = []
+    by_hand_too = has_yardstick(args)
     for cars, steps in args.batches:
-        subjects: dict[str, Work] = {
-            method: Training(args, method, cars, steps) for method in METHODS
-        }
-        hand = METHODS if has_yardstick(args) else ()
-        compiled = METHODS if args.compile_updates else ()
-        subjects |= {
-            f"{method} compiled": Training(args, method, cars, steps, compile=True)
-            for method in compiled
-        }
-        subjects |= {f"{method} by hand": by_hand(args, method, cars, steps) for method in hand}
-        rates = measure(args, subjects)
-        ratios = {
-            f"{method} / by hand": median_ratio(rates[method], rates[f"{method} by hand"])
-            for method in hand
-        }
-        ratios |= {
-            f"{method} compiled / by hand": median_ratio(
-                rates[f"{method} compiled"], rates[f"{method} by hand"]
-            )
-            for method in hand
-            if method in compiled
-        }
-        floor = {"floor, ppo": floor_rate(args, cars * steps)} if hand else {}
-        cost = {"cost of a frame, coil / ppo": median_ratio(rates["ppo"], rates["coil"])}
-        rows.append(
-            {
-                "batch": f"{cars} x {steps}",
-                **medians(rates),
-                **floor,
-                **cost,
-                **ratios,
-                "rounds": rates,
-            }
-        )
+        rates = measure(args, _trainings(args, cars, steps, by_hand_too))
+        row: Row = {"batch": f"{cars} x {steps}", **medians(rates)}
+        if by_hand_too:
+            row["floor, ppo"] = floor_rate(args, cars * steps)
+        row["cost of a frame, coil / ppo"] = median_ratio(rates["ppo"], rates["coil"])
+        for kind in ("", " compiled"):
+            for method in METHODS:
+                name, yardstick = f"{method}{kind}", f"{method} by hand"
+                if name in rates and yardstick in rates:
+                    row[f"{name} / by hand"] = median_ratio(rates[name], rates[yardstick])
+        rows.append({**row, "rounds": rates})
     return rows
 
 
+def _trainings(args: Namespace, cars: int, steps: int, by_hand_too: bool) -> dict[str, Work]:
+    """Return the updates of one batch size that are compared, by name."""
+    subjects: dict[str, Work] = {}
+    for method in METHODS:
+        subjects[method] = Training(args, method, cars, steps)
+    if args.compile_updates:
+        for method in METHODS:
+            subjects[f"{method} compiled"] = Training(args, method, cars, steps, compile=True)
+    if by_hand_too:
+        for method in METHODS:
+            subjects[f"{method} by hand"] = by_hand(args, method, cars, steps)
+    return subjects
+
+
 def floor_rate(args: Namespace, frames: int) -> float:
-    """Return the frames per second of PPO if it only multiplied matrices, at the measured speed of its largest ones."""
+    """Return the frames per second of PPO if it only multiplied matrices.
+
+    The speed of its largest matrices is measured.
+    """
     config = train_config(args, "ppo")
     learner: Any = build_learner(config, env_maker(config)(1))
     sizes = [parameter.numel() for parameter in learner.gradient.parameters if parameter.ndim == 2]
@@ -151,10 +155,8 @@ def floor_rate(args: Namespace, frames: int) -> float:
     # and to value.
     operations = 2 * sum(sizes) * (3 * learner.epochs + 1)
     rows, width = max(frames // learner.minibatches, 1), config.learner.hidden[0]
-    left, right = (
-        torch.ones(rows, width, device=args.device),
-        torch.ones(width, width, device=args.device),
-    )
+    left = torch.ones(rows, width, device=args.device)
+    right = torch.ones(width, width, device=args.device)
 
     def multiply() -> int:
         torch.mm(left, right)
@@ -164,17 +166,15 @@ def floor_rate(args: Namespace, frames: int) -> float:
 
 
 def measure_command(args: Namespace) -> list[Row]:
-    """Return the times of two runs of `coil-train` with its defaults; the second one finds the compiled code."""
+    """Return the times of two runs of `coil-train` with its defaults.
+
+    The second run finds the code that the first one has compiled.
+    """
     rows = []
     for name in ("first", "second"):
         with tempfile.TemporaryDirectory() as folder:
-            command = [
-                sys.executable,
-                "-m",
-                "coil_rl.programs.train",
-                f"hydra.run.dir={folder}/run",
-                *args.overrides,
-            ]
+            command = [sys.executable, "-m", "coil_rl.programs.train"]
+            command += [f"hydra.run.dir={folder}/run", *args.overrides]
             command += [f"device={args.device}", *args.command]
             start = time.perf_counter()
             subprocess.run(command, check=True, capture_output=True)
@@ -188,7 +188,10 @@ def measure_command(args: Namespace) -> list[Row]:
 
 
 def measure_shares(args: Namespace, updates: int = 2) -> list[Row]:
-    """Return the shares of the time of an update, collection included; the framework is the rest."""
+    """Return the shares of the parts in the time of an update; the framework is the rest.
+
+    The collection of the batch belongs to the update here.
+    """
     rows = []
     for cars, steps in args.batches:
         for method in METHODS:
@@ -206,18 +209,14 @@ def measure_shares(args: Namespace, updates: int = 2) -> list[Row]:
 
 
 def measure_one_car(args: Namespace) -> list[Row]:
-    """Return the speed of `compare_cars` driven by the guide beside one car in NumPy and SciPy."""
+    """Return the speed of cars driven by the guide beside one car in NumPy and SciPy."""
     ours = Driving(driving_env(args, args.compare_cars, guide=True), follow=True)
     rates = measure(args, {"one car": one_car(args), "ours": ours})
-    row = {f"{name} (steps/s)": rate for name, rate in medians(rates).items()}
-    return [
-        {
-            "cars": args.compare_cars,
-            **row,
-            "ratio": median_ratio(rates["ours"], rates["one car"]),
-            "rounds": rates,
-        }
-    ]
+    row: Row = {"cars": args.compare_cars}
+    for name, rate in medians(rates).items():
+        row[f"{name} (steps/s)"] = rate
+    row["ratio"] = median_ratio(rates["ours"], rates["one car"])
+    return [{**row, "rounds": rates}]
 
 
 def one_car(args: Namespace) -> Work:
@@ -226,16 +225,13 @@ def one_car(args: Namespace) -> Work:
     import oracle  # type: ignore[import-not-found,import-untyped,unused-ignore]
 
     config = train_config(args, "coil")
-    options = {
-        key: config.env[key]
-        for key in ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")
-    }
+    keys = ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")
+    options = {key: config.env[key] for key in keys}
     node = config.guide.get("spline", {})
     guide = {key: node[key] for key in ("spline", "smoothing", "gain") if key in node}
-    cars = [
-        oracle.OneCar(t.left, t.right, t.start, **options)
-        for t in build(config.track.train, "track.train")
-    ]
+    cars = []
+    for track in build(config.track.train, "track.train"):
+        cars.append(oracle.OneCar(track.left, track.right, track.start, **options))
 
     def steps() -> int:
         for _ in range(ORACLE_STEPS):
@@ -250,33 +246,27 @@ def one_car(args: Namespace) -> Work:
 
 
 def measure_sb3(args: Namespace) -> list[Row]:
-    """Return frames per second of PPO beside Stable-Baselines3 on the CPU, on vectors of single envs.
+    """Return frames per second of PPO beside Stable-Baselines3 on the CPU, which has single envs.
 
     The networks have the same size; other values are its defaults, with a shorter rollout.
     """
     if not has_yardstick(args):
         return [{"not measured": "Stable-Baselines3 runs PPO with continuous actions"}]
     if find_spec("stable_baselines3") is None or find_spec("gymnasium") is None:
-        return [
-            {
-                "not measured": "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"
-            }
-        ]
+        reason = "Stable-Baselines3 is not installed: python -m pip install 'coil-rl[bench]'"
+        return [{"not measured": reason}]
     (cars, steps), *_ = args.batches
     subjects: dict[str, Work] = {"ours": Training(args, "ppo", cars, steps)}
     subjects |= {str(envs): sb3(args, envs) for envs in SB3_ENVS}
     rates = measure(args, subjects)
     median = medians(rates)
-    return [
-        {
-            "envs": envs,
-            "frames/s": median[str(envs)],
-            f"ours, {cars} x {steps}": median["ours"],
-            "ratio": median_ratio(rates["ours"], rates[str(envs)]),
-            "rounds": rates,
-        }
-        for envs in SB3_ENVS
-    ]
+    rows = []
+    for envs in SB3_ENVS:
+        row = {"envs": envs, "frames/s": median[str(envs)]}
+        row[f"ours, {cars} x {steps}"] = median["ours"]
+        row["ratio"] = median_ratio(rates["ours"], rates[str(envs)])
+        rows.append({**row, "rounds": rates})
+    return rows
 
 
 def sb3(args: Namespace, envs: int) -> Work:
@@ -289,11 +279,8 @@ def sb3(args: Namespace, envs: int) -> Work:
 
     config = train_config(args, "ppo")
     options: Any = OmegaConf.to_container(config.env, resolve=True)
-    options = {
-        key: value
-        for key, value in options.items()
-        if key not in ("_target_", "num_envs", "device")
-    }
+    for key in ("_target_", "num_envs", "device"):
+        options.pop(key, None)
     options["tracks"] = build(config.track.train, "track.train")
     hidden = list(config.learner.hidden)
     policy: dict[str, Any] = {"net_arch": {"pi": hidden, "vf": hidden}, "activation_fn": nn.Tanh}

@@ -58,19 +58,31 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def temporary(path: Path) -> Path:
-    """Return the path beside `path` under which this process makes it."""
+    """Return the path beside `path` under which this process makes it.
+
+    Args:
+        path: of the finished file.
+    """
     return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove the temporary files of killed processes; no other process may be writing there."""
+    """Remove the temporary files of killed processes; no other process may be writing there.
+
+    Args:
+        folder: of the files.
+    """
     for path in folder.iterdir():
         if re.fullmatch(r"\..+\.\d+(\.\w+)?", path.name):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def folder_to_disk(folder: Path) -> None:
-    """Wait until the entries of a folder are on the disk."""
+    """Wait until the entries of a folder are on the disk.
+
+    Args:
+        folder: the folder.
+    """
     if os.name != "nt":  # Windows cannot open a folder
         _to_disk(folder)
 

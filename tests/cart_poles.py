@@ -10,7 +10,10 @@ from coil_rl.envs.cone_track import SeededEnv
 
 
 class CartPoles(SeededEnv):
-    """B carts; action 0 pushes left, 1 right. The reward is 1 per step; 475 steps per episode are a solution."""
+    """B carts with poles; action 0 pushes left, 1 right.
+
+    The reward is 1 per step; 475 steps per episode are a solution.
+    """
 
     def __init__(self, count, seed=0):
         super().__init__(batch_size=[count])

@@ -1,4 +1,4 @@
-"""Train on a disk that is full at random moments, resume with room, and compare with an uninterrupted run.
+"""Train on a disk that is full at random moments, resume, and compare with an uninterrupted run.
 
     python tests/full_disk.py --runs 10 [--seed 0] [--folder FOLDER] [--disk FOLDER] [OVERRIDES of
     coil-train ...]
@@ -27,14 +27,11 @@ from kill_and_resume import describe_state, differences, finish, start
 def interrupted_by_full_disk(
     folder: Path, overrides: list[str], room: int, disk: Path | None
 ) -> list[str]:
-    """Start a run with so many bytes of room, and return its lines on standard error without the progress."""
+    """Start a run with so many bytes of room; return its standard error without the progress."""
     filler = folder.parent / "filler"
-    limit = (
-        None
-        if disk
-        else partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
-    )
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (room, resource.RLIM_INFINITY))
     if disk:
+        limit = None
         with filler.open("wb") as file:
             file.write(bytes(max(0, shutil.disk_usage(disk).free - room)))
     process = start(folder, overrides, stderr=subprocess.PIPE, preexec_fn=limit)
@@ -75,12 +72,11 @@ def main(argv: list[str] | None = None) -> int:
             found = differences(place / "whole", folder)
             is_one_sentence = len(lines) == 1 and "cannot be" in lines[0]
             # A limit may be larger than all files.
-            verdict = (
-                "OK"
-                if not found and (is_one_sentence or lines == ["exit code 0"])
-                else f"WRONG: {found} {lines}"
-            )
-            wrong += verdict != "OK"
+            if not found and (is_one_sentence or lines == ["exit code 0"]):
+                verdict = "OK"
+            else:
+                verdict = f"WRONG: {found} {lines}"
+                wrong += 1
             print(
                 f"{number:3}  {room:8} bytes: {state:40} {(lines or [''])[-1]}  {verdict}",
                 flush=True,
@@ -88,7 +84,8 @@ def main(argv: list[str] | None = None) -> int:
             if arguments.disk:
                 shutil.rmtree(folder)
     print(
-        f"{arguments.runs - wrong} of {arguments.runs} runs with a full disk ended like the uninterrupted one"
+        f"{arguments.runs - wrong} of {arguments.runs} runs with a full disk "
+        "ended like the uninterrupted one"
     )
     return int(wrong > 0)
 

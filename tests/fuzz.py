@@ -1,4 +1,4 @@
-"""Give damaged and unusual inputs to all programs, run each to its end, and count what must not happen.
+"""Give damaged and unusual inputs to all programs, and count what must not happen.
 
     python tests/fuzz.py --cases 10000 [--seed 0] [--minutes N] [--workers N] [--folder FOLDER]
     python tests/fuzz.py --case N [--seed 0]        repeats one case and keeps its files
@@ -60,10 +60,14 @@ TRACKS = "track=generated track.train.count=1 track.test.count=1"
 SHORT = "env.laps=1 env.time_limit=1 evaluation.repeats=1"
 CURVE = "evaluation.curve.num_envs=2 evaluation.curve.env.time_limit=1"
 TRAIN = (
-    f"{SHORT} {CURVE} evaluation.gif=false budget.frames=32 budget.num_envs=4 budget.steps=8 checkpoint_every=1 "
+    f"{SHORT} {CURVE} evaluation.gif=false "
+    "budget.frames=32 budget.num_envs=4 budget.steps=8 checkpoint_every=1 "
     "logger=none"
 )
-PROXY = "proxy.budget.frames=32 proxy.budget.num_envs=4 proxy.budget.steps=8 proxy.learner.regressor.epochs=1"
+PROXY = (
+    "proxy.budget.frames=32 proxy.budget.num_envs=4 proxy.budget.steps=8 "
+    "proxy.learner.regressor.epochs=1"
+)
 PHASES = "learner.phases.agent_phase.frames=32 learner.phases.guide_phase.frames=32"
 ONCE, MINIBATCHES = "learner.epochs=1 learner.minibatches=2", "learner.minibatches=2"
 REPLAY = "learner.starts=16 learner.batch_size=8 learner.capacity=100"
@@ -99,7 +103,8 @@ USES = {  # of a run
     "distil": f"distill {TRACKS} {SHORT} {CURVE} {PROXY} guide=learned guide.learned.run=RUN",
     "report": "report folder=RUN",
     "reports": "report folder=runs actions=both",
-    "robot": "reproduce table=6 results.table_6.repeats=1 results.table_6.laps=1 results.table_6.runs=[RUN]",
+    "robot": "reproduce table=6 results.table_6.repeats=1 results.table_6.laps=1 "
+    "results.table_6.runs=[RUN]",
 }
 POLICY, LOGS = (
     ["config.yaml", "policy_last.pt"],
@@ -141,7 +146,8 @@ COMMANDS = {  # whose arguments are changed; several under a name are drawn from
             f"reproduce budget=smoke {result}"
             for result in ("table=1", "figure=6", "table=[1,7]", "all=maybe")
         ),
-        "reproduce claim=tabular_coil results.tabular_coil.worlds=1 results.tabular_coil.steps=[100]",
+        "reproduce claim=tabular_coil results.tabular_coil.worlds=1 "
+        "results.tabular_coil.steps=[100]",
         OF_RECORDINGS[-1],
     ],
 }
@@ -185,13 +191,14 @@ OPTIONS = [
 UNFINISHED = re.compile(r"\..+\.\d+(\.\w+)?")  # temporary files of atomic writes
 HYDRA = re.compile(r"(^|/)\.hydra(/|$)|(^|/)(multirun\.yaml|\.lock)$")
 NOTES = re.compile(
-    r" continues after update \d+$|using checkpoint_previous\.pt$|runs are missing$|^coil-train -m|they are ignored"
+    r" continues after update \d+$|using checkpoint_previous\.pt$|runs are missing$"
+    r"|^coil-train -m|they are ignored"
 )
 
 
 @dataclass
 class Case:
-    """A command, of which `given` are the unusual arguments, and the damaged files; then what became of it."""
+    """A command with damaged files, and what became of it; `given` are its unusual arguments."""
 
     kind: str
     command: str
@@ -222,7 +229,8 @@ def keys_of(node: DictConfig, path: str = "") -> list[str]:
     """Return the full keys of all values and nodes of a configuration."""
     names = []
     for key in node:
-        names.append(name := f"{path}.{key!s}".lstrip("."))
+        name = f"{path}.{key!s}".lstrip(".")
+        names.append(name)
         value = node._get_node(key)
         if (
             isinstance(value, DictConfig)
@@ -265,7 +273,10 @@ class Fuzzer:
         self.repository = self._repository()
 
     def _prepare(self) -> None:
-        """Make the files that cases change, and run every program once, so that all it needs is imported."""
+        """Make the files that cases change, and run every program once.
+
+        So all that the programs need is imported.
+        """
         (self.base / "levels").mkdir(parents=True)
         for name in ("a", "b"):
             shutil.copyfile(ROOT / "tests" / "ring.csv", self.base / "levels" / f"{name}.csv")
@@ -335,9 +346,8 @@ class Fuzzer:
             given.append(f"learner={learner}")
             usual += f" {LEARNERS[learner]}"
         tracks = ["generated", "generated", "folder track.dir=levels", "robot"]
-        if "generated" in (
-            track := draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])
-        ):
+        track = draw.choice([*tracks * 4, "unseen track.test.count=1", "shipped"])
+        if "generated" in track:
             track += (
                 f" track.train.count={draw.choice([1, 2])} track.test.count={draw.choice([1, 2])}"
             )
@@ -425,7 +435,8 @@ class Fuzzer:
     def _start(case: Case, place: Path) -> int:
         """Run the program of a case in a forked process and return how it ended."""
         sys.stdout.flush()
-        if pid := os.fork():
+        pid = os.fork()
+        if pid:
             _, status, used = os.wait4(pid, 0)
             case.seconds = used.ru_utime + used.ru_stime
             return os.waitstatus_to_exitcode(status)
@@ -462,22 +473,21 @@ class Fuzzer:
         lines = [line for line in error.splitlines() if line.strip() and not NOTES.search(line)]
         changed = {name for name, state in self._files(place).items() if before.get(name) != state}
         stopped, repository = status == 130 and case.patient, self._repository()
+        outside = {name for name in changed if not _may_write(case, name)}
+        outside |= repository - self.repository
         case.outcome = {0: "ran", 2: "refused", 130: "stopped"}.get(status, f"exit code {status}")
         if "Traceback" in error:
             case.failure, case.cause = "traceback", _cause(error)
         elif "File" in stacks and not stopped:
             case.failure = "hang" if case.seconds > PATIENCE else "crash"
             stack = re.split(r"\n(?!  File)", stacks[stacks.find("  File") :])[0]
-            case.cause = _cause(
-                "\n".join(stack.splitlines()[::-1])
-            )  # as a traceback, the innermost line last
+            # As a traceback, the innermost line last.
+            case.cause = _cause("\n".join(stack.splitlines()[::-1]))
         elif status not in (0, 2) and not stopped:
             case.failure = "exit code"
         elif status and (len(lines) != 1 or not lines[0].startswith(f"{case.words[0]}: ")):
             case.failure, case.cause = "sentences", " | ".join(lines)[:200]
-        elif outside := {name for name in changed if not _may_write(case, name)} | (
-            repository - self.repository
-        ):
+        elif outside:
             case.failure, case.cause = "outside", ", ".join(sorted(outside))[:200]
         elif half := _half_written(case, place, changed, status):
             case.failure, case.cause = "half-written", ", ".join(sorted(half))[:200]
@@ -513,7 +523,10 @@ class Fuzzer:
 
 
 def _limit(case: Case, place: Path) -> None:
-    """Limit time, memory and files of this process, which is interrupted first and leaves its stack."""
+    """Limit time, memory and files of this process.
+
+    At the end of the time it is interrupted, so that it leaves its stack.
+    """
     stacks = (place / "stacks").open("w")
     seconds = PATIENCE if case.patient else CPU
 
@@ -533,7 +546,10 @@ def _limit(case: Case, place: Path) -> None:
 
 
 def _may_write(case: Case, name: str) -> bool:
-    """Return whether a program may write a file: in its own folder, in `outputs`, or where its arguments say."""
+    """Return whether a program may write a file.
+
+    It may in its own folder, in `outputs`, and where its arguments say.
+    """
     if any(re.search(r"dir|folder|path|exp_name|hydra", word) for word in case.given):
         return True
     named = re.findall(r"(?:resume|folder)=(\S+)", case.command)
@@ -622,7 +638,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def summary(cases: dict[int, Case]) -> int:
-    """Print the counts, and each distinct failure with its shortest command; return 1 if there are failures."""
+    """Print the counts, and each distinct failure with its shortest command.
+
+    Return 1 if there are failures.
+    """
     columns = ["tries", "ran", "refused", "stopped", *FAILURES, "CPU s"]
     print(f"{'':10}", *(f"{column:>12}" for column in columns))
     for kind in (*sorted({case.kind for case in cases.values()}), ""):
@@ -649,7 +668,8 @@ def summary(cases: dict[int, Case]) -> int:
         usual = case.command.split()[: 1 if case.given else None]
         example = shlex.join([f"coil-{usual[0]}", *usual[1:], *case.given])
         print(
-            f"{len(numbers):5} {failure}: {cause}\n      --case {shortest}: {example[:300]} {case.damaged or ''}"
+            f"{len(numbers):5} {failure}: {cause}\n"
+            f"      --case {shortest}: {example[:300]} {case.damaged or ''}"
         )
     return int(bool(groups))
 

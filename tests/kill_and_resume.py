@@ -59,7 +59,7 @@ TIMEOUT = 600  # s
 
 
 def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process that begins the run in the folder or resumes it; the options are those of `Popen`."""
+    """Start a process that begins the run in the folder or resumes it, with options of `Popen`."""
     begun = (folder / "config.yaml").exists()
     arguments = [f"resume={folder}"] if begun else [*SMALL, *overrides, f"hydra.run.dir={folder}"]
     env = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -72,11 +72,8 @@ def start(folder: Path, overrides: list[str], **options: Any) -> subprocess.Pope
 
 def marks(folder: Path) -> int:
     """Return the progress of a run: rows of its log and finished files."""
-    rows = (
-        (folder / "metrics.csv").read_bytes().count(b"\n")
-        if (folder / "metrics.csv").exists()
-        else 0
-    )
+    log = folder / "metrics.csv"
+    rows = log.read_bytes().count(b"\n") if log.exists() else 0
     return rows + sum((folder / name).exists() for name in MILESTONES)
 
 
@@ -96,7 +93,7 @@ def finish(folder: Path, overrides: list[str]) -> list[float]:
 def kill(
     folder: Path, overrides: list[str], moment: float, reached: list[float], hit_write: bool
 ) -> str:
-    """Start or resume, kill at a moment of the uninterrupted run, and describe the state that the kill left.
+    """Start or resume, kill at a moment of the uninterrupted run, and describe what is left.
 
     The moment is counted from the mark before it, so that the load of the machine matters less.
     """
@@ -193,7 +190,8 @@ def main(argv: list[str] | None = None) -> int:
             print(f"{number:3}  {'; then '.join(states):90}  {verdict}", flush=True)
             bar.update()
     print(
-        f"{arguments.kills - wrong} of {arguments.kills} killed runs ended like the uninterrupted one"
+        f"{arguments.kills - wrong} of {arguments.kills} killed runs "
+        "ended like the uninterrupted one"
     )
     return int(wrong > 0)
 

@@ -1,4 +1,4 @@
-"""Random changes of configurations, files of runs, tracks, recordings and models, for the fuzz test."""
+"""Random changes of configurations, of files of runs, and of other inputs, for the fuzz test."""
 
 import contextlib
 import copy
@@ -8,7 +8,8 @@ import json
 import math
 import random
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -103,15 +104,21 @@ def junk(draw: random.Random) -> Any:
 
 def places(tree: Any) -> Iterator[tuple[Any, Any]]:
     """Yield every container and key of a tree."""
-    for key in (
-        tree if isinstance(tree, dict) else range(len(tree)) if isinstance(tree, list) else ()
-    ):
+    keys: Iterable[Any] = ()
+    if isinstance(tree, dict):
+        keys = tree
+    elif isinstance(tree, list):
+        keys = range(len(tree))
+    for key in keys:
         yield tree, key
         yield from places(tree[key])
 
 
 def mutate(tree: Any, draw: random.Random, kinds: str = "") -> tuple[Any, str]:
-    """Return a tree with one change at a random place, and what was changed; `kinds` are further kinds of change."""
+    """Return a tree with one change at a random place, and what was changed.
+
+    `kinds` are further kinds of change.
+    """
     tree = copy.deepcopy(tree)
     known = list(places(tree))
     if not known:
@@ -288,8 +295,9 @@ def _forest(archive: bytes, draw: random.Random) -> tuple[torch.Tensor, str]:
 
 
 def _recording(path: Path, draw: random.Random) -> str:
+    """Change some messages or notes of a recording."""
     contents = read_messages(path)
-    messages = [message for topic in contents.messages.values() for message in topic]
+    messages = list(chain.from_iterable(contents.messages.values()))
     notes: Any = contents.notes
     of_one_topic = draw.choice([topic for topic in contents.messages.values() if topic])
     chosen = set(
@@ -311,22 +319,16 @@ def _recording(path: Path, draw: random.Random) -> str:
     change: dict[str, Any] = {}
     if kind in channels:
         change = {"channel": first.channel._replace(**channels[kind])}
-    elif kind == "time":
-        change = {"log_time": draw.choice([0, 1, 2**63 - 1, 10**18])}
-    elif kind == "bytes":
-        change = {
-            "data": draw.choice([b"", first.data[:40], first.data + b"\0\0", draw.randbytes(40)])
-        }
-    elif kind == "field":
-        change = {"data": _message(first, draw)}
     elif kind == "extra":
         messages += [RawMessage(Channel("/extra", name), first.log_time, 0, draw.randbytes(20))]
     elif kind == "notes":
         record = draw.choice(sorted(notes))
         key = draw.choice(sorted(notes[record]))
-        notes[record][key] = draw.choice(
-            [str(junk(draw)), json.dumps(mutate(json.loads(notes[record][key]), draw)[0])]
-        )
+        text = str(junk(draw))
+        other = json.dumps(mutate(json.loads(notes[record][key]), draw)[0])
+        notes[record][key] = draw.choice([text, other])
+    else:
+        change = _changed_fields(first, kind, draw)
     replaced = {id(of_one_topic[index]) for index in chosen}
     with RecordingWriter(path) as writer:
         for record, entries in notes.items():
@@ -337,6 +339,18 @@ def _recording(path: Path, draw: random.Random) -> str:
             elif kind != "drop":
                 writer.copy(message._replace(**change))
     return f"{kind} of {len(chosen)} messages of {first.channel.topic}"
+
+
+def _changed_fields(message: RawMessage, kind: str, draw: random.Random) -> dict[str, Any]:
+    """Return the changed fields of a message; none for other kinds of change."""
+    if kind == "time":
+        return {"log_time": draw.choice([0, 1, 2**63 - 1, 10**18])}
+    if kind == "bytes":
+        data = message.data
+        return {"data": draw.choice([b"", data[:40], data + b"\0\0", draw.randbytes(40)])}
+    if kind == "field":
+        return {"data": _message(message, draw)}
+    return {}
 
 
 def _message(message: RawMessage, draw: random.Random) -> bytes:

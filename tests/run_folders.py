@@ -69,7 +69,10 @@ def make_run(
 
 
 def make_sweep(folder: Path) -> Path:
-    """Write three seeds of coil, better than its guide, and of ppo, better than coil; two more runs are unfinished."""
+    """Write three seeds of coil, better than its guide, and of ppo, better than coil.
+
+    Two more runs are unfinished.
+    """
     guide = driven("guide", {"a": 500.0, "b": 600.0})
     for seed in range(3):
         coil = [

@@ -1,4 +1,4 @@
-"""A finite Markov decision process as a batched env, with known optimal policies for tests of learners."""
+"""A finite Markov decision process as a batched env, whose optimal policies are known."""
 
 import torch
 from tensordict import TensorDict
@@ -9,7 +9,9 @@ from coil_rl.envs.cone_track import SeededEnv
 
 
 class TabularEnv(SeededEnv):
-    """B agents; `action` [B] and one-hot `observation` [B, S]; absorbing states without reward terminate.
+    """B agents with `action` [B] and one-hot `observation` [B, S].
+
+    Absorbing states without reward terminate.
 
     `P` and `R` [S, A, S] are probabilities and rewards, `start` [S] the probabilities of the first
     state (uniform).
@@ -19,11 +21,9 @@ class TabularEnv(SeededEnv):
         super().__init__(batch_size=torch.Size([num_envs]))
         self.P, self.R = torch.as_tensor(P).double(), torch.as_tensor(R).double()
         states, actions = self.P.shape[:2]
-        self.start = (
-            torch.full((states,), 1 / states).double()
-            if start is None
-            else torch.as_tensor(start).double()
-        )
+        if start is None:
+            start = torch.full((states,), 1 / states)
+        self.start = torch.as_tensor(start).double()
         stays = torch.diagonal(self.P, dim1=0, dim2=2).T == 1
         self.terminal = (stays & ((self.P * self.R).sum(2) == 0)).all(1)
         self.max_steps, self.generator = max_steps, torch.Generator()

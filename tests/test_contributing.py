@@ -1,4 +1,4 @@
-"""The two walks through the code in CONTRIBUTING.md, compared with the files that a run goes through."""
+"""The two walks through the code in CONTRIBUTING.md name the files that a run goes through."""
 
 import re
 import traceback

@@ -36,7 +36,10 @@ FILES = [path.relative_to(CONF).as_posix() for path in sorted(CONF.rglob("*.yaml
 
 
 def nodes(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield all nodes with a `_target_` of this project, with their keys; schedules are values and not nodes."""
+    """Yield all nodes with a `_target_` of this project, with their keys.
+
+    Schedules are values and not nodes.
+    """
     if isinstance(value, dict):
         target = str(value.get("_target_", ""))
         if target.startswith("coil_rl.") and not target.startswith("coil_rl.schedules."):
@@ -49,15 +52,16 @@ def nodes(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
 
 
 def defaults(target: Any) -> dict[str, Any]:
-    """Return defaults by parameter, with those of the base class if the constructor passes arguments on to it."""
+    """Return defaults by parameter.
+
+    Those of the base class are included if the constructor passes arguments on to it.
+    """
     function = target.__init__ if inspect.isclass(target) else target
     parameters = inspect.signature(function).parameters.values()
     passes_on = inspect.isclass(target) and any(p.kind is p.VAR_KEYWORD for p in parameters)
-    inherited = (
-        defaults(target.__bases__[0])
-        if passes_on and target.__module__.startswith("coil_rl.")
-        else {}
-    )
+    inherited = {}
+    if passes_on and target.__module__.startswith("coil_rl."):
+        inherited = defaults(target.__bases__[0])
     return inherited | {p.name: p.default for p in parameters if p.default is not p.empty}
 
 

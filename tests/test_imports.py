@@ -61,11 +61,11 @@ def forbidden_imports(source: str, package: list[str], folder: str) -> list[str]
 
 @pytest.mark.parametrize("folder", ALLOWED)
 def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
-    wrong = {
-        str(path.relative_to(ROOT)): bad
-        for path in source_files(folder)
-        if (bad := forbidden_imports(path.read_text(encoding="utf-8"), package_of(path), folder))
-    }
+    wrong = {}
+    for path in source_files(folder):
+        bad = forbidden_imports(path.read_text(encoding="utf-8"), package_of(path), folder)
+        if bad:
+            wrong[str(path.relative_to(ROOT))] = bad
     assert not wrong, (
         f"{folder}/ may import only {sorted(ALLOWED[folder])}, the standard library and itself"
     )
@@ -91,12 +91,11 @@ def test_only_modules_of_that_name_import_gymnasium() -> None:
 def test_folders_are_not_imported_by_their_bare_names(folder: str) -> None:
     # `import envs` would load a second copy of the package, with classes that are not the first
     # one's.
-    wrong = [
-        f"{path.relative_to(ROOT)}: {module}"
-        for path in source_files(folder)
-        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path))
-        if module.split(".")[0] in LINKED
-    ]
+    wrong = []
+    for path in source_files(folder):
+        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path)):
+            if module.split(".")[0] in LINKED:
+                wrong.append(f"{path.relative_to(ROOT)}: {module}")
     assert not wrong, "write coil_rl.envs, coil_rl.transforms, coil_rl.conf"
 
 

@@ -1,4 +1,7 @@
-"""docs/your_env.md: its commands and Python blocks run, at toy size, and its other code is that of the package."""
+"""docs/your_env.md: its commands and Python blocks run, at toy size.
+
+Its other code is that of the package.
+"""
 
 import math
 import re
@@ -15,12 +18,8 @@ BLOCKS = [(language, block) for language, block in ALL_BLOCKS if "vmas" not in b
 (SEVERAL_AGENTS,) = (block for _, block in ALL_BLOCKS if "vmas" in block)
 PROGRAMS = [block for language, block in BLOCKS if language == "python" and "import" in block]
 EXCERPTS = [block for language, block in BLOCKS if language and block not in PROGRAMS]
-COMMANDS = [
-    shlex.split(line, comments=True)
-    for language, block in BLOCKS
-    if not language
-    for line in block.splitlines()
-]
+SHELL = "".join(block for language, block in BLOCKS if not language)
+COMMANDS = [shlex.split(line, comments=True) for line in SHELL.splitlines()]
 TOY = {
     "coil-train": TINY,
     "coil-evaluate": ["evaluation.cases=2", "evaluation.repeats=1"],

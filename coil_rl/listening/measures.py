@@ -168,7 +168,11 @@ class InterceptedPolicy(TensorDictModuleBase):
         self.change = change
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action; the changed input is not written."""
+        """Write the action; the changed input is not written.
+
+        Args:
+            tensordict: input of the policy, [B].
+        """
         if self.advising is not None:
             tensordict = self.advising(tensordict)
         acted = self.acting(self.change(tensordict.copy()))

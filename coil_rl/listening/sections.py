@@ -50,7 +50,11 @@ def smooth_line(track: Track, spacing: float = 0.25, smoothing: float = SMOOTHIN
 
 
 def curvature(line: Array) -> Array:
-    """Return the curvature [P] in 1/m of a closed line [P, 2], positive in left turns."""
+    """Return the curvature [P] in 1/m of a closed line [P, 2], positive in left turns.
+
+    Args:
+        line: [P, 2] m.
+    """
     edge = (np.roll(line, -1, axis=0) - line) @ AS_COMPLEX
     turn = np.angle(edge * np.roll(edge, 1).conj())
     return np.asarray(2 * turn / (np.abs(edge) + np.abs(np.roll(edge, 1))))
@@ -192,7 +196,11 @@ class TrackSections(WholeEpisode):
         return {"track": track, "point": point}
 
     def section(self, place: TensorDictBase) -> Tensor:
-        """Return the section of each place as an index in SECTIONS, [B]."""
+        """Return the section of each place as an index in SECTIONS, [B].
+
+        Args:
+            place: [B], entries as `locate` returns them.
+        """
         return self._section.to(place["track"].device)[place["track"], place["point"]]
 
     def draw(self, data: Survey, folder: Path) -> None:
@@ -210,6 +218,9 @@ class TrackSections(WholeEpisode):
 
     def table(self, data: Survey) -> list[dict[str, Any]]:
         """Return one row per guide and bin of each track with a visited state.
+
+        Args:
+            data: the measures.
 
         Returns:
             Rows with `track`, `guide`, `bin`, `from` (m along the middle line), `x`, `y` (m),

@@ -2,6 +2,7 @@
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -9,7 +10,7 @@ from coil_rl.programs import app
 
 
 def distill(config: DictConfig) -> float:
-    """Train the missing proxies of all guides, and return the lowest mean test reward of a proxy."""
+    """Train the missing proxies of all guides; return the lowest mean test reward of a proxy."""
     from coil_rl.config import distillation
     from coil_rl.config.build import build_guides
     from coil_rl.config.start import run_configured
@@ -21,27 +22,33 @@ def distill(config: DictConfig) -> float:
         proxy_config = distillation.proxy_config(config, name)
         reward = run_configured(proxy_config, wait=True)
         (finished,) = read_runs([Path(proxy_config.run_dir)])
-        learned = {
-            name.removeprefix("learner/"): value for name, value in finished.curve[-1].items()
-        }
+        row: dict[str, Any] = {}
+        for key, value in finished.curve[-1].items():
+            row[key.removeprefix("learner/")] = value
         means = finished.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
         guide, proxy = means.iloc[0], means.iloc[-1]
-        row = {
+        row |= {
             "guide": name,
             "reward": reward,
             "guide_reward": guide["reward"],
             "completed": proxy["completed"],
+            "folder": str(finished.folder),
         }
-        table.append(learned | row | {"folder": str(finished.folder)})
+        table.append(row)
     print(markdown_table(table, TABLES["proxies"]["columns"]))
     worst = min(table, key=lambda row: row["reward"])
-    lowest = f"the lowest mean reward is {worst['reward']:.1f}, that of its guide {worst['guide_reward']:.1f}"
-    print(f"distill: made {len(table)}; {lowest}")
+    print(
+        f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:.1f}, "
+        f"that of its guide {worst['guide_reward']:.1f}"
+    )
     return float(worst["reward"])
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration of the proxies, and make their folder."""
+    """Raise a `UserError` for the first mistake in the configuration of the proxies.
+
+    Otherwise make their folder.
+    """
     from coil_rl.config.check import check_proxies, make_folder
     from coil_rl.config.values import check_values
 

@@ -25,7 +25,10 @@ Runs = Mapping[str, tuple[Path, DictConfig]]  # folder and configuration by name
 
 
 def replay(config: DictConfig) -> None:
-    """Run all policies through all recordings; write the results of each recording, then `replay.md`."""
+    """Run all policies through all recordings.
+
+    The results of each recording are written, then `replay.md`.
+    """
     import torch
     from tqdm import tqdm
 
@@ -42,9 +45,8 @@ def replay(config: DictConfig) -> None:
         env = build(config.env, "env", McapReplayEnv)
     _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)
-    with tqdm(
-        total=int(env.length.max()) * len(policies), unit="scan", desc="replay", leave=False
-    ) as bar:
+    scans = int(env.length.max()) * len(policies)
+    with tqdm(total=scans, unit="scan", desc="replay", leave=False) as bar:
 
         def tick(name: str) -> None:
             bar.set_postfix_str(name, refresh=False)
@@ -54,16 +56,15 @@ def replay(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     names = _numbered([result.recording.path.name.removesuffix(".mcap") for result in results])
     folders = [folder / name for name in names] if len(names) > 1 else [folder]
-    for destination, result in zip(
-        tqdm(folders, unit="recording", desc="write", leave=False), results, strict=True
-    ):
+    destinations = tqdm(folders, unit="recording", desc="write", leave=False)
+    for destination, result in zip(destinations, results, strict=True):
         _write(config, result, runs, destination)
-    sources = [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
-    cautions = [text for result in results if (text := caution(result, env.perception))]
-    notes = TABLES["replay"]["notes"].format(max_steering=math.degrees(env.max_steering))
-    text = "\n\n".join(
-        [*map(describe, results), *(f"Warning: {each}." for each in cautions), *sources, notes]
-    )
+    parts = [describe(result) for result in results]
+    cautions = [text for text in (caution(result, env.perception) for result in results) if text]
+    parts += [f"Warning: {each}." for each in cautions]
+    parts += [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
+    parts.append(TABLES["replay"]["notes"].format(max_steering=math.degrees(env.max_steering)))
+    text = "\n\n".join(parts)
     write_text(folder / "replay.md", text)
     print(f"{text}\n")
     for destination, result in zip(folders, results, strict=True):
@@ -87,21 +88,26 @@ def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Polici
     configs = [read_config(folder, "runs", {"device": config.device}) for folder in folders]
     guide_names = [_topic_name(name) for name in guides]
     run_names = _run_names([run.label for run in configs], [run.seed for run in configs])
-    if (repeated := _first_repeated([RECORDED, *guide_names, *run_names])) is not None:
+    repeated = _first_repeated([RECORDED, *guide_names, *run_names])
+    if repeated is not None:
         raise UserError(
-            f"two policies would be called {repeated}; leave one out, or give the guide another name"
+            f"two policies would be called {repeated}; "
+            "leave one out, or give the guide another name"
         )
     runs = dict(zip(run_names, zip(folders, configs, strict=True), strict=True))
-    agents = {
-        name: assemble(own, run).in_env(env, config.policy) for name, (run, own) in runs.items()
-    }
-    return runs, {
-        name: (env, guide) for name, guide in zip(guide_names, guides.values(), strict=True)
-    } | agents
+    policies = {}
+    for name, guide in zip(guide_names, guides.values(), strict=True):
+        policies[name] = (env, guide)
+    for name, (run, own) in runs.items():
+        policies[name] = assemble(own, run).in_env(env, config.policy)
+    return runs, policies
 
 
 def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> None:
-    """Write `annotated.mcap`, its Foxglove layout, `steering.csv` and `steering.png` of one recording."""
+    """Write the results of one recording.
+
+    These are `annotated.mcap`, its Foxglove layout, `steering.csv` and `steering.png`.
+    """
     from coil_rl.files import write_text
     from coil_rl.replay.annotation import annotate, foxglove_layout
     from coil_rl.replay.report import draw_steering, over_time
@@ -114,10 +120,12 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     attachments = {"config.yaml": OmegaConf.to_yaml(settings, resolve=True).encode()}
     inputs = {"config": attachments["config.yaml"]}
     for name, (run, _) in runs.items():
-        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = (
-            run / "config.yaml"
-        ).read_bytes()
+        own = (run / "config.yaml").read_bytes()
+        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = own
         inputs[f"{name}_checkpoint"] = weights_file(run, config.policy).read_bytes()
+    about = {}
+    for name, content in inputs.items():
+        about[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
     annotate(
         result,
         folder / "annotated.mcap",
@@ -125,56 +133,64 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
         speed=robot.speed,
         scale=OmegaConf.select(robot, "perception.scale", default=7.0),
         laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
-        about={
-            f"{name}_sha256": hashlib.sha256(content).hexdigest()
-            for name, content in inputs.items()
-        },
+        about=about,
         attachments=attachments,
     )
-    write_text(
-        folder / "foxglove_layout.json",
-        foxglove_layout(result, scan=robot.scan, command=robot.command),
-    )
+    layout = foxglove_layout(result, scan=robot.scan, command=robot.command)
+    write_text(folder / "foxglove_layout.json", layout)
     write_csv(over_time(result), folder / "steering.csv")
     simulated = " (simulated)" if result.recording.simulated else ""
     draw_steering(result, folder / "steering.png", title=f"{result.recording.path.name}{simulated}")
 
 
 def _topic_name(name: str) -> str:
-    """Return a name of letters, digits and single underscores that begins with a letter, as ROS topics require."""
+    """Return a name as ROS topics require it.
+
+    It has letters, digits and single underscores only, and begins with a letter.
+    """
     plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_")
     return plain if plain[:1].isalpha() else f"policy_{plain}".rstrip("_")
 
 
 def _run_names(labels: Sequence[str], seeds: Sequence[int]) -> list[str]:
-    """Return the labels of runs; the seed is appended to equal labels, then a number to equal names."""
+    """Return a name for each run: its label, and the seed and a number where names are equal."""
     names = [_topic_name(label) for label in labels]
-    seeded = zip(names, seeds, strict=True)
-    return _numbered(
-        [f"{name}_seed{seed}" if names.count(name) > 1 else name for name, seed in seeded]
-    )
+    seeded = []
+    for name, seed in zip(names, seeds, strict=True):
+        seeded.append(f"{name}_seed{seed}" if names.count(name) > 1 else name)
+    return _numbered(seeded)
 
 
 def _numbered(names: Sequence[str]) -> list[str]:
     """Return the names, with a number appended to equal ones."""
-    return [
-        f"{name}_{names[: n + 1].count(name)}" if names.count(name) > 1 else name
-        for n, name in enumerate(names)
-    ]
+    numbered = []
+    for n, name in enumerate(names, start=1):
+        numbered.append(f"{name}_{names[:n].count(name)}" if names.count(name) > 1 else name)
+    return numbered
 
 
 def _first_repeated(names: Sequence[str]) -> str | None:
-    return next((name for n, name in enumerate(names) if name in names[:n]), None)
+    """Return the first name that was there before; None if all are different."""
+    for n, name in enumerate(names):
+        if name in names[:n]:
+            return name
+    return None
 
 
 def _check_unique(key: str, paths: Sequence[Path]) -> None:
-    if (repeated := _first_repeated([str(path.resolve()) for path in paths])) is not None:
+    """Raise a `UserError` if two of the paths that a key names are the same."""
+    repeated = _first_repeated([str(path.resolve()) for path in paths])
+    if repeated is not None:
         raise UserError(f"{key} names {repeated} twice; leave one out")
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
-    from coil_rl.config.check import check_values, make_folder
+    """Raise a `UserError` for the first mistake in the configuration.
+
+    Otherwise make the folder of the results.
+    """
+    from coil_rl.config.check import make_folder
+    from coil_rl.config.values import check_values
 
     check_values(config)
     if config.recording is None:

@@ -27,9 +27,12 @@ MAX_CURVES = 8  # in one plot
 
 
 def report(config: DictConfig) -> None:
-    """Compare the finished runs; print the page, and write it, all numbers and the figures to the first folder."""
+    """Compare the finished runs, and print the page.
+
+    The page, all numbers and the figures are written to the first folder.
+    """
     from coil_rl.files import write_text
-    from coil_rl.report import draw_intervals, driver_intervals, page, write_csv
+    from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
     from coil_rl.report.runs import read_runs
 
@@ -37,39 +40,51 @@ def report(config: DictConfig) -> None:
     runs = read_runs(folders)
     finished = [run for run in runs if run.finished]
     if not finished:
-        remedy = f"continue one with coil-train resume={runs[0].folder}, or repeat the command that started them"
-        raise UserError(f"none of the runs in folder={config.folder} is finished; {remedy}")
+        raise UserError(
+            f"none of the runs in folder={config.folder} is finished; "
+            f"continue one with coil-train resume={runs[0].folder}, "
+            "or repeat the command that started them"
+        )
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}
-    parts = [
-        page.section(f"{kind.capitalize()} actions", compared[kind], tables[kind], against)
-        for kind in compared
-    ]
+    parts = []
+    for kind, comparison in compared.items():
+        heading = f"{kind.capitalize()} actions"
+        parts.append(page.section(heading, comparison, tables[kind], against))
     parts += [*page.training(finished), *page.guide_training(finished)]
     normalised = any(comparison.normalised for comparison in compared.values())
-    notes = page.notes(against, normalised, "sampled" in compared)
-    text = "\n\n".join([*parts, notes, page.progress(len(finished), len(runs))])
+    parts.append(page.notes(against, normalised, "sampled" in compared))
+    parts.append(page.progress(len(finished), len(runs)))
+    text = "\n\n".join(parts)
 
     folder = folders[0]
     write_text(folder / "report.md", text)
-    cases = {actions: comparison.case_table() for actions, comparison in compared.items()}
-    for name, by_actions in {"report.csv": tables, "report_cases.csv": cases}.items():
-        rows = [
-            {"actions": actions} | row for actions, table in by_actions.items() for row in table
-        ]
-        write_csv(rows, folder / name)
-    panels = {
-        f"{kind} actions": driver_intervals(each.agents or each.guides)
-        for kind, each in compared.items()
-    }
-    draw_intervals(
-        panels,
-        folder / "report.png",
-        measure="reward / guide's (mean)" if normalised else "reward (mean)",
-    )
+    write_csv(_rows(tables), folder / "report.csv")
+    cases = {kind: comparison.case_table() for kind, comparison in compared.items()}
+    write_csv(_rows(cases), folder / "report_cases.csv")
+    _draw_scores(compared, normalised, folder / "report.png")
     _draw_curves(finished, next(iter(compared.values())), folder / "report_curves.png")
     print(f"{text}\nreport: see {folder}")
+
+
+def _rows(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
+    """Return the rows of the tables for each kind of actions as one table."""
+    rows = []
+    for actions, table in tables.items():
+        rows += [{"actions": actions, **row} for row in table]
+    return rows
+
+
+def _draw_scores(compared: Mapping[str, Comparison], normalised: bool, path: Path) -> None:
+    """Draw the scores of the agents, or of the guides if there is no agent."""
+    from coil_rl.report import draw_intervals, driver_intervals
+
+    panels = {}
+    for kind, comparison in compared.items():
+        panels[f"{kind} actions"] = driver_intervals(comparison.agents or comparison.guides)
+    measure = "reward / guide's (mean)" if normalised else "reward (mean)"
+    draw_intervals(panels, path, measure=measure)
 
 
 def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> None:
@@ -89,9 +104,8 @@ def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> Non
     if several_guides or len(curves) > MAX_CURVES:
         draw_curve_grid(curves, path, guides=guides)
     elif curves:
-        draw_learning_curves(
-            curves, path, guides={"guide": next(iter(guides.values()))} if guides else {}
-        )
+        guide = {"guide": next(iter(guides.values()))} if guides else {}
+        draw_learning_curves(curves, path, guides=guide)
 
 
 def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:
@@ -101,12 +115,15 @@ def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | Non
         return DEFAULT_AGAINST if DEFAULT_AGAINST in labels else None
     choices = [*labels, "guide"]
     if given not in choices:
-        known = f"{', '.join(choices)}{did_you_mean(given, choices)}"
-        raise UserError(f"against={given} is no label of a finished run; there are {known}")
+        raise UserError(
+            f"against={given} is no label of a finished run; "
+            f"there are {', '.join(choices)}{did_you_mean(given, choices)}"
+        )
     return given
 
 
 def _folders(config: DictConfig) -> list[Path]:
+    """Return the folders with runs, at least one."""
     given = list(config.folder) if isinstance(config.folder, ListConfig) else [config.folder]
     if not given or not all(isinstance(folder, str) and folder for folder in given):
         raise UserError(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,10 @@ INDEX = "RESULTS.md"
 
 
 def reproduce(config: DictConfig) -> None:
-    """Train the missing runs, make the requested results, print their pages and write them with RESULTS.md."""
+    """Train the missing runs, and make the requested results.
+
+    Their pages are printed, and written with RESULTS.md.
+    """
     import torch
 
     from coil_rl.config.nodes import build
@@ -37,45 +41,56 @@ def reproduce(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     # Build all results before the first run, so that mistakes cost seconds.
-    results = {
-        name: build(config.results[name], f"results.{name}", Result) for name in requested(config)
-    }
+    results: dict[str, Result] = {}
+    for name in requested(config):
+        results[name] = build(config.results[name], f"results.{name}", Result)
     runs = trained_runs(config, list(results.values()))
     note = config.budgets[config.budget].note
     for name, result in results.items():
-        used = [run for experiment in dict.fromkeys(result.experiments) for run in runs[experiment]]
+        used = list(chain.from_iterable(runs[each] for each in dict.fromkeys(result.experiments)))
         origin = pages.origin(command(config, _key(name), name), versions()["commit"], used)
         text = pages.page(result.make(folder / name, runs), name, note, origin)
         write_text(folder / f"{name}.md", text)
         print(text)
-    files = {str(name): folder / f"{name}.md" for name in config.results}
-    texts = {
-        name: path.read_text(encoding="utf-8") if path.exists() else None
-        for name, path in files.items()
-    }
-    commands = {name: command(config, _key(name), name) for name in files}
-    everything, problems = command(config, "all=true"), config.known_problems
-    index = pages.all_results(texts, commands, everything, note, problems, config.not_reproduced)
-    write_text(folder / INDEX, index)
+    write_text(folder / INDEX, _index(config, folder))
     print(f"reproduce: {', '.join(results)} made; see {folder / INDEX}")
 
 
+def _index(config: DictConfig, folder: Path) -> str:
+    """Return RESULTS.md, which has the pages of all results that were made, also earlier."""
+    from coil_rl.reproduce import pages
+
+    texts, commands = {}, {}
+    for name in map(str, config.results):
+        path = folder / f"{name}.md"
+        texts[name] = path.read_text(encoding="utf-8") if path.exists() else None
+        commands[name] = command(config, _key(name), name)
+    return pages.all_results(
+        texts,
+        commands,
+        command(config, "all=true"),
+        config.budgets[config.budget].note,
+        config.known_problems,
+        config.not_reproduced,
+    )
+
+
 def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
-    """Return the runs of all experiments of some results, after training the missing ones."""
+    """Return the runs of all experiments of some results, after training the missing ones.
+
+    Args:
+        config: of the program.
+        results: whose experiments are needed.
+    """
     from coil_rl.programs import sweeps
     from coil_rl.report.runs import read_runs
 
     budget = config.budgets[config.budget]
-    planned = [
-        sweeps.planned(
-            name,
-            [*budget.every, *budget.only.get(name, []), *config.train],
-            range(budget.seeds_of.get(name, budget.seeds)),
-        )
-        for name in dict.fromkeys(
-            experiment for result in results for experiment in result.experiments
-        )
-    ]
+    planned = []
+    for name in dict.fromkeys(chain.from_iterable(result.experiments for result in results)):
+        overrides = [*budget.every, *budget.only.get(name, []), *config.train]
+        seeds = range(budget.seeds_of.get(name, budget.seeds))
+        planned.append(sweeps.planned(name, overrides, seeds))
     launcher = [word for word in HydraConfig.get().overrides.hydra if word.startswith(LAUNCHER)]
     for sweep in planned:
         sweeps.run(sweep, launcher)
@@ -83,7 +98,14 @@ def trained_runs(config: DictConfig, results: Sequence[Result]) -> Runs:
 
 
 def requested(config: DictConfig) -> list[str]:
-    """Return the names in `results` of the requested results, at least one; an unknown one is a `UserError`."""
+    """Return the names in `results` of the requested results, at least one.
+
+    Args:
+        config: of the program.
+
+    Raises:
+        UserError: if nothing is requested, or something unknown.
+    """
     if config.all:
         return [str(name) for name in config.results]
     available = {_key(str(name)): str(name) for name in config.results}
@@ -91,17 +113,11 @@ def requested(config: DictConfig) -> list[str]:
     names: list[str] = []
     for kind in KINDS:
         values = config[kind] if isinstance(config[kind], ListConfig) else [config[kind]]
-        for key in (f"{kind}={value}" for value in values if value is not None):
-            for what, numbers in config.other_figures.items():
-                if key in [f"figure={number}" for number in numbers]:
-                    raise UserError(
-                        f"{key} is {what}, which is not reproduced; there are {', '.join(available)}"
-                    )
-            if key not in available:
-                raise UserError(
-                    f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}"
-                )
-            names.append(available[key])
+        for value in values:
+            if value is not None:
+                key = f"{kind}={value}"
+                _check_key(config, key, available)
+                names.append(available[key])
     if not names:
         raise UserError(
             f"nothing is requested; give one of {', '.join(available)}, or several, or all=true"
@@ -109,8 +125,27 @@ def requested(config: DictConfig) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def _check_key(config: DictConfig, key: str, available: Mapping[str, str]) -> None:
+    """Raise a `UserError` if the key of a request is unknown."""
+    for what, numbers in config.other_figures.items():
+        if key in [f"figure={number}" for number in numbers]:
+            raise UserError(
+                f"{key} is {what}, which is not reproduced; there are {', '.join(available)}"
+            )
+    if key not in available:
+        raise UserError(
+            f"{key} does not exist; there are {', '.join(available)}{did_you_mean(key, available)}"
+        )
+
+
 def command(config: DictConfig, key: str, name: str = "") -> str:
-    """Return the command that makes a result, or all results, with the given options that affect it."""
+    """Return the command that makes a result, with the given options that affect it.
+
+    Args:
+        config: of the program.
+        key: what is requested, such as "table=1", or "all=true".
+        name: of the result; empty for all results.
+    """
     requests = tuple(f"{request}=" for request in (*KINDS, "all", "budget"))
     own = (f"results.{name}.", f"results.{name}=") if name else "results."
     options = []
@@ -130,18 +165,23 @@ def check(config: DictConfig) -> None:
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
         raise UserError(
-            "results are made one after the other; leave out -m, and request several as in table=[1,4]"
+            "results are made one after the other; "
+            "leave out -m, and request several as in table=[1,4]"
         )
     if config.budget not in config.budgets:
         names = list(config.budgets)
         raise UserError(
-            f"budget={config.budget} must be one of {', '.join(names)}{did_you_mean(config.budget, names)}"
+            f"budget={config.budget} must be one of {', '.join(names)}"
+            f"{did_you_mean(config.budget, names)}"
         )
     requested(config)
 
 
 def _key(name: str) -> str:
-    """Return the command-line key of a result: table=1 for table_1, claim=NAME for names of no other kind."""
+    """Return the key of a result on the command line.
+
+    It is table=1 for the name table_1, and claim=NAME for names of no other kind.
+    """
     kind, _, rest = name.partition("_")
     return f"{kind}={rest}" if kind in KINDS and rest else f"claim={name}"
 

@@ -1,4 +1,4 @@
-"""Training runs of an experiment file: their folders, and the sweep of `coil-train` that does the missing ones.
+"""Training runs of an experiment file: their folders, and the sweep that does the missing ones.
 
 The folder of a run contains its fingerprint (`hydra.sweep.subdir` of the file), so that a finished
 run is found again. The experiment files set `existing=resume`: in a repeated sweep a finished run
@@ -26,11 +26,17 @@ from coil_rl.run.folder import is_evaluated
 
 @dataclass(frozen=True)
 class Sweep:
-    """The runs of an experiment."""
+    """The runs of an experiment.
 
-    experiment: str  # name of its file
-    command: tuple[str, ...]  # arguments of `coil-train` for the whole sweep
-    all_folders: tuple[Path, ...]  # of the runs
+    Attributes:
+        experiment: name of its file.
+        command: arguments of `coil-train` for the whole sweep.
+        all_folders: of the runs.
+    """
+
+    experiment: str
+    command: tuple[str, ...]
+    all_folders: tuple[Path, ...]
 
     @property
     def missing(self) -> list[Path]:
@@ -39,9 +45,15 @@ class Sweep:
 
 
 def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> Sweep:
-    """Return the runs of an experiment file with overrides and other seeds. Hydra must be initialised.
+    """Return the runs of an experiment file. Hydra must be initialised.
 
-    A file without a sweep, or an override that does not fit one of its runs, is a `UserError`.
+    Args:
+        experiment: name of the file.
+        overrides: of every run.
+        seeds: of the runs, in place of those of the file.
+
+    Raises:
+        UserError: if the file has no sweep, or an override does not fit one of its runs.
     """
     # Hydra also composes the overrides alone first.
     params: dict[str, Any] = dict(_composed(experiment, *overrides).hydra.sweeper.params or {})
@@ -63,25 +75,43 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
 
 
 def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:
-    """Run a sweep, with overrides of Hydra's launcher; its end before all runs are finished is a `UserError`."""
+    """Do the missing runs of a sweep.
+
+    Args:
+        sweep: the runs.
+        launcher: overrides of Hydra's launcher.
+
+    Raises:
+        UserError: if the sweep ends before all runs are finished.
+    """
     if not sweep.missing:
         return
     command = [*sweep.command, *launcher]
     count = f"{len(sweep.missing)} of {len(sweep.all_folders)} runs are missing"
     print(f"{sweep.experiment}: {count}\n{shlex.join(['coil-train', *command])}", file=sys.stderr)
-    if code := start(command):
-        remedy = "correct the cause and give the same command again: finished runs are kept"
+    code = start(command)
+    if code:
         raise UserError(
-            f"the sweep of {sweep.experiment} ended with exit code {code}, see above; {remedy}"
+            f"the sweep of {sweep.experiment} ended with exit code {code}, see above; "
+            "correct the cause and give the same command again: finished runs are kept"
         )
-    if missing := sweep.missing:
+    missing = sweep.missing
+    if missing:
         raise UserError(
-            f"{len(missing)} runs of {sweep.experiment} are still missing, the first is {missing[0]}"
+            f"{len(missing)} runs of {sweep.experiment} are still missing, "
+            f"the first is {missing[0]}"
         )
 
 
 def start(arguments: Sequence[str]) -> int:
-    """Run `coil-train` in a process of its own, so that any launcher works, and return the exit code."""
+    """Run `coil-train` in a process of its own, so that any launcher works.
+
+    Args:
+        arguments: of the command line.
+
+    Returns:
+        The exit code.
+    """
     command = [sys.executable, "-m", "coil_rl.programs.train", *arguments]
     try:
         # Progress and errors are on standard error; the tables of the runs are not of interest
@@ -92,6 +122,7 @@ def start(arguments: Sequence[str]) -> int:
 
 
 def _composed(experiment: str, *overrides: str) -> Any:
+    """Return the configuration of a run of an experiment."""
     try:
         return compose("train", [f"+experiment={experiment}", *overrides], return_hydra_config=True)
     except (HydraException, OmegaConfBaseException) as error:

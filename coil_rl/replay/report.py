@@ -21,7 +21,11 @@ MOST = 0.5  # share of the clusters
 
 
 def describe(result: OpenLoop) -> str:
-    """Return a section of Markdown about one recording."""
+    """Return a section of Markdown about one recording.
+
+    Args:
+        result: of the recording.
+    """
     columns = {
         "policy": ("policy", ""),
         "smoothness": ("smoothness", ".3f"),
@@ -49,6 +53,9 @@ def extent(result: OpenLoop) -> str:
 
     These are the number of scans, their duration, the share of them with both boundaries valid, and
     remarks on the file.
+
+    Args:
+        result: of the recording.
     """
     text = (
         f"{len(result.both_valid)} scans in {result.recording.seconds[-1]:.1f} s; "
@@ -86,13 +93,21 @@ def caution(result: OpenLoop, perception: object) -> str:
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:
-    """Return the mean |a - b| of each pair of policies, over the scans with both actions."""
+    """Return the mean |a - b| of each pair of policies, over the scans with both actions.
+
+    Args:
+        result: of the recording.
+    """
     actions = pd.DataFrame({name: steering.action for name, steering in result.steering.items()})
     return pd.DataFrame({name: actions.sub(actions[name], axis=0).abs().mean() for name in actions})
 
 
 def outcome(result: OpenLoop) -> str:
-    """Return the extent of the recording, and which policies disagree most."""
+    """Return the extent of the recording, and which policies disagree most.
+
+    Args:
+        result: of the recording.
+    """
     text = f"{result.recording.path}: {extent(result)}"
     distances = disagreement(result)
     pairs = distances.where(np.triu(np.ones(distances.shape, dtype=bool), 1)).stack().dropna()
@@ -107,6 +122,9 @@ def over_time(result: OpenLoop) -> list[dict[str, Any]]:
 
     Its columns are the time (s), whether both boundaries are valid, and the actions and omegas
     (radians/s) of all policies.
+
+    Args:
+        result: of the recording.
     """
     columns: dict[str, Any] = {
         "time": result.recording.seconds,

@@ -104,7 +104,11 @@ class Group:
         return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
 
     def has(self, measure: str) -> bool:
-        """Return whether a measure is known in all cases."""
+        """Return whether a measure is known in all cases.
+
+        Args:
+            measure: name of the measure.
+        """
         return measure in self.table and not self.table[measure].isna().to_numpy().any()
 
     def means(self, case: int | None = None) -> dict[str, float]:

@@ -265,6 +265,9 @@ def learning(run: Run) -> dict[str, float]:
     which is chosen in other cases, with the frames `best_at`; the mean of the curve (`area`, under
     the curve divided by the frames); the return of the best `guide`; and the frames `until_90` and
     `until_100` percent of that.
+
+    Args:
+        run: with or without a curve.
     """
     curve, choice = points(run.curve, RETURN), points(run.curve, CHOICE)
     guide = max(run.guide_returns.values(), default=math.nan)
@@ -292,7 +295,12 @@ def frames_until(
 ) -> float:
     """Return the frames at which a curve first reaches a level; NaN if it never does.
 
-    Between two points of the curve, [P] each, the frames are interpolated linearly.
+    Between two points of the curve the frames are interpolated linearly.
+
+    Args:
+        frames: of the points of the curve, [P].
+        returns: of the points of the curve, [P].
+        level: the return to reach.
     """
     reached = np.flatnonzero(np.asarray(returns) >= level)
     if not len(reached):
@@ -302,7 +310,12 @@ def frames_until(
 
 
 def points(run: Rows, key: str) -> Array:
-    """Return frames and values [P, 2] of the rows with a finite value, sorted by frames."""
+    """Return frames and values [P, 2] of the rows with a finite value, sorted by frames.
+
+    Args:
+        run: rows of `metrics.csv`.
+        key: column of the values.
+    """
     table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
     return table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
 

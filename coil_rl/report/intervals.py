@@ -70,7 +70,11 @@ class Interval:
 
 
 def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
-    """Return a row for the score of each policy, with its single seeds and its guide."""
+    """Return a row for the score of each policy, with its single seeds and its guide.
+
+    Args:
+        groups: the policies, in the order of the rows.
+    """
     rows = []
     for group in groups:
         row = Interval(
@@ -127,7 +131,12 @@ def draw_intervals(
 
 
 def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:
-    """Draw rows at their y positions."""
+    """Draw rows at their y positions.
+
+    Args:
+        axes: of the panel.
+        rows: by y position.
+    """
     style.lighten(axes, grid="x")
     axes.spines["left"].set_visible(False)
     axes.tick_params(axis="y", length=0)

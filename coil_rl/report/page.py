@@ -97,6 +97,9 @@ def guide_training(runs: Sequence[Run]) -> list[str]:
     """Return the table of guides' own returns before and after training.
 
     The list is empty if no guide was trained.
+
+    Args:
+        runs: finished runs.
     """
     rows: list[dict[str, Any]] = []
     columns = {"label": ("guides' own return, before to after", ""), "seeds": ("seeds", "")}
@@ -123,6 +126,9 @@ def training(runs: Sequence[Run]) -> list[str]:
     """Return the table of evaluation curves, means over seeds.
 
     The list is empty if nothing was trained.
+
+    Args:
+        runs: finished runs.
     """
     rows: list[dict[str, Any]] = []
     for label, of_label in _trained(runs):

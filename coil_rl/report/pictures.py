@@ -37,7 +37,11 @@ class Picture:
     record: ClassVar[Mapping[str, NestedKey]] = {}
 
     def watch(self, env: EnvBase) -> None:
-        """See the env before each step of the agent's episodes; by default do nothing."""
+        """See the env before each step of the agent's episodes; by default do nothing.
+
+        Args:
+            env: of the evaluation.
+        """
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
         """Draw the picture.
@@ -65,7 +69,12 @@ class DrivenLines(Picture):
     most: int = 12
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Draw the lines; see `Picture.draw`."""
+        """Draw the lines; see `Picture.draw`.
+
+        Args:
+            results: the episodes of each policy, one for each case.
+            folder: where the pictures are written.
+        """
         tracks, lines, crashed = self.tracks[: self.most], {}, {}
         for policy, result in results.items():
             first = result[: self.most]
@@ -124,7 +133,11 @@ class Film(Picture):
         self.steps = 0
 
     def watch(self, env: EnvBase) -> None:
-        """Take a frame if it is time, and the first episode still runs."""
+        """Take a frame if it is time, and the first episode still runs.
+
+        Args:
+            env: of the evaluation; it can render.
+        """
         if self.steps % self.every == 0 and len(self.images) < self.frames:
             pixels: NDArray[np.uint8] | None = env.render()
             if pixels is not None:

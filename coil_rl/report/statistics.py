@@ -71,6 +71,9 @@ def estimate(values: ArrayLike) -> Estimate:
     From ten seeds on, p is the share of sign patterns of the values with such a mean (two-sided,
     exact up to 14 seeds); with fewer it is that of a t test. A single seed has no interval and no
     p-value. NaN or no seeds give NaN.
+
+    Args:
+        values: one value per seed, [seeds].
     """
     from scipy import stats
 

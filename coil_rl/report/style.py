@@ -66,6 +66,9 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke for each policy.
 
     A policy whose name starts with "guide" gets grey dashes, another one the next strong colour.
+
+    Args:
+        labels: names of the policies, all different.
     """
     labels = list(labels)
     guides = [label for label in labels if label.lower().startswith("guide")]
@@ -77,7 +80,11 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 
 
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
-    """Return a stroke in a strong colour for each label, dashed once the colours are used again."""
+    """Return a stroke in a strong colour for each label, dashed once the colours are used again.
+
+    Args:
+        labels: names of the policies or methods, all different.
+    """
     result = {}
     for index, label in enumerate(labels):
         linestyle = SECOND_ROUND if index >= len(AGENTS) else "-"

@@ -148,7 +148,11 @@ def _convergence_table(error: Array) -> str:
 
 
 def most_explained(differences: Array) -> int:
-    """Return the largest number of differences that one common shift brings within rounding."""
+    """Return the largest number of differences that one common shift brings within rounding.
+
+    Args:
+        differences: between our values and the printed ones, [N].
+    """
     # Each difference is explained by an interval of shifts. Among intervals of equal width, the
     # most that share a point share the lower end of one of them.
     lower = differences - ROUNDING

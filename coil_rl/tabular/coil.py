@@ -62,7 +62,11 @@ def observations_with_advice(observations: ArrayLike, actions: int) -> Integers:
 
 
 def optimal_guide(mdp: MDP) -> Array:
-    """Return an optimal policy, [S, A] probabilities."""
+    """Return an optimal policy, [S, A] probabilities.
+
+    Args:
+        mdp: the world.
+    """
     return mdp.probabilities(value_iteration(mdp).policy)
 
 
@@ -77,7 +81,11 @@ def noisy_guide(mdp: MDP, noise: float = 0.5) -> Array:
 
 
 def random_guide(mdp: MDP) -> Array:
-    """Return the uniform policy, [S, A] probabilities."""
+    """Return the uniform policy, [S, A] probabilities.
+
+    Args:
+        mdp: the world.
+    """
     return np.full_like(mdp.r, 1 / mdp.r.shape[1])
 
 
@@ -85,5 +93,8 @@ def worst_guide(mdp: MDP) -> Array:
     """Return the policy with the lowest value, [S, A] probabilities.
 
     It is the optimal policy for the negated rewards.
+
+    Args:
+        mdp: the world.
     """
     return optimal_guide(MDP(mdp.P, -mdp.R, mdp.gamma))

@@ -50,6 +50,9 @@ class Simulator:
 
         At the end of an episode the next one begins: then `state` is its start state, and not the
         state that is returned.
+
+        Args:
+            action: index of the action.
         """
         next_state = bisect_right(self._next[self.state][action], self.rng.random())
         reward = self._rewards[self.state][action][next_state]
@@ -111,7 +114,11 @@ class ModelEstimate:
         self.rewards: Array = np.zeros((states, actions, states))  # sum of their rewards
 
     def add(self, transitions: Transitions) -> None:
-        """Count more transitions."""
+        """Count more transitions.
+
+        Args:
+            transitions: the sampled transitions.
+        """
         index = (transitions.state, transitions.action, transitions.next_state)
         np.add.at(self.counts, index, 1)
         np.add.at(self.rewards, index, transitions.reward)

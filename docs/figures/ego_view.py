@@ -78,7 +78,15 @@ def draw_field_of_view(axes: Axes, sight: float, half_angle: float) -> None:
 
 
 def draw_boundary(axes: Axes, boundary: Spline, side: int, valid: bool, samples: Array) -> None:
-    """Draw the boundary estimate of a side, if it is valid, and its samples [5, 2] m: hollow if they are remembered."""
+    """Draw the estimate of a boundary, if it is valid, and its samples.
+
+    Args:
+        axes: of the panel.
+        boundary: the splines of both sides.
+        side: index of the side.
+        valid: whether the estimate is valid; if not, the samples are remembered, and hollow.
+        samples: [5, 2] m.
+    """
     colour = LINE_COLOURS[side]
     if valid:
         curve = boundary.equidistant(CURVE_POINTS)[:, :, side, 0]
@@ -116,11 +124,10 @@ def draw_advice(axes: Axes, degrees: float, length: float) -> None:
     tip = (-length * math.sin(angle), length * math.cos(angle))
     arrow = {"arrowstyle": "-|>", "color": ADVICE_COLOUR, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tip, (0, 0), arrowprops=arrow, zorder=8.5)
-    text = (
-        "straight on"
-        if abs(degrees) < 0.5
-        else f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
-    )
+    if abs(degrees) < 0.5:
+        text = "straight on"
+    else:
+        text = f"{abs(degrees):.0f}° {'left' if degrees > 0 else 'right'}"
     axes.text(
         1,
         0.02,

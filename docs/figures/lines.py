@@ -1,7 +1,8 @@
-"""Draw the last lap of the guide and of trained agents on test tracks straightened along the middle line.
+"""Draw the last lap of the guide and of trained agents on straightened test tracks.
 
-Below each track is the smoothness of the steering, |a - weighted mean of the last 20 actions|. The
-agents of the runs drive once more, in their own environments; the guide is that of the first run.
+The tracks are straightened along their middle line. Below each track is the smoothness of the
+steering, |a - weighted mean of the last 20 actions|. The agents of the runs drive once more, in
+their own environments; the guide is that of the first run.
 
     python docs/figures/lines.py RUN [RUN ...] [--output FOLDER] [--tracks 3] [--policy last]
 """
@@ -59,7 +60,16 @@ class StraightTrack:
         return along, heading[:, 0] * offset[:, 1] - heading[:, 1] * offset[:, 0]
 
     def last_lap(self, line: Array, smoothness: Array) -> list[Array]:
-        """Return along, left and the smoothed smoothness of the last lap; NaN separates the ends of the picture."""
+        """Return what is drawn of the last lap.
+
+        Args:
+            line: [N, 2] m, all driven positions.
+            smoothness: [N], the smoothness at each of them.
+
+        Returns:
+            The distance along the track and to the left of its middle, and the smoothed smoothness;
+            NaN where the line leaves the picture at one end and enters it at the other.
+        """
         along, left = self(line)
         distance = np.unwrap(along, period=self.length)
         step = float(np.median(np.linalg.norm(np.diff(line, axis=0), axis=1)))
@@ -70,24 +80,27 @@ class StraightTrack:
 
     def path_ratio(self, line: Array) -> float:
         """Return the driven distance per distance along the centre line."""
-        passed = (
-            np.diff(np.unwrap(self(line)[0], period=self.length)).sum()
-            / self.length
-            * self.track.length
-        )
+        along, _ = self(line)
+        laps = np.diff(np.unwrap(along, period=self.length)).sum() / self.length
+        passed = laps * self.track.length
         return float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum() / passed)
 
 
 def drive(
     runs: Sequence[Path], count: int, policy: str
 ) -> tuple[list[Track], dict[str, EvaluationResult]]:
-    """Return the first test tracks of the first run, and the drives of its guide and of every agent there."""
+    """Return the first test tracks of the first run, and the drives of all policies there.
+
+    Args:
+        runs: folders of the runs; the guide is that of the first one.
+        count: number of tracks.
+        policy: which policy of each run, "best" or "last".
+    """
     configs = [read_config(run, "run", {"device": "cpu"}) for run in runs]
     tracks: list[Track] = build(configs[0].track.test, "track.test")[:count]
     record = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
-    evaluation = replace(
-        build_evaluation(configs[0]), cases=[track.name for track in tracks], record=record
-    )
+    cases = [track.name for track in tracks]
+    evaluation = replace(build_evaluation(configs[0]), cases=cases, record=record)
     drives = dict(guide_results(configs[0], evaluation))
     for run, config in zip(runs, configs, strict=True):
         opened = assemble(config, run)
@@ -205,15 +218,11 @@ def main() -> None:
     tracks, drives = drive(options.runs, options.tracks, options.policy)
     straight = [StraightTrack(track) for track in tracks]
     draw(options.output / "lines.png", straight, drives)
-    rows = [
-        {
-            "driver": name,
-            **episode,
-            "path": of_track.path_ratio(line_of(result, index)) if episode["laps"] else None,
-        }
-        for name, result in drives.items()
-        for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True))
-    ]
+    rows = []
+    for name, result in drives.items():
+        for index, (episode, of_track) in enumerate(zip(result.episodes, straight, strict=True)):
+            ratio = of_track.path_ratio(line_of(result, index)) if episode["laps"] else None
+            rows.append({"driver": name, **episode, "path": ratio})
     columns = {
         "driver": ("driver", ""),
         "case": ("track", ""),

@@ -1,8 +1,9 @@
-"""Draw the smoothing spline of appendix A.2 through noisy cones for several lambda, next to SciPy's.
+"""Draw the smoothing spline of appendix A.2 through noisy cones, next to SciPy's.
 
-The spline minimises sum |y_i - f(u_i)|^2 + lambda * integral |f''|^2 du over the chord length u.
-lambda = 0 passes through every point; a larger one trades distance from the points for a straighter
-curve. The car estimates boundaries with lambda = 0.1 m^3, the guide's path has lambda = 1 m^3.
+There is one for each of several lambda. The spline minimises sum |y_i - f(u_i)|^2 + lambda *
+integral |f''|^2 du over the chord length u. lambda = 0 passes through every point; a larger one
+trades distance from the points for a straighter curve. The car estimates boundaries with lambda =
+0.1 m^3, the guide's path has lambda = 1 m^3.
 
     python docs/figures/spline.py [OUTPUT FOLDER]
 """

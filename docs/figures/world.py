@@ -1,10 +1,10 @@
-"""Draw the view of a car in the cone world, and its guide's plan, at four moments of the guide's drive.
+"""Draw the view of a car in the cone world, and its guide's plan.
 
-The car faces up in each panel. Cones within 7 m and 60 degrees of the heading are in sight. A
-smoothing spline through the cones of a side estimates that boundary; five samples of each are the
-observation (distance and bearing). With fewer than two cones in sight, the last samples are
-remembered as places in the world. The guide pairs left and right cones into midpoints, fits a
-smoother spline through them and steers for a target on it.
+There are four moments of the guide's drive. The car faces up in each panel. Cones within 7 m and 60
+degrees of the heading are in sight. A smoothing spline through the cones of a side estimates that
+boundary; five samples of each are the observation (distance and bearing). With fewer than two cones
+in sight, the last samples are remembered as places in the world. The guide pairs left and right
+cones into midpoints, fits a smoother spline through them and steers for a target on it.
 
     python docs/figures/world.py [OUTPUT FOLDER]
 """

@@ -22,12 +22,15 @@ def test_type_checkers_see_the_same_names():
         for node in ast.parse(Path(coil_rl.__file__).read_text()).body
         if isinstance(node, ast.If)
     ]
-    names = {
-        alias.asname: f"{node.module}.{alias.name}" for node in block.body for alias in node.names
-    }
+    names = {}
+    for node in block.body:
+        names |= {alias.asname: f"{node.module}.{alias.name}" for alias in node.names}
     assert names == {name: f"{coil_rl._MODULES[name]}.{name}" for name in coil_rl.__all__}
 
 
 def test_import_of_the_package_is_light():
-    script = "import sys, coil_rl; assert not {'torch', 'hydra'} & set(sys.modules); from coil_rl import UserError"
+    script = (
+        "import sys, coil_rl; assert not {'torch', 'hydra'} & set(sys.modules); "
+        "from coil_rl import UserError"
+    )
     subprocess.run([sys.executable, "-c", script], check=True)

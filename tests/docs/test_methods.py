@@ -1,8 +1,12 @@
-"""docs/methods: rows of all methods, links that lead somewhere, commands that compose, options with their defaults."""
+"""docs/methods has all methods, links that lead somewhere, and commands that compose.
+
+The options are named with their defaults.
+"""
 
 import json
 import re
 import shlex
+from itertools import chain
 
 import pytest
 from hydra import compose, initialize_config_module
@@ -28,16 +32,13 @@ OTHER = [command for page, command in COMMANDS if command is not FIRST[page]]
 
 
 def table(page, *headings):
-    """Return the cells of the rows of the tables of a page whose first columns have some headings."""
+    """Return the cells of the rows of those tables whose first columns have some headings."""
     head = r" \| ".join(headings)
     tables = re.findall(
         rf"^\| {head} \|.*\n\|[-| ]+\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE
     )
-    return [
-        [cell.strip() for cell in row.strip("|").split("|")]
-        for rows in tables
-        for row in rows.splitlines()
-    ]
+    rows = chain.from_iterable(rows.splitlines() for rows in tables)
+    return [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
 
 
 INDEX = {
@@ -47,7 +48,7 @@ INDEX = {
 
 
 def composed(command):
-    """Return the configuration of a command, after a comparison of its method, if it has one, with the index."""
+    """Return the configuration of a command; its method, if it has one, must be in the index."""
     program, *overrides = command
     if "-m" in overrides:  # the first run of the sweep
         overrides = [override.partition(",")[0] for override in overrides if override != "-m"]

@@ -29,7 +29,10 @@ PROXY = [
 
 
 def install(folder: Path) -> Path:
-    """Copy the package into a folder, because setuptools writes there, and return where it is installed."""
+    """Copy the package into a folder, and return where it is installed.
+
+    Setuptools writes into the folder of the sources.
+    """
     shutil.copytree(SOURCE, folder / "source", ignore=shutil.ignore_patterns("__pycache__"))
     offline = [
         "--quiet",

@@ -29,7 +29,7 @@ from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.learner import Learner
 from coil_rl.learners.minibatches import Minibatches
 from coil_rl.learners.several_agents import SummedRewards
-from coil_rl.train.rollout import Rollout
+from coil_rl.run.rollout import Rollout
 
 FOLDER = Path(coil_rl.learners.__file__).parent
 

@@ -121,7 +121,7 @@ def test_update_gives_the_weights_of_stable_baselines3(env, gym_env):
     default = stable_baselines3(gym_env())
     budget, minibatches = CONFIG["budget"], default.n_steps // default.batch_size
     assert (default.n_envs, default.n_steps, minibatches) == (
-        budget["cars"],
+        budget["num_envs"],
         budget["steps"],
         OPTIONS["minibatches"],
     )

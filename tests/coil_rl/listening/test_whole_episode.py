@@ -33,11 +33,10 @@ def world(copies=1):
     """Episodes of LENGTHS, with a guide that shows the time and one that does the opposite."""
     lengths = torch.tensor(LENGTHS * copies)
     time = torch.linspace(-1, 1, 256)[:, None, None].repeat(1, len(lengths), 1)
+    keys = {"in_keys": ["time"], "out_keys": ["action"]}
     guides = {
-        name: TensorDictModule(
-            lambda seen, sign=sign: sign * seen, in_keys=["time"], out_keys=["action"]
-        )
-        for name, sign in (("time", 1), ("opposite", -1))
+        "time": TensorDictModule(lambda seen: seen.clone(), **keys),
+        "opposite": TensorDictModule(lambda seen: -seen, **keys),
     }
     return TransformedEnv(Script(lengths, torch.ones_like(time), time=time), GuideActions(guides))
 
@@ -51,9 +50,10 @@ def test_every_state_is_measured_in_no_section(found):
     assert found.guides == ["time", "opposite"]
     assert [episode["case"] for episode in found.result.episodes] == ["a", "b", "a", "b"]
     assert [episode["steps"] for episode in found.result.episodes] == LENGTHS
-    assert found.step.tolist() == [
-        step for step in range(max(LENGTHS)) for steps in LENGTHS if step < steps
-    ]
+    steps = []
+    for step in range(max(LENGTHS)):
+        steps += [step for length in LENGTHS if step < length]
+    assert found.step.tolist() == steps
     assert (found.section == 0).all()
     assert found.section.shape == found.step.shape
     assert found.place == {}

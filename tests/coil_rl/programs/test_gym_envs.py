@@ -1,4 +1,7 @@
-"""The shipped envs of Gymnasium: each is evaluated by its public controller, and one trains, is killed and resumes."""
+"""The shipped envs of Gymnasium: each is evaluated with its public controller.
+
+Some of them also train, are killed and resume.
+"""
 
 import csv
 import signal

@@ -1,4 +1,7 @@
-"""Every mistake in the input of a program: one sentence, exit code 2, no traceback, no new files."""
+"""Every mistake in the input of a program is answered by one sentence.
+
+The exit code is 2, and there is no traceback and no new file.
+"""
 
 import signal
 import subprocess
@@ -35,7 +38,7 @@ TINY = [
 
 @pytest.fixture
 def started(monkeypatch, tmp_path):
-    """The programs without their work, in an empty folder: the names of those that would have started it."""
+    """Return the names of the programs that start to work: they do nothing, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     names = []
     monkeypatch.setattr(train, "train", lambda config: names.append("train"))
@@ -67,7 +70,8 @@ def refusal(name, *arguments):
         ("sed=1", "resume; did you mean seed?"),
         (
             "budget.step=1",
-            "no key budget.step; budget has frames, num_envs, steps, minibatches; did you mean steps?",
+            "no key budget.step; budget has frames, num_envs, steps, minibatches; "
+            "did you mean steps?",
         ),
         (
             "learner.learning_rat=1",
@@ -222,7 +226,8 @@ def refusal(name, *arguments):
         ),
         (
             "method=oil",
-            "track.train gives one track, which cannot be left out to validate; set learner.group_key=null",
+            "track.train gives one track, which cannot be left out to validate; "
+            "set learner.group_key=null",
         ),
         (
             "method=dynamic_coil_joint proxy.learner.regressor.epochs=-1",
@@ -390,8 +395,8 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
     assert (
-        f"{change} has no effect: run={run} has its own configuration; what can be changed is run, track"
-        in sentence
+        f"{change} has no effect: run={run} has its own configuration; "
+        "what can be changed is run, track" in sentence
     )
 
 
@@ -436,7 +441,10 @@ def test_missing_extra_is_named(monkeypatch):
 
 
 def test_env_with_the_guide_of_another_one_is_refused():
-    message = "guide.spline.spline refers to preset.spline, which does not exist; choose another guide, or give"
+    message = (
+        "guide.spline.spline refers to preset.spline, which does not exist; "
+        "choose another guide, or give"
+    )
     assert message in refusal("train", "env=mountain_car", "guide=spline")
 
 
@@ -465,11 +473,10 @@ def leaves(node, path=""):
     for key in node:
         name = f"{path}.{key}".lstrip(".")
         value = node._get_node(key)
-        yield from (
-            leaves(value, name)
-            if isinstance(value, DictConfig) and not value._is_interpolation()
-            else [name]
-        )
+        if isinstance(value, DictConfig) and not value._is_interpolation():
+            yield from leaves(value, name)
+        else:
+            yield name
 
 
 with initialize_config_module("coil_rl.conf", version_base="1.3"):

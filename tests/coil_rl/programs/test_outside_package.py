@@ -1,4 +1,7 @@
-"""A package that coil-rl does not know, with its own envs, controllers and YAML files, through all commands."""
+"""A package that coil-rl does not know goes through all commands.
+
+It has its own envs, controllers and YAML files.
+"""
 
 import csv
 import os
@@ -32,7 +35,10 @@ def installed(site, monkeypatch):
 
 @pytest.fixture(scope="module")
 def runs(site, tmp_path_factory):
-    """Return the folder of two finished runs, `room` with its PI controller and `rooms` with the batched one."""
+    """Return the folder of two finished runs.
+
+    `room` has the PI controller of the package, and `rooms` its batched one.
+    """
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(site)
@@ -163,7 +169,10 @@ def test_package_that_is_not_declared_can_be_trusted(runs, tmp_path, monkeypatch
 
 @pytest.fixture
 def script(site, tmp_path):
-    """Return what starts a console script in a process of its own, with this checkout and the package installed."""
+    """Return what starts a console script in a process of its own.
+
+    This checkout and the package are installed there.
+    """
 
     def start(name, *arguments):
         path = os.pathsep.join([str(ROOT), str(site)])

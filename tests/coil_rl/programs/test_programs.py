@@ -125,7 +125,8 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
         (
             "train",
             ["-m", "resume=run,other"],
-            "resume=run,other takes no argument but trust=[PACKAGE]: the run has its own config.yaml; leave out -m",
+            "resume=run,other takes no argument but trust=[PACKAGE]: "
+            "the run has its own config.yaml; leave out -m",
         ),
     ],
 )

@@ -178,7 +178,8 @@ def test_recording_without_boundaries_is_replayed_with_a_warning(tmp_path):
     )
     sentence = done.stderr.splitlines()[-1]
     assert sentence.startswith(
-        "replay: room.mcap: no scan shows both boundaries and 100% of the clusters in sight are unlike any cone of the "
+        "replay: room.mcap: no scan shows both boundaries and "
+        "100% of the clusters in sight are unlike any cone of the "
         "training, so the actions mean little; check env.perception, or train the classifier"
     )
     assert (
@@ -208,7 +209,10 @@ def test_recording_that_is_cut_off_is_replayed_as_far_as_it_goes(tmp_path):
 
 
 def test_recorded_steering_is_that_of_table_6(tmp_path):
-    """A robot at another speed than the replay's, with stamped commands between its scans, and two scanners."""
+    """Record a robot at another speed than the replay's.
+
+    It has two scanners, and stamped commands between its scans.
+    """
     commands = [twist(0.3, 0.4 * math.sin(number)) for number in range(40)]
     stamped = [{"header": header(START, "base_link"), "twist": each} for each in commands]
     messages = [

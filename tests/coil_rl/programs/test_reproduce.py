@@ -27,7 +27,12 @@ def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
     code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
     files = {path.name for path in Path("run").iterdir()}
     made = {
-        f"{name}.{ending}" for name in ("table_1", "figure_6") for ending in ("md", "csv", "png")
+        "table_1.md",
+        "table_1.csv",
+        "table_1.png",
+        "figure_6.md",
+        "figure_6.csv",
+        "figure_6.png",
     }
     assert code == 0
     assert files == made | {"RESULTS.md"}

@@ -1,4 +1,4 @@
-"""Help texts and wrong overrides import none of the heavy libraries, and help begins with examples."""
+"""Help texts and wrong overrides import no heavy library, and help begins with examples."""
 
 import json
 import subprocess
@@ -28,7 +28,7 @@ print(json.dumps(results))
 
 
 def start(cwd, *commands):
-    """Return exit code, standard output, standard error and imported heavy modules of each command."""
+    """Return exit code, standard output and error, and imported heavy modules of each command."""
     command = [sys.executable, "-c", SCRIPT, json.dumps(commands)]
     done = subprocess.run(
         command, cwd=cwd, env=environment(cwd), capture_output=True, text=True, check=True

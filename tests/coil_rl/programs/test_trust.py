@@ -47,8 +47,8 @@ def test_command_runs_no_code_from_a_folder(command, received, tmp_path):
     stderr = called(command.split()[0], *COMMANDS[command], cwd=tmp_path, code=2).stderr
     sentence = stderr.splitlines()[-1]
     assert (
-        "run/config.yaml: method.transforms.x._target_ names 'builtins.open', which is no part of a run"
-        in sentence
+        "run/config.yaml: method.transforms.x._target_ names 'builtins.open', "
+        "which is no part of a run" in sentence
     )
     assert "Traceback" not in stderr
     assert not (tmp_path / "marker").exists()

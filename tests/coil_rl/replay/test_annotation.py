@@ -71,15 +71,10 @@ def by_another_library(path):
 
 
 def test_markers_have_the_stamp_and_the_frame_of_the_scan(tmp_path):
-    messages = [
-        (
-            "/scan",
-            SCAN,
-            START + number * PERIOD,
-            scan(number, header=header(7 + number * PERIOD, "lidar")),
-        )
-        for number in range(SCANS)
-    ]
+    messages = []
+    for number in range(SCANS):
+        stamped = scan(number, header=header(7 + number * PERIOD, "lidar"))
+        messages.append(("/scan", SCAN, START + number * PERIOD, stamped))
     env = McapReplayEnv(rosbag_of(tmp_path / "drive", *messages), perception)
     [result] = open_loop(env, {"spline": (env, SplineGuide())})
     path = tmp_path / "annotated.mcap"

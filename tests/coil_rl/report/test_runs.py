@@ -61,7 +61,10 @@ def test_guide_without_agent_has_no_curve(tmp_path):
     assert (list(found.curve), found.guide_returns, found.needs_guide) == ([], {}, None)
 
 
-ROW = "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\nguide,,sampled,a,"
+ROW = (
+    "driver,advice,actions,case,reward,lap_time,smoothness,completed,crashed,clearance\n"
+    "guide,,sampled,a,"
+)
 
 
 @pytest.mark.parametrize(

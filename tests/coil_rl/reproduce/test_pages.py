@@ -12,7 +12,8 @@ from coil_rl.reproduce.pages import Claim, claims_section
 def test_a_page_has_heading_warning_picture_text_and_origin():
     text = pages.page("## Table 9: something\n\ntext", "table_9", "A smoke test.", "Made by hand.")
     assert text == (
-        "## Table 9: something\n\n> **A smoke test.**\n\n![Table 9: something](table_9.png)\n\ntext\n\n"
+        "## Table 9: something\n\n> **A smoke test.**\n\n"
+        "![Table 9: something](table_9.png)\n\ntext\n\n"
         "<sub>Made by hand.</sub>\n"
     )
     assert "> **" not in pages.page("## Table 9: something\n\ntext", "table_9", None, "")
@@ -24,7 +25,8 @@ def test_the_origin_has_command_commits_seeds_and_frames(tmp_path):
     for run, commit in zip(runs, ["abc", "abc", "abc-dirty", "abc"], strict=False):
         (run.folder / "versions.json").write_text(json.dumps({"commit": commit}))
     assert pages.origin("coil-reproduce table=4", "def-dirty", runs) == (
-        "Made by `coil-reproduce table=4` at commit `def` with local changes. 5 runs with the seeds 0, 1, made at "
+        "Made by `coil-reproduce table=4` at commit `def` with local changes. "
+        "5 runs with the seeds 0, 1, made at "
         "commit `abc`, `abc` with local changes, `unknown`. Training frames: 4,000 (coil, ppo)."
     )
     assert (

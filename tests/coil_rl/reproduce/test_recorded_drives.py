@@ -9,7 +9,7 @@ from coil_rl.reproduce.recorded_drives import record
 
 @pytest.fixture
 def guide():
-    """A function that makes robots and their guide, and a list with an entry for each of its drives."""
+    """Return a function that makes robots and their guide, and a list that grows at each drive."""
     drives = []
 
     def make_env_and_policy():

@@ -139,7 +139,7 @@ def test_all_drive_on_further_tracks_too(runs, tmp_path):
 
 
 def robots_of(run, folder):
-    """Return the recordings of the agent of a run, one robot and a lap of the constant guide at most."""
+    """Return the recordings of the agent of a run: one robot, and a lap at most."""
     Table6(runs=[str(run)], repeats=1, laps=1).make(folder / "own")
     return read_recording(folder / "own_drives" / f"{run.name}_0.mcap")
 
@@ -235,7 +235,10 @@ def test_claims_have_a_verdict_by_seed(page):
         row(page, "COIL steers more smoothly than PPO")[3]
         == "**undecided**: -0.001 (-0.065 to +0.063), 2 seeds, p 1.000"
     )
-    expected = "**did not hold up**: guide 0 of 2 drives, ppo 0 of 3 (0% to 71%) seeds, coil 1 of 3 (1% to 91%) seeds"
+    expected = (
+        "**did not hold up**: guide 0 of 2 drives, "
+        "ppo 0 of 3 (0% to 71%) seeds, coil 1 of 3 (1% to 91%) seeds"
+    )
     assert row(page, "Nobody crashes") == ["Nobody crashes", "0", "-", expected]
 
 

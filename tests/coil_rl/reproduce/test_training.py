@@ -1,3 +1,5 @@
+import itertools
+
 import pytest
 from reproduced_runs import make_runs, read_csv, row
 
@@ -79,9 +81,7 @@ def test_curves_are_means_of_runs_with_the_guides_return(tmp_path):
     rows = {
         (point["label"], float(point["frames"])): point for point in read_csv(tmp_path / "f.csv")
     }
-    assert set(rows) == {
-        (label, frames) for label in ("coil", "ppo") for frames in (2000, 3000, 4000)
-    }
+    assert set(rows) == set(itertools.product(("coil", "ppo"), (2000, 3000, 4000)))
     assert float(rows["coil", 3000]["mean"]) == 341
     assert float(rows["coil", 3000]["low"]) <= 341 <= float(rows["coil", 3000]["high"])
     coil, ppo = row(page, "coil"), row(page, "ppo")

@@ -90,7 +90,10 @@ def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made)
     assert claims["COIL's laps take less time than PPO's"][:2] == ["-0.10", expected]
     assert claims["COIL earns more with its guide's advice than with another car's"][0] == "-"
     none = "0 of 3 (0% to 71%)"
-    crashes = f"**did not hold up**: guide 0 of 2 cases, ppo {none}, coil {none}, oil 3 of 3 (29% to 100%)"
+    crashes = (
+        f"**did not hold up**: guide 0 of 2 cases, ppo {none}, coil {none}, "
+        "oil 3 of 3 (29% to 100%)"
+    )
     assert claims["Nobody crashes"][:2] == ["0%", crashes]
     assert len(claims) == 7 + 3 + 1
 

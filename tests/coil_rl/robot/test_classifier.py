@@ -90,7 +90,10 @@ def test_unsuitable_drives_are_refused():
         train_classifier(features, thick, thick.astype(int), folds=2)
 
 
-NARROW = '{"mean": [0], "scale": [1], "support": [[0]], "weights": [[1], [1]], "intercept": [0, 0], "gamma": 1}'
+NARROW = (
+    '{"mean": [0], "scale": [1], "support": [[0]], "weights": [[1], [1]], '
+    '"intercept": [0, 0], "gamma": 1}'
+)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +166,10 @@ def test_shares_have_the_interval_of_wilson():
 
 @pytest.mark.slow
 def test_shipped_classifier_is_the_result_of_training():
-    """The shipped one is what `save_classifier` writes here: a pair of drives per seed, with more and more beams."""
+    """It is what `save_classifier` writes here.
+
+    There is a pair of drives per seed, with more and more beams.
+    """
 
     def scans(sides, seed):
         drive = simulated_drive(sides, seed, SimulatedLidar((180, 360, 720, 1440)[seed % 4]))

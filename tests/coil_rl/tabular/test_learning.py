@@ -20,7 +20,7 @@ UNIFORM = np.full((5, 2), 0.5)
 
 
 def corridor(length, gamma=0.9):
-    """Actions left and right; a reward of 2 at the terminal right end; the start is the left end."""
+    """Return a row of states from the start on the left to a terminal one with a reward of 2."""
     P, R = np.zeros((length, 2, length)), np.zeros((length, 2, length))
     for s in range(length):
         P[s, 0, max(s - 1, 0)] = P[s, 1, min(s + 1, length - 1)] = 1

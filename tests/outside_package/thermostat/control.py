@@ -1,4 +1,4 @@
-"""PI controllers of the heater: as a Python class, as a batched module with memory, as functions."""
+"""PI controllers of the heater: a Python class, a batched module with memory, and functions."""
 
 from typing import Any
 
@@ -45,7 +45,9 @@ class PI:
 
 
 class BatchedPI(TensorDictModuleBase):
-    """The same for all rooms at once; its integral follows what the heater was really given (back-calculation).
+    """The same for all rooms at once.
+
+    Its integral follows what the heater was really given (back-calculation).
 
     So it does not wind up either while an agent heats instead of it.
 
@@ -86,7 +88,7 @@ def proportional(observation: Tensor, kp: float = 0.2) -> Tensor:
 
 
 class Feedforward(torch.nn.Linear):
-    """A network: the power [B, 1] for observations [B, 2], with what the temperature outside needs."""
+    """A network: the power [B, 1] for observations [B, 2], and for the temperature outside."""
 
     def __init__(self) -> None:
         super().__init__(2, 1)
