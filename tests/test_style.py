@@ -141,9 +141,10 @@ def messages(function: ast.AST) -> Iterator[ast.expr]:
     """Yield the first argument of each exception that a function raises, and of each warning."""
     for node in own_nodes(function):
         call = node.exc if isinstance(node, ast.Raise) else node
-        if isinstance(call, ast.Call) and call.args:
-            if isinstance(node, ast.Raise) or ast.unparse(call.func) == "warnings.warn":
-                yield call.args[0]
+        if not isinstance(call, ast.Call) or not call.args:
+            continue
+        if isinstance(node, ast.Raise) or ast.unparse(call.func) == "warnings.warn":
+            yield call.args[0]
 
 
 def is_glued(message: ast.expr, texts: set[str]) -> bool:

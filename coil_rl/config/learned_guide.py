@@ -3,17 +3,30 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from tensordict import TensorDictBase
+import torch
+from numpy.typing import NDArray
+from omegaconf import DictConfig
+from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, ExplorationType, TransformedEnv, set_exploration_type
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExplorationType,
+    TransformedEnv,
+    set_exploration_type,
+)
 
-from coil_rl.config.build import assemble, build_bare_env, build_transforms
+from coil_rl.config.build import assemble, build_transforms
 from coil_rl.config.saved import read_config
 from coil_rl.errors import UserError
+from coil_rl.guides import PerRow
+from coil_rl.run.parts import TRAIN
 from coil_rl.run.policy_batch import memory_keys
+from coil_rl.run.run import Run
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
 _loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
@@ -22,6 +35,9 @@ _loading: list[Path] = []  # runs that are being loaded, each of which is a guid
 class LearnedGuide(TensorDictModuleBase):
     """Deterministic action of a trained policy, with the guides and action transforms of its run.
 
+    All rows act at once. Where the policy, a guide of it or a transform depends on earlier steps,
+    they act one after the other, each with a `Controller` of its own.
+
     Args:
         run: folder of a run of `coil-train`.
         which: the last policy, or the best of the kept ones.
@@ -29,8 +45,7 @@ class LearnedGuide(TensorDictModuleBase):
 
     Raises:
         UserError: if the folder holds no finished run, or one that is its own guide.
-        ValueError: if the run has no policy (method=guide), one whose advice depends on earlier
-            steps, or one with a memory behind transforms.
+        ValueError: if the run has no policy (method=guide).
     """
 
     def __init__(
@@ -41,39 +56,50 @@ class LearnedGuide(TensorDictModuleBase):
         config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(
-                f"{folder} trained no agent: its method is {config.method.name}; name its guide instead"
+                f"{folder} trained no agent: its method is {config.method.name}; name its guide "
+                "instead"
             )
         with _guarded(folder):
-            # The transforms need the specs of an env; some need at least two rows.
-            env = TransformedEnv(
-                build_bare_env(config, {"num_envs": 2}), Compose(*build_transforms(config))
-            )
-            self.policy = assemble(config, folder).load_policy(env, which)
-            self.transforms = None
+            opened = assemble(config, folder)
+            guide: TensorDictModuleBase = _AllRows(config, opened, which)
+            if guide.needs_past:
+                guide = PerRow(partial(_OneRow, opened, which), guide.plant_keys)
+        self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
+        self.guide = guide
+        self.requires_grad_(False)
+        self.eval()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write `action` as executed by the env, and the next state of a policy with a memory."""
+        return self.guide(tensordict)
+
+
+class _AllRows(TensorDictModuleBase):
+    """The policy of a run on all rows at once, without a past behind its transforms.
+
+    Attributes:
+        needs_past: whether it has such a past, so that it must not be used.
+        plant_keys: entries of the env of the run.
+    """
+
+    def __init__(self, config: DictConfig, run: Run, which: str) -> None:
+        super().__init__()
+        # The transforms need the specs of an env; some need at least two rows.
+        env = TransformedEnv(run.make_env.bare(2, TRAIN, None), Compose(*build_transforms(config)))
+        self.policy = run.load_policy(env, which)
         memory = memory_keys(self.policy)
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
+        specs = env.base_env.observation_spec
+        self.plant_keys = observed(env.base_env)
+        self.transforms, self.needs_past = None, False
         if config.method.needs_guide or config.action:
-            if memory:
-                raise ValueError(
-                    f"{folder} has a policy with a memory behind transforms, which is no guide; train one with "
-                    "network=mlp, or with method=ppo action=continuous"
-                )
             self.transforms = env.transform
-            past = [
-                type(part).__name__
-                for part in env.transform.modules()
-                if getattr(part, "needs_past", False)
-            ]
-            if past:
-                raise ValueError(
-                    f"{folder} has {', '.join(past)}, which needs earlier steps; its policy is no guide"
-                )
-            self.in_keys = [key for key in env.base_env.observation_spec if key != "info"]
+            parts = env.transform.modules()
+            self.needs_past = bool(memory) or any(getattr(p, "needs_past", False) for p in parts)
+            self.in_keys = [key for key in specs if key != "info"]
         # Transforms hold a weak reference to their env; the tuple keeps it from becoming a
         # submodule.
         self._env = (env,)
-        self.requires_grad_(False)
-        self.eval()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` as executed by the env, and the next state of a policy with a memory."""
@@ -87,6 +113,31 @@ class LearnedGuide(TensorDictModuleBase):
         for key in self.out_keys:
             tensordict.set(key, data[key])
         return tensordict
+
+
+def observed(env: EnvBase) -> list[NestedKey]:
+    """Return the entries of an env without those under `info`."""
+    keys = env.observation_spec.keys(True, True)
+    return [key for key in keys if isinstance(key, str) or key[0] != "info"]
+
+
+class _OneRow:
+    """The policy of a run on one row, with its past; the object of a row for `PerRow`."""
+
+    def __init__(self, run: Run, which: str) -> None:
+        self.controller = run.controller(which)
+        self.keys = observed(self.controller.plant)
+        self.reset = self.controller.reset
+        self.state_dict = self.controller.state_dict
+        self.load_state_dict = self.controller.load_state_dict
+
+    def act(self, *values: NDArray[Any]) -> NDArray[Any]:
+        """Return the action for the entries of the row."""
+        plant = self.controller.plant
+        entries = plant.full_observation_spec.zero()
+        for key, value in zip(self.keys, values, strict=True):
+            entries.set(key, torch.as_tensor(value, device=plant.device)[None])
+        return self.controller.act_on(entries)[0].cpu().numpy()
 
 
 @contextmanager

@@ -58,7 +58,6 @@ class Controller:
         self._acted: TensorDictBase | None = None  # the last state with the policy's action
         self._executed: TensorDictBase | None = None  # the same after the transforms of the action
 
-    @torch.no_grad()
     def act(self, observation: Any) -> Any:
         """Return the action for an observation.
 
@@ -74,11 +73,21 @@ class Controller:
         Raises:
             ValueError: if the observation does not fit the env.
         """
-        state = self._state(self._entries(observation))
+        return self._decoded(self.act_on(self._entries(observation)))
+
+    @torch.no_grad()
+    def act_on(self, entries: TensorDictBase) -> Tensor:
+        """Return the action for the entries of the env, as an entry of the env, [1, *A].
+
+        Args:
+            entries: what the env writes before the transforms of the run, [1].
+        """
+        state = self._state(entries)
         with set_exploration_type(ExplorationType.DETERMINISTIC):
             self._acted = self.policy(state)
         self._executed = self.env.transform.inv(self._acted)
-        return self._decoded(self._executed[self.env.action_key])
+        action: Tensor = self._executed[self.env.action_key]
+        return action
 
     def state_dict(self) -> dict[str, Any]:
         """Return what the next actions of the episode depend on, besides their observations."""

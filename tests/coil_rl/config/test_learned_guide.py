@@ -75,14 +75,22 @@ def test_run_without_an_agent_is_refused(tmp_path):
         LearnedGuide(str(run))
 
 
-def test_run_whose_advice_needs_earlier_steps_is_refused(tmp_path):
-    (tmp_path / "actions.csv").write_text("0.1\n0.2\n")
-    options = ["method=coil", "guide=recorded", f"guide.recorded.file={tmp_path / 'actions.csv'}"]
-    run = make_untrained_run(tmp_path / "run", *TINY, *options)
-    with pytest.raises(
-        ValueError, match="run has GuideActions, which needs earlier steps; its policy is no guide"
-    ):
-        LearnedGuide(str(run))
+@pytest.mark.parametrize("options", [["guide=recorded", "method=coil"], ["network=gru"]])
+def test_policy_with_a_past_acts_as_in_its_own_env(options, tmp_path):
+    (tmp_path / "actions.csv").write_text("0.1\n0.2\n-0.3\n")
+    if "guide=recorded" in options:
+        options = [*options, f"guide.recorded.file={tmp_path / 'actions.csv'}"]
+    run = make_untrained_run(tmp_path / "run", *TINY, "learner.action_gain=3", *options)
+    opened = open_run(run)
+    env = opened.make_env(3, "evaluation", count=3)
+    policy = evaluate_policy(env, opened.policy(env))
+    guided = composed(
+        *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}", "run_dir=unused"
+    )
+    learned = evaluate_policy(*env_maker(guided).guided(3, "evaluation", count=3))
+    assert [row["reward"] for row in learned.episodes] == pytest.approx(
+        [row["reward"] for row in policy.episodes], abs=1e-5
+    )
 
 
 def guided_by(run, guide):

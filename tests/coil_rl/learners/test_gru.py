@@ -14,9 +14,9 @@ from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, Unbo
 from torchrl.envs import Compose, RewardSum, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.config.build import build_env, build_guided_env, build_guides
+from coil_rl.config.build import build_guides, env_maker
 from coil_rl.config.check import check
-from coil_rl.config.learned_guide import LearnedGuide
+from coil_rl.config.load import open_run
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.errors import UserError
 from coil_rl.learners import (
@@ -33,9 +33,9 @@ from coil_rl.learners import (
 )
 from coil_rl.learners.encoders import ObservationNetwork
 from coil_rl.learners.networks import FastTensorDictModule
-from coil_rl.programs.evaluate import restore
 from coil_rl.programs.train import resume, train
 from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.run.parts import TEST
 from coil_rl.run.policy_batch import PoliciesInTurn, policy_batch
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
@@ -268,9 +268,9 @@ def test_run_resumes_to_the_bit_and_is_evaluated_in_a_new_env(method, tmp_path):
     resume(stopped)
     for name in ("policy_last.pt", "metrics.csv", "evaluation.csv", "episodes.csv"):
         assert (run / name).read_bytes() == (stopped / name).read_bytes(), name
-    again, policy = restore(run, composed("unused", *TINY[:3], f"run={run}", name="evaluate"))
-    overrides = {**again.evaluation.env, "num_envs": 2}
-    mean = evaluate_policy(build_env(again, overrides), policy).mean_reward
+    opened = open_run(run)
+    env = opened.make_env(2, TEST)
+    mean = evaluate_policy(env, opened.policy(env)).mean_reward
     table = (run / "evaluation.csv").read_text().splitlines()
     (row,) = (
         line.split(",") for line in table if line.startswith(f"{config.label},,deterministic,mean,")
@@ -283,25 +283,16 @@ def test_policy_with_a_memory_is_a_guide(tmp_path):
         tmp_path / "run", *TINY, "method=ppo", "network=gru", "learner.action_gain=3"
     )
     guided = composed("unused", *TINY, "method=guide", "guide=learned", f"guide.learned.run={run}")
-    overrides = {"num_envs": 3, "assignment": "cyclic"}
-    config, agent = restore(run, composed("unused", *TINY[:3], f"run={run}", name="evaluate"))
-    policy = evaluate_policy(build_env(config, overrides), agent)
-    learned = evaluate_policy(*build_guided_env(guided, overrides))
+    opened = open_run(run)
+    env = opened.make_env(3, "evaluation", count=3)
+    policy = evaluate_policy(env, opened.policy(env))
+    learned = evaluate_policy(*env_maker(guided).guided(3, "evaluation", count=3))
     assert [row["reward"] for row in learned.episodes] == pytest.approx(
         [row["reward"] for row in policy.episodes]
     )
     assert not any(
         parameter.requires_grad for parameter in build_guides(guided)["learned"].parameters()
     )
-
-
-def test_policy_with_a_memory_behind_transforms_is_no_guide(tmp_path):
-    run = make_untrained_run(tmp_path / "run", *TINY, "method=coil", "network=gru")
-    with pytest.raises(
-        ValueError,
-        match="has a policy with a memory behind transforms, which is no guide; train one",
-    ):
-        LearnedGuide(str(run))
 
 
 @pytest.mark.parametrize(

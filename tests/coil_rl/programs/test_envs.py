@@ -15,7 +15,6 @@ from hydra import compose, initialize_config_module
 from programs import called
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
-from coil_rl.config.build import env_maker
 
 FILES = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
 REPLAYS = ["mcap_replay"]  # for coil-replay alone, see test_replay.py
@@ -93,7 +92,7 @@ def test_env_takes_steps_with_the_advice_of_its_guide(env):
         has_guide = bool(compose("train", overrides).guide)
         method = "coil" if has_guide else "ppo"
         config = compose("train", [*overrides, f"method={method}"])
-    rollout = build_env(config, {"num_envs": 2}).rollout(3, break_when_any_done=False)
+    rollout = env_maker(config)(2).rollout(3, break_when_any_done=False)
     assert rollout.batch_size == (2, 3)
     entries = [*config.observes, "guide_action"] if has_guide else config.observes
     for key in entries:
