@@ -15,6 +15,7 @@ from hydra import compose, initialize_config_module
 from programs import called
 
 import coil_rl.config.schema  # noqa: F401 registers the schema
+from coil_rl.config.build import env_maker
 
 FILES = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
 REPLAYS = ["mcap_replay"]  # for coil-replay alone, see test_replay.py
