@@ -45,7 +45,7 @@ import mutations  # noqa: E402
 import torch  # noqa: E402
 from hydra import compose, initialize_config_module  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
-from programs import called  # noqa: E402
+from programs import called, module  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from coil_rl.envs import SimulatedRobotEnv, record_drives  # noqa: E402
@@ -442,7 +442,7 @@ class Fuzzer:
             }
             os.chdir(place / "here")
             sys.argv = case.words
-            importlib.import_module(f"coil_rl.programs.{case.words[0]}").main()
+            importlib.import_module(module(case.words[0])).main()
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -23,8 +23,13 @@ TINY = [
 ]
 
 
+def module(name):
+    """Return the module of a program."""
+    return "coil_paper.program" if name == "reproduce" else f"coil_rl.programs.{name}"
+
+
 def command(name, *arguments):
-    return [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
+    return [sys.executable, "-m", module(name), *arguments]
 
 
 def environment(cwd):
@@ -58,7 +63,7 @@ def called(name, *arguments, cwd=".", code=0):
             contextlib.redirect_stderr(error),
             contextlib.redirect_stdout(out),
         ):
-            importlib.import_module(f"coil_rl.programs.{name}").main()
+            importlib.import_module(module(name)).main()
     except SystemExit as end:
         ended = end.code
     finally:
