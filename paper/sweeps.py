@@ -55,7 +55,7 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
     """
     words = [FILES, f"+experiment={experiment}", *overrides]
     seeds, folders = list(seeds), []
-    for choice in _choices(experiment, words):
+    for choice in choices(experiment, words):
         config = _composed([*words, *choice])
         for seed in seeds:
             config.seed = seed
@@ -64,8 +64,13 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
     return Sweep(experiment, command, tuple(folders))
 
 
-def _choices(experiment: str, words: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Yield the overrides of each run of a sweep but for its seed."""
+def choices(experiment: str, words: Sequence[str]) -> Iterator[Sequence[str]]:
+    """Yield the overrides of each run of a sweep but for its seed.
+
+    Args:
+        experiment: name of the file, for the message.
+        words: of the command line of `coil-train`, with this experiment.
+    """
     # Composed without any choice first, as Hydra does it too.
     params: dict[str, Any] = dict(_composed(words).hydra.sweeper.params or {})
     if not params:
@@ -74,8 +79,8 @@ def _choices(experiment: str, words: Sequence[str]) -> Iterator[Sequence[str]]:
     parsed = OverridesParser.create().parse_overrides(
         [f"{key}={value}" for key, value in params.items()]
     )
-    (choices,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
-    yield from choices
+    (batch,) = BasicSweeper.split_arguments(parsed, max_batch_size=None)
+    yield from batch
 
 
 def run(sweep: Sweep, launcher: Sequence[str] = ()) -> None:

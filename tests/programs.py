@@ -22,6 +22,24 @@ TINY = [
     "logger=none",
 ]
 
+# The smallest run of any experiment in the cone world.
+TINY_SWEEP = [
+    "track=generated",
+    "track.train.count=2",
+    "track.test.count=2",
+    "env.laps=1",
+    "env.time_limit=1",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+]
+
 
 def module(name):
     """Return the module of a program."""

@@ -12,8 +12,10 @@ import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -29,7 +31,7 @@ from coil_rl.report import DrivenLines, markdown_table, style
 INSIDE_COLOUR = "#eceff2"
 HALF_WIDTH = 1.5  # m, of the straightened track
 SPACING = 0.05  # m, of the middle line
-CONE = {"ms": 3, "mec": style.INK, "mew": 0.3}
+CONE: Any = {"ms": 3, "mec": style.INK, "mew": 0.3}
 
 
 class StraightTrack:
@@ -161,7 +163,7 @@ def draw(
 ) -> None:
     """Draw all tracks and drives."""
     strokes = style.strokes(drives)
-    handles = [
+    handles: list[Artist] = [
         Line2D([], [], color=s.colour, ls=s.linestyle, lw=1.8, label=name)
         for name, s in strokes.items()
     ]

@@ -11,6 +11,8 @@ smoother spline through them and steers for a target on it.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from matplotlib.axes import Axes
@@ -28,7 +30,7 @@ from coil_rl.report import style
 TRACK = "test_3"
 MOMENTS = {"straight": 10.5, "right bend": 17.5, "left bend": 4.75, "left boundary lost": 5.33}  # s
 CAR = np.array([[0.7, 0.0], [-0.5, 0.42], [-0.25, 0.0], [-0.5, -0.42]])  # m
-EDGE = {"mec": style.INK, "mew": 0.5}
+EDGE: Any = {"mec": style.INK, "mew": 0.5}
 
 
 @torch.no_grad()

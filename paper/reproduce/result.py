@@ -17,9 +17,8 @@ import yaml
 from coil_rl import UserError
 from coil_rl.report import Run
 
-Runs = Mapping[
-    str, Sequence[Run]
-]  # finished runs by experiment, a file name in `paper/conf/experiment`
+# Finished runs by experiment, the name of a file in `paper/conf/experiment`.
+Runs = Mapping[str, Sequence[Run]]
 NO_RUNS: Runs = MappingProxyType({})
 # By result: the paper's numbers and claims, and notes on the tables.
 PAGES: Any = yaml.safe_load(

@@ -8,11 +8,7 @@ from run_folders import make_untrained_run
 
 
 def run(script, *arguments):
-    command = [
-        sys.executable,
-        str(ROOT / "docs" / "figures" / f"{script}.py"),
-        *map(str, arguments),
-    ]
+    command = [sys.executable, "-m", f"coil_paper.figures.{script}", *map(str, arguments)]
     done = subprocess.run(
         command, env=environment(ROOT), cwd=ROOT, capture_output=True, text=True, check=False
     )

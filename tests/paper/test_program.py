@@ -9,7 +9,7 @@ from programs import ROOT, TRACK, called, program
 from run_folders import driven, make_run
 
 from coil_paper import sweeps
-from coil_rl.programs.reproduce import INDEX
+from coil_paper.program import INDEX
 
 
 @pytest.fixture(autouse=True)
@@ -37,7 +37,7 @@ def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
 
 
 def test_every_figure_of_the_paper_is_either_reproduced_or_named():
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+    with initialize_config_module("coil_paper.conf", version_base="1.3"):
         config = compose("reproduce")
     named = [number for numbers in config.other_figures.values() for number in numbers]
     made = [
@@ -101,8 +101,7 @@ def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
 @pytest.fixture
 def two_runs(monkeypatch):
     """Finished runs of COIL and PPO, and the list of commands that a sweep starts."""
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        sweep = sweeps.planned("paper", ["compile=true"], [0])
+    sweep = sweeps.planned("paper", ["compile=true"], [0])
     for folder, label in zip(sweep.all_folders, ("coil", "ppo"), strict=True):
         make_run(folder, label, 0, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
     started = []
@@ -132,7 +131,8 @@ def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs
     assert code == 2
     assert "the sweep of paper ended with exit code 3" in error
     (command,) = started
-    assert command == ["-m", "+experiment=paper", "compile=true", "seed=0", "hydra/launcher=basic"]
+    words = ["-m", sweeps.FILES, "+experiment=paper", "compile=true", "seed=0"]
+    assert command == [*words, "hydra/launcher=basic"]
 
 
 @pytest.mark.parametrize(
@@ -165,18 +165,17 @@ def test_a_mistake_is_one_sentence_and_leaves_no_file(arguments, message):
 @pytest.mark.slow
 @pytest.mark.parametrize("budget", ["smoke", "full"])
 def test_every_budget_fits_every_experiment(budget):
-    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+    with initialize_config_module("coil_paper.conf", version_base="1.3"):
         config = compose("reproduce", ["table=1"])
-        results, chosen = (
-            instantiate(config.results, _convert_="all").values(),
-            config.budgets[budget],
-        )
-        experiments = {name for result in results for name in result.experiments}
-        plans = [
-            sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
-            for name in experiments
-        ]
-    assert experiments == {path.stem for path in (ROOT / "conf" / "experiment").glob("paper*.yaml")}
+    results = instantiate(config.results, _convert_="all").values()
+    chosen = config.budgets[budget]
+    experiments = {name for result in results for name in result.experiments}
+    plans = [
+        sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
+        for name in experiments
+    ]
+    files = (ROOT / "paper" / "conf" / "experiment").glob("*.yaml")
+    assert experiments == {path.stem for path in files}
     assert set(chosen.only) <= experiments
     for plan in plans:
         assert len(set(plan.all_folders)) == len(plan.all_folders) >= chosen.seeds
