@@ -256,7 +256,8 @@ class Fuzzer:
             self.groups.setdefault(file.parent.name, []).append(file.stem)
         self.keys = {}
         for program in COMMANDS:
-            with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            conf = module(program).partition(".")[0] + ".conf"
+            with initialize_config_module(conf, version_base="1.3"):
                 keys = keys_of(compose(program, return_hydra_config=True))
             self.keys[program] = [
                 key for key in keys if not key.startswith("hydra.") or key.endswith("dir")

@@ -85,7 +85,10 @@ def command_line() -> list[str]:
     """Return the command that makes this run alone, also where it is a job of a sweep."""
     if not HydraConfig.initialized():
         return []
-    return ["coil-train", *HydraConfig.get().overrides.task]
+    given = HydraConfig.get().overrides
+    # Files of another package, such as an experiment, are found only with this one.
+    places = [word for word in given.hydra if word.startswith("hydra.searchpath=")]
+    return ["coil-train", *places, *given.task]
 
 
 def check_used(used: Iterable[str], reason: str) -> None:
