@@ -256,7 +256,9 @@ class Fuzzer:
             self.groups.setdefault(file.parent.name, []).append(file.stem)
         self.keys = {}
         for program in COMMANDS:
-            conf = module(program).partition(".")[0] + ".conf"
+            name = module(program)
+            importlib.import_module(name)  # it registers its schema with Hydra
+            conf = f"{name.partition('.')[0]}.conf"
             with initialize_config_module(conf, version_base="1.3"):
                 keys = keys_of(compose(program, return_hydra_config=True))
             self.keys[program] = [

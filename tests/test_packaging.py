@@ -151,6 +151,8 @@ main()
     assert (len(lines), outside) == (6, [])
     assert all(Path(line).is_file() for line in lines)
     assert "test_3" in out, "the shipped tracks are missing in the wheel"
+    paper = [sys.executable, "-m", "coil_paper.program", "table=1", "budget=smoke"]
+    assert "table_1 made" in run(*paper, cwd=tmp_path, pythonpath=installed)
 
 
 def test_every_dependency_is_pinned_within_its_range() -> None:

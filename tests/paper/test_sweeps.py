@@ -1,7 +1,9 @@
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
 
+import coil_paper.schema  # noqa: F401  registers the configuration of coil-reproduce
 from coil_paper import sweeps
 from coil_rl.errors import UserError
 
@@ -42,6 +44,13 @@ def test_every_run_has_a_folder_with_its_fingerprint(authors):
     assert not set(names) & {
         folder.name for folder in planned("paper_authors", ["budget.frames=128"]).all_folders
     }
+
+
+def test_sweep_is_composed_beside_the_files_of_the_running_program(authors):
+    with initialize_config_module("coil_paper.conf", version_base="1.3"):
+        before = compose("reproduce")
+        assert planned("paper_authors", ["budget.frames=64"]) == authors
+        assert compose("reproduce") == before
 
 
 def test_override_that_fits_only_some_runs_is_refused_before_the_first_run():
