@@ -12,9 +12,14 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
     from coil_rl.config.load import open_run as open_run
+    from coil_rl.config.nodes import build as build
+    from coil_rl.config.python import compose_train as compose_train
     from coil_rl.config.python import prepare as prepare
     from coil_rl.config.python import train as train
+    from coil_rl.config.schema import NodeConfig as NodeConfig
+    from coil_rl.config.schema import ProgramConfig as ProgramConfig
     from coil_rl.config.trust import trust_packages as trust_packages
+    from coil_rl.config.values import check_values as check_values
     from coil_rl.envs import ConeTrackEnv as ConeTrackEnv
     from coil_rl.envs import DrivingTasksEnv as DrivingTasksEnv
     from coil_rl.envs import EnvBatch as EnvBatch
@@ -26,7 +31,10 @@ if TYPE_CHECKING:
     from coil_rl.envs import random_tracks as random_tracks
     from coil_rl.envs import shipped_tracks as shipped_tracks
     from coil_rl.envs.gymnasium_env import GymnasiumEnv as GymnasiumEnv
+    from coil_rl.envs.limits import check_range as check_range
     from coil_rl.errors import UserError as UserError
+    from coil_rl.errors import did_you_mean as did_you_mean
+    from coil_rl.files import write_text as write_text
     from coil_rl.guides import ConstantGuide as ConstantGuide
     from coil_rl.guides import ControllerGuide as ControllerGuide
     from coil_rl.guides import EntryGuide as EntryGuide
@@ -43,11 +51,15 @@ if TYPE_CHECKING:
     from coil_rl.learners import TRPO as TRPO
     from coil_rl.learners import DynamicCoil as DynamicCoil
     from coil_rl.learners import Reinforce as Reinforce
+    from coil_rl.programs.app import run_program as run_program
     from coil_rl.report.measures import Measure as Measure
     from coil_rl.run.controller import Controller as Controller
+    from coil_rl.run.evaluation import EvaluationResult as EvaluationResult
     from coil_rl.run.evaluation import evaluate_policy as evaluate_policy
+    from coil_rl.run.folder import versions as versions
     from coil_rl.run.judge import Evaluation as Evaluation
     from coil_rl.run.judge import Trial as Trial
+    from coil_rl.run.judge import guide_titles as guide_titles
     from coil_rl.run.parts import EnvMaker as EnvMaker
     from coil_rl.run.rollout import Rollout as Rollout
     from coil_rl.run.run import Budget as Budget
@@ -67,16 +79,23 @@ _NAMES = {
     "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch McapReplayEnv SimulatedRobotEnv Track "
     "load_track load_tracks random_tracks shipped_tracks",
     "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
-    "coil_rl.errors": "UserError",
+    "coil_rl.envs.limits": "check_range",
+    "coil_rl.errors": "UserError did_you_mean",
+    "coil_rl.files": "write_text",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide SplineGuide ZeroGuide",
     "coil_rl.config.learned_guide": "LearnedGuide",
     "coil_rl.imitation": "Imitation",
     "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
     "coil_rl.testing": "check_env check_guide check_transform",
-    "coil_rl.run.evaluation": "evaluate_policy",
-    "coil_rl.run.judge": "Evaluation Trial",
+    "coil_rl.run.evaluation": "EvaluationResult evaluate_policy",
+    "coil_rl.run.judge": "Evaluation Trial guide_titles",
     "coil_rl.config.load": "open_run",
-    "coil_rl.config.python": "prepare train",
+    "coil_rl.config.nodes": "build",
+    "coil_rl.config.python": "compose_train prepare train",
+    "coil_rl.config.schema": "NodeConfig ProgramConfig",
+    "coil_rl.config.values": "check_values",
+    "coil_rl.programs.app": "run_program",
+    "coil_rl.run.folder": "versions",
     "coil_rl.report.measures": "Measure",
     "coil_rl.run.rollout": "Rollout",
     "coil_rl.run.controller": "Controller",

@@ -24,7 +24,15 @@ from coil_rl.envs.robot.lidar import SimulatedLidar as SimulatedLidar
 from coil_rl.envs.robot.perception import ConeClassifier as ConeClassifier
 from coil_rl.envs.robot.perception import Perception as Perception
 from coil_rl.envs.robot.perception import simulated_cone_classifier as simulated_cone_classifier
+from coil_rl.envs.sight import HALF_FIELD_OF_VIEW as HALF_FIELD_OF_VIEW
+from coil_rl.envs.sight import SAMPLES as SAMPLES
+from coil_rl.envs.sight import SIGHT as SIGHT
+from coil_rl.envs.sight import Frame as Frame
+from coil_rl.envs.splines import Spline as Spline
+from coil_rl.envs.splines import smoothing_spline as smoothing_spline
+from coil_rl.envs.track import SIDES as SIDES
 from coil_rl.envs.track import Track as Track
 from coil_rl.envs.track import TrackError as TrackError
+from coil_rl.envs.track import resample as resample
 from coil_rl.envs.track_generator import random_track as random_track
 from coil_rl.envs.track_generator import random_tracks as random_tracks

@@ -45,7 +45,7 @@ import mutations  # noqa: E402
 import torch  # noqa: E402
 from hydra import compose, initialize_config_module  # noqa: E402
 from omegaconf import DictConfig  # noqa: E402
-from programs import called  # noqa: E402
+from programs import called, module  # noqa: E402
 from tqdm import tqdm  # noqa: E402
 
 from coil_rl.envs import SimulatedRobotEnv, record_drives  # noqa: E402
@@ -264,7 +264,10 @@ class Fuzzer:
             self.groups.setdefault(file.parent.name, []).append(file.stem)
         self.keys = {}
         for program in COMMANDS:
-            with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            name = module(program)
+            importlib.import_module(name)  # it registers its schema with Hydra
+            conf = f"{name.partition('.')[0]}.conf"
+            with initialize_config_module(conf, version_base="1.3"):
                 keys = keys_of(compose(program, return_hydra_config=True))
             self.keys[program] = [
                 key for key in keys if not key.startswith("hydra.") or key.endswith("dir")
@@ -453,7 +456,7 @@ class Fuzzer:
             }
             os.chdir(place / "here")
             sys.argv = case.words
-            importlib.import_module(f"coil_rl.programs.{case.words[0]}").main()
+            importlib.import_module(module(case.words[0])).main()
             code = 0
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -22,9 +22,32 @@ TINY = [
     "logger=none",
 ]
 
+# The smallest run of any experiment in the cone world.
+TINY_SWEEP = [
+    "track=generated",
+    "track.train.count=2",
+    "track.test.count=2",
+    "env.laps=1",
+    "env.time_limit=1",
+    "env.rate=12",
+    "evaluation.repeats=1",
+    "logger=none",
+    "budget.num_envs=4",
+    "budget.steps=16",
+    "budget.frames=128",
+    "proxy.budget.frames=64",
+    "proxy.budget.num_envs=2",
+    "proxy.budget.steps=16",
+]
+
+
+def module(name):
+    """Return the module of a program."""
+    return "coil_paper.program" if name == "reproduce" else f"coil_rl.programs.{name}"
+
 
 def command(name, *arguments):
-    return [sys.executable, "-m", f"coil_rl.programs.{name}", *arguments]
+    return [sys.executable, "-m", module(name), *arguments]
 
 
 def environment(cwd):
@@ -58,7 +81,7 @@ def called(name, *arguments, cwd=".", code=0):
             contextlib.redirect_stderr(error),
             contextlib.redirect_stdout(out),
         ):
-            importlib.import_module(f"coil_rl.programs.{name}").main()
+            importlib.import_module(module(name)).main()
     except SystemExit as end:
         ended = end.code
     finally:

@@ -9,9 +9,10 @@ import hydra.utils
 import pytest
 from omegaconf import OmegaConf
 
-CONF = Path(__file__).parents[1] / "conf"
+ROOT = Path(__file__).parents[1]
+PROJECT = ("coil_rl.", "coil_paper.")
 # Folders in which a file changes the defaults of a class for a method or an experiment.
-VARIATION_FOLDERS = ("experiment", "method", "preset")
+VARIATION_FOLDERS = ("experiment", "method", "preset", "paper/experiment")
 # Other deliberate variations, by file. A key stands for all keys that begin with it.
 VARIATIONS = {
     "env/cone_track.yaml": ["env.reward"],  # None in the constructor: the rewards of the paper
@@ -27,12 +28,17 @@ VARIATIONS = {
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],
     "proxy/network.yaml": ["method.transforms"],
-    "reproduce/figure_22.yaml": ["labels", "worlds"],
-    "reproduce/table_4.yaml": ["worlds"],
-    "reproduce/table_5.yaml": ["worlds"],
-    "reproduce/table_6.yaml": ["experiments", "worlds", "car_length"],
+    "paper/reproduce/figure_22.yaml": ["labels", "worlds"],
+    "paper/reproduce/table_4.yaml": ["worlds"],
+    "paper/reproduce/table_5.yaml": ["worlds"],
+    "paper/reproduce/table_6.yaml": ["experiments", "worlds", "car_length"],
 }
-FILES = [path.relative_to(CONF).as_posix() for path in sorted(CONF.rglob("*.yaml"))]
+CONF = {"": ROOT / "conf", "paper/": ROOT / "paper" / "conf"}
+FILES = {
+    f"{prefix}{path.relative_to(conf).as_posix()}": path
+    for prefix, conf in CONF.items()
+    for path in sorted(conf.rglob("*.yaml"))
+}
 
 
 def nodes(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
@@ -42,7 +48,7 @@ def nodes(value: Any, path: str = "") -> Iterator[tuple[str, dict[str, Any]]]:
     """
     if isinstance(value, dict):
         target = str(value.get("_target_", ""))
-        if target.startswith("coil_rl.") and not target.startswith("coil_rl.schedules."):
+        if target.startswith(PROJECT) and not target.startswith("coil_rl.schedules."):
             yield path, value
         for key, entry in value.items():
             yield from nodes(entry, f"{path}.{key}".lstrip("."))
@@ -60,7 +66,7 @@ def defaults(target: Any) -> dict[str, Any]:
     parameters = inspect.signature(function).parameters.values()
     passes_on = inspect.isclass(target) and any(p.kind is p.VAR_KEYWORD for p in parameters)
     inherited = {}
-    if passes_on and target.__module__.startswith("coil_rl."):
+    if passes_on and target.__module__.startswith(PROJECT):
         inherited = defaults(target.__bases__[0])
     return inherited | {p.name: p.default for p in parameters if p.default is not p.empty}
 
@@ -73,7 +79,7 @@ def plain(value: Any) -> Any:
 def differences(file: str) -> dict[str, tuple[Any, Any]]:
     """Return stated value and default of each key in which a file differs from the constructors."""
     different = {}
-    for path, node in nodes(OmegaConf.to_container(OmegaConf.load(CONF / file))):
+    for path, node in nodes(OmegaConf.to_container(OmegaConf.load(FILES[file]))):
         default = defaults(hydra.utils.get_object(node["_target_"]))
         for key in node.keys() & default.keys():
             value = node[key]

@@ -18,11 +18,13 @@ from typing import Any
 import hydra.utils
 import pytest
 
+import coil_paper
 import coil_rl
 
 MODULES = [
     module.name
-    for module in pkgutil.walk_packages(coil_rl.__path__, "coil_rl.")
+    for package in (coil_rl, coil_paper)
+    for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")
     if ">>>" in (importlib.util.find_spec(module.name).loader.get_source(module.name) or "")
 ]
 CONF = Path(__file__).parents[1] / "conf"

@@ -6,9 +6,31 @@ from pathlib import Path
 
 import pytest
 
+import coil_rl
+
 ROOT = Path(__file__).resolve().parents[1]
-LINKED = {"envs": "coil_rl.envs", "transforms": "coil_rl.transforms", "conf": "coil_rl.conf"}
+LINKED = {
+    "envs": "coil_rl.envs",
+    "transforms": "coil_rl.transforms",
+    "conf": "coil_rl.conf",
+    "paper": "coil_paper",
+}
 TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
+
+# Packages whose `__init__.py` says what is public: `from coil_rl.envs import Track as Track`.
+PUBLIC = [
+    "coil_rl.envs",
+    "coil_rl.envs.recordings",
+    "coil_rl.envs.robot",
+    "coil_rl.guides",
+    "coil_rl.imitation",
+    "coil_rl.learners",
+    "coil_rl.listening",
+    "coil_rl.replay",
+    "coil_rl.report",
+    "coil_rl.robot",
+    "coil_rl.transforms",
+]
 
 # Folder -> allowed imports besides the standard library and the folder itself.
 ALLOWED = {
@@ -20,7 +42,7 @@ ALLOWED = {
 
 def source_files(folder: str) -> list[Path]:
     # The links coil_rl/envs, ... are searched under their own name.
-    linked = [ROOT / "coil_rl" / name for name in LINKED]
+    linked = [ROOT / name.replace(".", "/") for name in LINKED.values()]
     found = (ROOT / folder).rglob("*.py")
     return sorted(path for path in found if not any(path.is_relative_to(link) for link in linked))
 
@@ -71,6 +93,35 @@ def test_folder_imports_only_what_the_design_allows(folder: str) -> None:
     )
 
 
+def public_names():
+    """Return the full names of everything public in coil_rl."""
+    names = {*PUBLIC, *(f"coil_rl.{name}" for name in coil_rl.__all__)}
+    for package in PUBLIC:
+        init = ast.parse((ROOT / package.replace(".", "/") / "__init__.py").read_text("utf-8"))
+        imports = [node for node in init.body if isinstance(node, ast.ImportFrom)]
+        aliases = [alias for node in imports for alias in node.names]
+        names |= {f"{package}.{alias.asname}" for alias in aliases if alias.asname == alias.name}
+    return names
+
+
+def test_paper_imports_only_what_is_public() -> None:
+    public = public_names()
+    wrong = [
+        f"{path.relative_to(ROOT)}: {module}"
+        for path in source_files("paper")
+        for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path))
+        if is_inside(module, "coil_rl") and module not in public
+    ]
+    assert not wrong, "paper/ is written as a stranger's package; use, or make, public names"
+
+
+def test_library_does_not_name_the_paper_package() -> None:
+    folders = ["coil_rl", "envs", "transforms", "conf"]
+    files = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
+    texts = [path for path in files if path.suffix in (".py", ".yaml")]
+    assert [str(path) for path in texts if "coil_paper" in path.read_text("utf-8")] == []
+
+
 def test_only_modules_of_that_name_import_gymnasium() -> None:
     found = {
         path.stem: list(imported_modules(path.read_text(), package_of(path)))
@@ -96,7 +147,7 @@ def test_folders_are_not_imported_by_their_bare_names(folder: str) -> None:
         for module in imported_modules(path.read_text(encoding="utf-8"), package_of(path)):
             if module.split(".")[0] in LINKED:
                 wrong.append(f"{path.relative_to(ROOT)}: {module}")
-    assert not wrong, "write coil_rl.envs, coil_rl.transforms, coil_rl.conf"
+    assert not wrong, f"write {', '.join(LINKED.values())}"
 
 
 def test_package_list_matches_the_folders() -> None:

@@ -13,7 +13,12 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LINKS = ["envs", "transforms", "conf"]
+LINKS = {
+    "coil_rl/envs": "../envs",
+    "coil_rl/transforms": "../transforms",
+    "coil_rl/conf": "../conf",
+    "coil_paper": "paper",
+}
 
 
 def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
@@ -38,11 +43,12 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ".*", "build", "dist", "outputs", "*.egg-info", "__pycache__", "site", "node_modules"
     )
     shutil.copytree(ROOT, tree, symlinks=True, ignore=ignore)
-    for name in LINKS:
-        link = tree / "coil_rl" / name
+    for name, target in LINKS.items():
+        link = tree / name
         link.unlink(missing_ok=True)
-        link.write_text(f"../{name}")
-    for planted in ["conf/planted.yaml", "conf/a/b/planted.yaml", "envs/tracks/a/planted.csv"]:
+        link.write_text(target)
+    planted_files = ["conf/planted.yaml", "conf/a/b/planted.yaml", "envs/tracks/a/planted.csv"]
+    for planted in [*planted_files, "paper/conf/a/planted.yaml"]:
         (tree / planted).parent.mkdir(parents=True, exist_ok=True)
         (tree / planted).write_text("")
     return tree
@@ -78,24 +84,27 @@ def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Pa
         "coil_rl": ["*.py", "*.json", "py.typed"],
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
-    patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"]}
+    patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}
+    installed_as = {"coil_rl": "coil_rl", "paper": "coil_paper"}
     expected = set()
     for folder, globs in patterns.items():
-        package = "" if folder == "coil_rl" else "coil_rl/"
+        package = installed_as.get(folder, f"coil_rl/{folder}")
         for path in chain.from_iterable((tree / folder).rglob(glob) for glob in globs):
-            expected.add(f"{package}{path.relative_to(tree).as_posix()}")
+            expected.add(f"{package}/{path.relative_to(tree / folder).as_posix()}")
     names = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
     assert names == expected
     assert {
         "coil_rl/py.typed",
         "coil_rl/conf/a/b/planted.yaml",
         "coil_rl/envs/tracks/a/planted.csv",
+        "coil_paper/conf/a/planted.yaml",
+        "coil_paper/conf/experiment/paper.yaml",
     } <= names
 
 
-def test_wheel_has_one_import_name(wheel: Path) -> None:
+def test_wheel_has_two_import_names(wheel: Path) -> None:
     top = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
-    assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl"}
+    assert {name for name in top if not name.endswith(".dist-info")} == {"coil_rl", "coil_paper"}
 
 
 @pytest.mark.slow
@@ -104,11 +113,9 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
     [sdist] = tree.parent.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "tests", "transforms"]
+    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "paper", "tests", "transforms"]
     paths = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
-    needed = {path.relative_to(tree).as_posix() for path in paths} - {
-        f"coil_rl/{name}" for name in LINKS
-    }
+    needed = {path.relative_to(tree).as_posix() for path in paths} - {*LINKS}
     files = {
         "CONTRIBUTING.md",
         "LICENSE",
@@ -117,7 +124,7 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
         "constraints.txt",
         "pyproject.toml",
     }
-    assert (needed | files | {"results/RESULTS.md"}) - names == set()
+    assert (needed | files) - names == set()
 
 
 @pytest.mark.slow
@@ -128,8 +135,8 @@ def test_installed_wheel_runs_from_another_folder(installed: Path, tmp_path: Pat
         assert (installed / module.replace(".", "/")).with_suffix(".py").is_file()
     program = """
 import importlib.resources
-import coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms
-for module in (coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms):
+import coil_paper, coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms
+for module in (coil_paper, coil_rl, coil_rl.conf, coil_rl.envs, coil_rl.transforms):
     print(module.__file__)
 print(importlib.resources.files("coil_rl.conf").joinpath("a", "b", "planted.yaml"))
 from coil_rl.programs.train import main
@@ -137,13 +144,15 @@ main()
 """
     tiny = ["method=guide", "guide=zero", "env.laps=1", "evaluation.gif=false", "hydra.run.dir=run"]
     out = run(sys.executable, "-c", program, *tiny, cwd=tmp_path, pythonpath=installed)
-    lines = out.splitlines()[:5]
+    lines = out.splitlines()[:6]
     outside = [
         line for line in lines if not Path(line).resolve().is_relative_to(installed.resolve())
     ]
-    assert (len(lines), outside) == (5, [])
+    assert (len(lines), outside) == (6, [])
     assert all(Path(line).is_file() for line in lines)
     assert "test_3" in out, "the shipped tracks are missing in the wheel"
+    paper = [sys.executable, "-m", "coil_paper.program", "table=1", "budget=smoke"]
+    assert "table_1 made" in run(*paper, cwd=tmp_path, pythonpath=installed)
 
 
 def test_every_dependency_is_pinned_within_its_range() -> None:

@@ -1,7 +1,8 @@
 """Runs from Python: the words of the command line as arguments, with objects where a name is not enough."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import gymnasium
 from hydra import compose, initialize_config_module
+from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
@@ -90,7 +92,7 @@ def prepare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     words += [f"seed={seed}", *overrides]
-    config = _composed([*words, f"run_dir={_quoted(str(folder))}"])
+    config = compose_train([*words, f"run_dir={_quoted(str(folder))}"])
     with open_dict(config):
         for place, node in (env_nodes | guide_nodes).items():
             OmegaConf.update(config, place, node, merge=False, force_add=True)
@@ -106,12 +108,35 @@ def _new_folder() -> Path:
     return Path("outputs", "train", f"{now}_{os.getpid()}")
 
 
-def _composed(words: Sequence[str]) -> DictConfig:
+def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConfig:
+    """Return the configuration that `coil-train` composes from the words of its command line.
+
+    Args:
+        words: such as "method=coil" and "+experiment=placebo". YAML files of another package are
+            found with "hydra.searchpath=[pkg://PACKAGE.conf]".
+        with_hydra: whether the configuration has Hydra's own part, such as the folders of a sweep.
+
+    Raises:
+        UserError: for words that do not fit the configuration, with one sentence.
+    """
     try:
-        with initialize_config_module("coil_rl.conf", version_base="1.3"):
-            return compose("train", list(words))
+        with _own_hydra():
+            return compose("train", list(words), return_hydra_config=with_hydra)
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(sentence(error)) from error
+
+
+@contextmanager
+def _own_hydra() -> Iterator[None]:
+    """Compose files of this package in the block, also inside a program of Hydra with its own files."""
+    program = GlobalHydra.instance()
+    outer = program.hydra
+    program.clear()
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer
 
 
 def _shipped(group: str) -> set[str]:

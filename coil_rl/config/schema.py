@@ -240,40 +240,6 @@ class ReportConfig(ProgramConfig):
     against: str | None = None
 
 
-@dataclass
-class RunsBudgetConfig(NodeConfig):
-    """Training runs of `coil-reproduce`: number of seeds, and overrides of all runs and of single experiments."""
-
-    seeds: Annotated[int, Field(ge=1)] = MISSING
-    seeds_of: dict[str, Annotated[int, Field(ge=1)]] = field(
-        default_factory=dict
-    )  # by experiment, where it is another
-    note: str | None = None
-    every: list[str] = field(default_factory=list)
-    only: dict[str, list[str]] = field(default_factory=dict)
-
-
-@dataclass
-class ReproduceConfig(ProgramConfig):
-    """Configuration of `coil-reproduce`."""
-
-    table: Any = None
-    figure: Any = None
-    claim: Any = None
-    all: bool = False
-    budget: str = MISSING
-    budgets: dict[str, RunsBudgetConfig] = MISSING
-    aliases: dict[str, str] = field(default_factory=dict)
-    other_figures: dict[str, list[int]] = field(default_factory=dict)
-    threads: Threads = 1
-    train: list[str] = field(default_factory=list)
-    known_problems: list[str] = field(default_factory=list)
-    not_reproduced: list[str] = field(default_factory=list)
-    results: dict[str, Any] = MISSING
-    trust: list[str] = field(default_factory=list)
-    run_dir: str = MISSING
-
-
 def fingerprint(config: DictConfig) -> str:
     """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
     identity: dict[str, Any] = {
@@ -313,4 +279,3 @@ _store(name="evaluate_schema", node=EvaluateConfig)
 _store(name="report_schema", node=ReportConfig)
 _store(name="listen_schema", node=ListenConfig)
 _store(name="replay_schema", node=ReplayConfig)
-_store(name="reproduce_schema", node=ReproduceConfig)

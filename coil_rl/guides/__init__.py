@@ -9,5 +9,6 @@ from coil_rl.guides.simple import ConstantGuide as ConstantGuide
 from coil_rl.guides.simple import FollowAdvice as FollowAdvice
 from coil_rl.guides.simple import RandomGuide as RandomGuide
 from coil_rl.guides.simple import ZeroGuide as ZeroGuide
+from coil_rl.guides.spline import PathPlan as PathPlan
 from coil_rl.guides.spline import SplineGuide as SplineGuide
 from coil_rl.guides.spline_memory import SplineMemoryGuide as SplineMemoryGuide

@@ -117,7 +117,7 @@ class SplineGuide(TensorDictModuleBase):
             steering: [B, 1], current steering, returned if there is no target.
         """
         plan = self.plan(cones, cone_count)
-        advice = self._pursuit(plan.nearest_target())
+        advice = self.pursuit(plan.nearest_target())
         return torch.where(plan.excluded.amin(0).bool(), steering.squeeze(-1), advice).unsqueeze(-1)
 
     def plan(self, cones: Tensor, cone_count: Tensor) -> PathPlan:
@@ -141,7 +141,7 @@ class SplineGuide(TensorDictModuleBase):
         margin = torch.minimum(margin, count - constant(2, count))
         return PathPlan(points, count, path, targets, square, margin.lt_(constant(0, margin)))
 
-    def _pursuit(self, target: Tensor) -> Tensor:
+    def pursuit(self, target: Tensor) -> Tensor:
         """Return equation 103 for targets [2, B] m ahead: [B], fraction of `max_steering`."""
         x, y = target.unbind(0)
         square = torch.addcmul(x * x, y, y).clamp_(min=TARGET_REACHED**2)

@@ -126,7 +126,7 @@ class SplineMemoryGuide(SplineGuide):
         square = torch.addcmul(local[0] * local[0], local[1], local[1])
         advised = (square > TARGET_REACHED**2) & (square < self.sight**2)
         without = torch.zeros_like(steering) if self.oddities else steering
-        action = torch.where(advised, self._pursuit(local), without.squeeze(-1)).unsqueeze(-1)
+        action = torch.where(advised, self.pursuit(local), without.squeeze(-1)).unsqueeze(-1)
         for key, value in memory.items():
             tensordict.set(("next", key), value)
         return tensordict.set(self.out_keys[0], action.to(dtype))

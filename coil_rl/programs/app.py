@@ -85,7 +85,10 @@ def command_line() -> list[str]:
     """Return the command that makes this run alone, also where it is a job of a sweep."""
     if not HydraConfig.initialized():
         return []
-    return ["coil-train", *HydraConfig.get().overrides.task]
+    given = HydraConfig.get().overrides
+    # Files of another package, such as an experiment, are found only with this one.
+    places = [word for word in given.hydra if word.startswith("hydra.searchpath=")]
+    return ["coil-train", *places, *given.task]
 
 
 def check_used(used: Iterable[str], reason: str) -> None:
@@ -115,12 +118,24 @@ def check_run(config: DictConfig) -> None:
     check(config)
 
 
-def run(
+def run_program(
     task: Callable[[DictConfig], Any],
     config_name: str,
     check: Callable[[DictConfig], None] = check_run,
+    config_path: str = "pkg://coil_rl.conf",
 ) -> None:
-    """Run a task as a program after a check of its configuration; `config_name` is also the name of the program."""
+    """Run a task as a console program: Hydra composes its configuration, which is checked first.
+
+    A mistake of the user ends the process with one sentence and exit code 2.
+
+    Args:
+        task: what the program does with its configuration.
+        config_name: of the YAML file; also the name of the program.
+        check: raises a `UserError` for a mistake in the configuration, before anything is done.
+        config_path: where the YAML file is. One of another package, such as "pkg://my_package.conf",
+            finds the files of coil-rl by its own `hydra: {searchpath: [pkg://coil_rl.conf]}`, and
+            gets the help and the clean-up of these programs by the schema `ProgramConfig`.
+    """
     os.environ["HYDRA_FULL_ERROR"] = "1"
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     _new_folders.clear()
@@ -146,9 +161,9 @@ def run(
     with program(config_name):
         _check_options(config_name)
         try:
-            hydra.main(
-                version_base="1.3", config_path="pkg://coil_rl.conf", config_name=config_name
-            )(checked)()
+            hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)(
+                checked
+            )()
         except (
             HydraException,
             ValueError,

@@ -59,7 +59,7 @@ def check(config: DictConfig) -> None:
     make_folder(Path(config.proxy.folder))
 
 
-main = partial(app.run, distill, "distill", check)
+main = partial(app.run_program, distill, "distill", check)
 
 if __name__ == "__main__":
     main()

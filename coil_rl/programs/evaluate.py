@@ -108,7 +108,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-main = partial(app.run, evaluate, "evaluate", check)
+main = partial(app.run_program, evaluate, "evaluate", check)
 
 if __name__ == "__main__":
     main()

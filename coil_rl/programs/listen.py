@@ -160,7 +160,7 @@ def check(config: DictConfig) -> None:
     app.check_run(config)
 
 
-main = partial(app.run, listen, "listen", check)
+main = partial(app.run_program, listen, "listen", check)
 
 if __name__ == "__main__":
     main()

@@ -202,7 +202,7 @@ def check(config: DictConfig) -> None:
     make_folder(Path(config.run_dir))
 
 
-main = partial(app.run, replay, "replay", check)
+main = partial(app.run_program, replay, "replay", check)
 
 if __name__ == "__main__":
     main()

@@ -151,7 +151,7 @@ def check(config: DictConfig) -> None:
         )
 
 
-main = partial(app.run, report, "report", check)
+main = partial(app.run_program, report, "report", check)
 
 if __name__ == "__main__":
     main()

@@ -94,7 +94,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     resumed = next((argument for argument in arguments if argument.startswith("resume=")), None)
     if resumed is None:
-        app.run(train, "train")
+        app.run_program(train, "train")
         return
     with app.program("train"):
         resume_from_command_line(resumed, [each for each in arguments if each != resumed])

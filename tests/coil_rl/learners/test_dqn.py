@@ -7,10 +7,10 @@ from torch.nn import functional as F
 from torchrl.envs import GymEnv, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from coil_paper.tabular import garnet, toymaker, value_iteration
 from coil_rl.learners import DQN
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
-from coil_rl.tabular import garnet, toymaker, value_iteration
 from coil_rl.transforms import GuideActions
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
+from programs import TINY_SWEEP
 
 from coil_rl.config.check import check
 from coil_rl.programs.train import train
@@ -12,22 +13,6 @@ from coil_rl.programs.train import train
 CONF = Path(__file__).parents[3] / "conf"
 EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
 NEEDS_RUNS = ["driving_tasks"]
-TINY = [
-    "track=generated",
-    "track.train.count=2",
-    "track.test.count=2",
-    "env.laps=1",
-    "env.time_limit=1",
-    "env.rate=12",
-    "evaluation.repeats=1",
-    "logger=none",
-    "budget.num_envs=4",
-    "budget.steps=16",
-    "budget.frames=128",
-    "proxy.budget.frames=64",
-    "proxy.budget.num_envs=2",
-    "proxy.budget.steps=16",
-]
 
 
 def first(experiment, run_dir):
@@ -46,7 +31,9 @@ def first(experiment, run_dir):
         if not key.startswith("budget.")
     ]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        return compose("train", [f"+experiment={experiment}", *chosen, *TINY, f"run_dir={run_dir}"])
+        return compose(
+            "train", [f"+experiment={experiment}", *chosen, *TINY_SWEEP, f"run_dir={run_dir}"]
+        )
 
 
 @pytest.mark.parametrize("experiment", sorted({*EXPERIMENTS} - {*NEEDS_RUNS}))

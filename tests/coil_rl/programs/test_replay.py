@@ -20,12 +20,12 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from run_folders import make_untrained_run
 
+from coil_paper.reproduce.robot import Table6
 from coil_rl.envs import SimulatedRobotEnv, read_recording, record_drives
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import SCAN, TWIST_STAMPED, header, twist
 from coil_rl.guides import SplineGuide
 from coil_rl.programs.replay import _first_repeated, _run_names, _topic_name
-from coil_rl.reproduce.robot import Table6
 
 SCANS = 15
 TRACK = ["track=generated", "track.train.count=1", "learner.action_gain=1.0"]

@@ -6,7 +6,7 @@ import sys
 import tomllib
 
 import pytest
-from programs import ROOT, environment
+from programs import ROOT, environment, module
 
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS = sorted(script.removeprefix("coil-") for script in SCRIPTS if script != "coil-info")
@@ -15,11 +15,11 @@ HEAVY = {"torch", "torchrl", "tensordict", "sklearn", "matplotlib", "scipy", "pa
 SCRIPT = """
 import contextlib, importlib, io, json, sys
 results = []
-for name, *arguments in json.loads(sys.argv[1]):
+for name, program, *arguments in json.loads(sys.argv[1]):
     sys.argv, code, out, error = [name, *arguments], 0, io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         try:
-            importlib.import_module("coil_rl.programs." + name).main()
+            importlib.import_module(program).main()
         except SystemExit as end:
             code = end.code
     results.append((code, out.getvalue(), error.getvalue(), list(sys.modules)))
@@ -29,7 +29,8 @@ print(json.dumps(results))
 
 def start(cwd, *commands):
     """Return exit code, standard output and error, and imported heavy modules of each command."""
-    command = [sys.executable, "-c", SCRIPT, json.dumps(commands)]
+    named = [[name, module(name), *arguments] for name, *arguments in commands]
+    command = [sys.executable, "-c", SCRIPT, json.dumps(named)]
     done = subprocess.run(
         command, cwd=cwd, env=environment(cwd), capture_output=True, text=True, check=True
     )

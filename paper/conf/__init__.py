@@ -1,0 +1,1 @@
+"""Hydra configuration of `coil-reproduce`: results, experiments, budgets, words of the pages."""

@@ -1,0 +1,335 @@
+"""Table 4 and figure 22 of the paper: the return of the policies of a training run."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coil_paper.reproduce import pages
+from coil_paper.reproduce.result import NO_RUNS, PAGES, Runs, WorldsResult, runs_by_label
+from coil_rl.report import (
+    GUIDE,
+    RETURN,
+    Estimate,
+    Interval,
+    Run,
+    draw_intervals,
+    draw_learning_curves,
+    estimate,
+    frames_until,
+    learning,
+    markdown_table,
+    mean_curve,
+    points,
+    wins,
+    write_csv,
+)
+
+Row = Mapping[str, Any]
+
+PAPER_RETURNS = PAGES["table_4"]["paper"]
+KEYS = ("best", "final", "guide")
+FRACTIONS = {0.1: "a tenth", 0.25: "a quarter", 0.5: "half", 1.0: "all"}  # of the frames
+POINT = ("frames", "mean", "low", "high")  # of a curve
+
+
+class Table4(WorldsResult):
+    """Return of the best and of the last policy of each method.
+
+    Args:
+        experiments: names of the experiments in the main world, files of `paper/conf/experiment`.
+        worlds: the experiments in each variant of the main world by its name; none by default.
+        against: label of the runs with which the others are compared, seed by seed.
+    """
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        rows = {world: _returns(names, runs) for world, names in self.worlds.items()}
+        every_row = []
+        for world, of_world in rows.items():
+            every_row += [{"world": world, **row} for row in of_world]
+        write_csv(every_row, stem.with_suffix(".csv"))
+        tables = {world: self._table(of_world) for world, of_world in rows.items()}
+        _draw_returns(rows[""], tables[""], self.against, stem.with_suffix(".png"))
+        columns = {
+            "label": ("method", ""),
+            "runs": ("runs", "d"),
+            "best cell": ("best: mean (95 %)", ""),
+            "final cell": ("final: mean (95 %)", ""),
+            "guide": ("its guide", ".1f"),
+            "difference cell": (f"best - {self.against}'s (95 %)", ""),
+            "better": (f"better than {self.against}", ".0%"),
+        }
+        parts = ["## Table 4: the return of the trained policies", _paper_table(tables[""])]
+        for world, table in tables.items():
+            parts += [*pages.world_heading(world), markdown_table(table, columns)]
+        parts.append(PAGES["table_4"]["notes"].format(against=self.against))
+        claims = self._claims(tables)
+        if claims:
+            parts.append(pages.claims_section(claims, {"paper": "paper", "ours": "ours (95 %)"}))
+        return "\n\n".join(parts)
+
+    def _table(self, rows: Sequence[Row]) -> list[dict[str, Any]]:
+        """Return one row per label, the best first."""
+        by_label: dict[str, dict[int, Row]] = {}
+        for row in rows:
+            by_label.setdefault(row["label"], {})[row["seed"]] = row
+        reference = by_label.get(self.against, {})
+        table = []
+        for label, by_seed in by_label.items():
+            best, final, guide = (np.array([row[key] for row in by_seed.values()]) for key in KEYS)
+            common = [seed for seed in by_seed if seed in reference and label != self.against]
+            ours = np.array([by_seed[seed]["best"] for seed in common])
+            theirs = np.array([reference[seed]["best"] for seed in common])
+            line: dict[str, Any] = {"label": label, "runs": len(by_seed), "guide": guide.mean()}
+            line["better"] = float(wins(ours[:, None], theirs[:, None]).mean()) if common else None
+            for key, values in {"best": best, "final": final, "difference": ours - theirs}.items():
+                line[key] = estimate(values)
+                line[f"{key} cell"] = line[key].cell("+.1f" if key == "difference" else ".1f")
+            table.append(line)
+        return sorted(table, key=_rank)
+
+    def _claims(self, tables: Mapping[str, Sequence[Row]]) -> list[Row]:
+        """Return the verdicts on the claim of the paper, which is about PPO, in all worlds."""
+        claims: list[Row] = []
+        if self.against != "ppo":
+            return claims
+        paper = f"{PAPER_RETURNS['coil'] - PAPER_RETURNS['ppo']:+.1f}"
+        for world, table in tables.items():
+            for line in table:
+                if line["label"] == "coil":
+                    claims.append(
+                        {
+                            "world": world,
+                            "claim": "COIL's best return is above PPO's",
+                            "paper": paper,
+                            "ours": pages.Claim(line["difference"], "+.1f"),
+                        }
+                    )
+        return claims
+
+
+def _returns(experiments: Sequence[str], runs: Runs) -> list[Row]:
+    """Return the numbers of the evaluation curve of each run of some experiments."""
+    rows: list[Row] = []
+    for run in chain.from_iterable(runs[experiment] for experiment in experiments):
+        if run.curve:
+            rows.append({"label": run.label, "seed": run.seed} | learning(run))
+    return rows
+
+
+def _rank(line: Row) -> float:
+    """Return the sort key of a label: the best mean first, a label without a number last."""
+    mean = line["best"].mean
+    return -mean if math.isfinite(mean) else math.inf
+
+
+class Figure22(WorldsResult):
+    """Learning curves of the runs with some labels.
+
+    The return of the guide of the first label is drawn as a line. A label is drawn in every world
+    that has runs of it. Variants of the main world have pictures of their own, `stem_2.png` and so
+    on.
+
+    Args:
+        experiments: names of the experiments in the main world, files of `paper/conf/experiment`.
+        labels: of the runs to draw, at least one.
+        worlds: the experiments in each variant of the main world by its name; none by default.
+    """
+
+    def __init__(
+        self,
+        experiments: Sequence[str],
+        labels: Sequence[str] = ("coil", "ppo"),
+        worlds: Mapping[str, Sequence[str]] | None = None,
+    ) -> None:
+        super().__init__(experiments, worlds)
+        if not labels:
+            raise ValueError("labels=[] draws nothing; give at least one")
+        self.labels = list(labels)
+
+    def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
+        """Make the result, see `Result`."""
+        learned = {name: [run for run in runs[name] if run.curve] for name in self.experiments}
+        runs_by_label(self.labels, learned)  # each has runs in some world
+        parts, rows, claims = ["## Figure 22: learning curves"], list[Row](), list[Row]()
+        for number, (world, experiments) in enumerate(self.worlds.items(), start=1):
+            of_world = list(chain.from_iterable(learned[experiment] for experiment in experiments))
+            curves = _Curves(world, self._by_label(of_world))
+            name = f"{stem.name}_{number}.png" if world else f"{stem.name}.png"
+            curves.draw(stem.with_name(name))
+            parts += curves.page(name)
+            rows += curves.rows()
+            claims += curves.claims()
+        write_csv(rows, stem.with_suffix(".csv"))
+        parts.append(PAGES["figure_22"]["notes"])
+        if claims:
+            parts.append(pages.claims_section(claims, {"ours": "ours (95 %)"}))
+        return "\n\n".join(parts)
+
+    def _by_label(self, runs: Sequence[Run]) -> dict[str, list[Run]]:
+        """Return the runs of each label that has some."""
+        by_label = {}
+        for label in self.labels:
+            of_label = [run for run in runs if run.label == label]
+            if of_label:
+                by_label[label] = of_label
+        return by_label
+
+
+class _Curves:
+    """The learning curves in one world.
+
+    Args:
+        world: its name, "" for the main world.
+        runs: by label, at least one run of each.
+    """
+
+    def __init__(self, world: str, runs: Mapping[str, Sequence[Run]]) -> None:
+        self.world, self.runs = world, runs
+        self.means = {
+            label: mean_curve([run.curve for run in of_label], RETURN)
+            for label, of_label in runs.items()
+        }
+        self.guide = _guide_return(next(iter(runs.values())))
+        self.reached = {label: _frames_to(self.guide, of_label) for label, of_label in runs.items()}
+        self.title = "Figure 22: the return of the trained policies"
+        if world:
+            self.title += f", {world}"
+
+    def draw(self, path: Path) -> None:
+        """Draw the curves."""
+        curves = {label: [run.curve for run in of_label] for label, of_label in self.runs.items()}
+        guides = {} if math.isnan(self.guide) else {GUIDE: self.guide}
+        draw_learning_curves(curves, path, guides=guides, title=self.title)
+
+    def rows(self) -> list[Row]:
+        """Return the points of the mean curves."""
+        rows: list[Row] = []
+        for label, curve in self.means.items():
+            for point in zip(*curve, strict=True):
+                values = dict(zip(POINT, point, strict=True))
+                rows.append({"world": self.world, "label": label, **values})
+        return rows
+
+    def page(self, picture: str) -> list[str]:
+        """Return the parts of the page, given the file name of the picture.
+
+        The picture of the main world is not among them, because the frame of all pages has it.
+        """
+        parts = pages.world_heading(self.world)
+        if self.world:
+            parts.append(f"![{self.title}]({picture})")
+        parts.append(self._table())
+        if not math.isnan(self.guide):
+            parts.append(f"The guide alone earns {self.guide:.1f} in these cases.")
+        return parts
+
+    def _table(self) -> str:
+        """Return the table: returns after parts of the training, and frames up to the guide."""
+        table = []
+        for label, (frames, mean, low, high) in self.means.items():
+            count = len(self.runs[label])
+            line: dict[str, Any] = {"label": label, "runs": count}
+            for fraction in FRACTIONS:
+                if len(frames):
+                    at = int(np.abs(frames - fraction * frames[-1]).argmin())
+                    ends = (low[at], high[at]) if count > 1 else (np.nan, np.nan)
+                    line[str(fraction)] = Estimate(mean[at], *ends).cell(".1f")
+            line["reached"] = estimate(list(self.reached[label].values())).cell(",.0f")
+            table.append(line)
+        columns = {"label": ("method", ""), "runs": ("runs", "d")}
+        for fraction, text in FRACTIONS.items():
+            columns[str(fraction)] = (f"return after {text} of the frames (95 %)", "")
+        columns["reached"] = ("frames up to the guide (95 %)", "")
+        return markdown_table(table, columns)
+
+    def claims(self) -> list[Row]:
+        """Return the verdicts on the curves, as rows of `claims_section`."""
+        claims: list[Row] = []
+        for claim, policy, other in PAGES["figure_22"]["claims"]:
+            if policy not in self.runs or other not in self.runs:
+                continue
+            ours = self._above(policy, other) if claim == "above" else self._sooner(policy, other)
+            text = PAGES["figure_22"]["texts"][claim].format(driver=policy, other=other)
+            claims.append({"world": self.world, "claim": text, "ours": ours})
+        return claims
+
+    def _above(self, policy: str, other: str) -> str:
+        """Return the verdict on the claim that one mean curve is above another one everywhere."""
+        frames, mean, *_ = self.means[policy]
+        _, others, *_ = self.means[other]
+        above = (mean > others)[frames > 0]  # both begin untrained
+        details = f"at {above.sum()} of {len(above)} points"
+        return pages.certain_verdict(bool(above.all()), details)
+
+    def _sooner(self, policy: str, other: str) -> pages.Claim:
+        """Return the claim that a policy reaches its guide within fewer frames than another one."""
+        ours, theirs = self.reached[policy], self.reached[other]
+        seeds = sorted(ours.keys() & theirs.keys())
+        more = [ours[seed] - theirs[seed] for seed in seeds]
+        return pages.Claim(estimate(more), "+,.0f", -1)
+
+
+def _guide_return(runs: Sequence[Run]) -> float:
+    """Return the mean over runs of the return of their best guide; NaN without guides."""
+    returns = [max(run.guide_returns.values()) for run in runs if run.guide_returns]
+    return float(np.mean(returns)) if returns else math.nan
+
+
+def _frames_to(level: float, runs: Sequence[Run]) -> dict[int, float]:
+    """Return by seed after how many frames a curve first reaches a level.
+
+    If it never does, these are all frames of the run.
+    """
+    reached = {}
+    for run in runs:
+        at, values = points(run.curve, RETURN).T
+        frames = frames_until(at, values, level)
+        reached[run.seed] = float(run.curve[-1]["frames"]) if math.isnan(frames) else frames
+    return reached
+
+
+def _paper_table(table: Sequence[Row]) -> str:
+    """Return the table of COIL and PPO next to the paper."""
+    by_label = {line["label"]: line for line in table}
+    rows: list[dict[str, Any]] = [{"source": "paper, best", **PAPER_RETURNS}]
+    for key in ("best", "final"):
+        row: dict[str, Any] = {"source": f"ours, {key}"}
+        for label in PAPER_RETURNS:
+            row[label] = by_label[label][key].mean if label in by_label else None
+        rows.append(row)
+    for row in rows:
+        coil, ppo = row["coil"], row["ppo"]
+        row["ratio"] = None
+        if coil is not None and ppo is not None and ppo > 0:
+            row["ratio"] = coil / ppo - 1
+    columns = {
+        "source": ("mean over runs", ""),
+        "coil": ("COIL", ".1f"),
+        "ppo": ("RL (PPO)", ".1f"),
+        "ratio": ("COIL over RL", "+.1%"),
+    }
+    return markdown_table(rows, columns)
+
+
+def _draw_returns(rows: Sequence[Row], table: Sequence[Row], against: str, path: Path) -> None:
+    """Draw the returns of the best and of the last policies, one row per label."""
+    # One guide for all: guides with placebo advice would only stretch the axis.
+    guide = None
+    for line in table:
+        if line["label"] == against and math.isfinite(line["guide"]):
+            guide = line["guide"]
+    panels: dict[str, list[Interval]] = {"best": [], "final": []}
+    for key, panel in panels.items():
+        for line in table:
+            label, value = line["label"], line[key]
+            single = [row[key] for row in rows if row["label"] == label] if line["runs"] > 1 else []
+            panel.append(
+                Interval(label, value.mean, value.low, value.high, guide=guide, points=single)
+            )
+    title = "Table 4: the return of the trained policies"
+    draw_intervals(panels, path, measure="return (mean of the runs)", title=title)

@@ -1,0 +1,151 @@
+import re
+
+import numpy as np
+import pytest
+from reproduced_runs import read_csv
+
+from coil_paper.reproduce.classifier import Figure25, draw_cone_features, principal_components
+from coil_rl.envs import RecordingError, SimulatedLidar, read_recording, save_drive, simulated_drive
+from coil_rl.envs.recordings.mcap_files import RecordingWriter, read_messages
+from coil_rl.envs.recordings.messages import ODOMETRY, SCAN
+from coil_rl.envs.robot.drives import labelled_drive, record_labelling_drives
+from coil_rl.errors import UserError
+from coil_rl.robot.classifier import accuracy, clusters_in_range, label_clusters, load_classifier
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    return record_labelling_drives(tmp_path_factory.mktemp("drives"), pairs=2, both=1)
+
+
+def test_the_page_has_the_accuracy_of_the_saved_classifier(drives, tmp_path):
+    page = Figure25(**drives).make(tmp_path / "figure_25")
+    tested = labelled_drive(read_recording(drives["both"][0]))
+    shares = accuracy(load_classifier(tmp_path / "cones.json"), label_clusters([tested]))
+    for name, share in shares.items():
+        assert re.search(
+            rf"\| accuracy +\| {re.escape(name)} +\| +{share.share:.4f} \|.*\| +{share.total} \|",
+            page,
+        )
+    assert re.search(
+        r"\| paper, its own robot +\| all +\| 0\.9877 \| +0\.964\d \| 0\.995\d \| +3 \| +243 \|",
+        page,
+    )
+    assert "| recall of thin cones " in page
+    assert "| recall" not in Figure25(drives["left"], drives["right"]).make(tmp_path / "untested")
+    assert (tmp_path / "figure_25.png").exists()
+    rows = read_csv(tmp_path / "figure_25.csv")
+    (measured,) = (row for row in rows if (row["measure"], row["of"]) == ("accuracy", "all"))
+    assert float(measured["share"]) == shares["all"].share > 0.97
+
+
+def test_unusable_drives_are_rejected(drives, tmp_path):
+    with pytest.raises(ValueError, match="must both be given"):
+        Figure25(left=drives["left"])
+    with pytest.raises(ValueError, match="pairs=1 must be at least 2"):
+        Figure25(pairs=1)
+    with pytest.raises(RecordingError, match="lacks the positions of its cones"):
+        Figure25(drives["left"], drives["right"], both=drives["left"])
+    with pytest.raises(UserError, match="are too few to learn from"):
+        Figure25(drives["left"][:1], drives["right"]).make(tmp_path / "figure_25")
+
+
+def test_a_recorded_drive_has_the_ground_truth_of_the_simulated_one(tmp_path):
+    drive = simulated_drive("both", seed=7)
+    save_drive(drive, tmp_path / "both.mcap")
+    again = labelled_drive(read_recording(tmp_path / "both.mcap"))
+    length = len(drive.seconds) - 1
+    assert np.array_equal(again.ranges, drive.ranges[:length])
+    assert (again.hit == drive.hit[:length]).float().mean() > 0.999
+    assert (again.visibility - drive.visibility[:length]).abs().max() < 0.2
+    assert (again.visibility - drive.visibility[:length]).abs().mean() < 1e-3
+    assert np.array_equal(again.thick, drive.thick)
+
+
+def drive_with_varying_scans(path, sides, seed):
+    """Record a drive with 250 ranges in every second scan and 470 in the others."""
+    drives = [simulated_drive(sides, seed, lidar=SimulatedLidar(beams)) for beams in (250, 470)]
+    for number, drive in enumerate(drives):
+        save_drive(drive, path.with_suffix(f".{number}"))
+    contents = [
+        read_messages(path.with_suffix(f".{n}"), {"/scan": SCAN, "/odom": ODOMETRY}) for n in (0, 1)
+    ]
+    with RecordingWriter(path) as writer:
+        for name, entries in contents[0].notes.items():
+            writer.describe(name, entries)
+        for index in range(len(drives[0].seconds)):
+            writer.copy(contents[index % 2].messages["/scan"][index])
+            writer.copy(contents[0].messages["/odom"][index])
+    return drives
+
+
+def test_each_scan_is_measured_by_its_own_bearings(tmp_path):
+    drives = drive_with_varying_scans(tmp_path / "both.mcap", "both", 7)
+    recording = read_recording(tmp_path / "both.mcap")
+    varying = labelled_drive(recording)
+    for number, drive in enumerate(drives):
+        scans, beams = slice(number, len(varying.ranges), 2), len(drive.angles)
+        assert np.array_equal(
+            varying.ranges[scans, :beams], drive.ranges[scans][: len(varying.ranges[scans])]
+        )
+        assert (
+            varying.hit[scans, :beams] == drive.hit[scans][: len(varying.ranges[scans])]
+        ).float().mean() > 0.999
+        assert (varying.hit[scans, beams:] == -1).all()
+        difference = (
+            varying.visibility[scans] - drive.visibility[scans][: len(varying.ranges[scans])]
+        )
+        assert difference.abs().mean() < 1e-3
+    every_second = [
+        clusters_in_range([(drive.ranges[n::2].numpy(), drive.angles.numpy())])[0]
+        for n, drive in enumerate(drives)
+    ]
+    features, _ = clusters_in_range([(recording.ranges, recording.angles(slice(None)))])
+    expected = np.concatenate(every_second)
+    np.testing.assert_allclose(np.sort(features, axis=0), np.sort(expected, axis=0), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_drives_with_varying_scans_train_and_test_the_classifier(tmp_path):
+    paths = {side: [] for side in ("left", "right", "both")}
+    for side, seeds in (("left", (0, 1)), ("right", (0, 1)), ("both", (100,))):
+        for seed in seeds:
+            paths[side].append(tmp_path / f"{side}_{seed}.mcap")
+            drive_with_varying_scans(paths[side][-1], side, seed)
+    Figure25(**paths).make(tmp_path / "figure_25")
+    (measured,) = (
+        row
+        for row in read_csv(tmp_path / "figure_25.csv")
+        if row["measure"] == "accuracy" and row["of"] == "all"
+    )
+    assert float(measured["share"]) > 0.96
+
+
+def clusters(count=300, seed=0):
+    rng = np.random.default_rng(seed)
+    thick = rng.random(count) < 0.5
+    width = np.where(thick, 0.08, 0.035) + rng.normal(0, 0.006, count)
+    return np.stack(
+        [width, rng.uniform(0, 0.02, count), 1.2 * width + rng.normal(0, 0.001, count)], axis=1
+    ), thick
+
+
+def test_components_are_the_eigenvectors_of_the_correlation_matrix_in_any_units():
+    features, _ = clusters()
+    xy, directions, share = principal_components(features)
+    values, vectors = np.linalg.eigh(np.corrcoef(features.T))
+    np.testing.assert_allclose(share, values[::-1][:2] / 3)
+    np.testing.assert_allclose(np.abs(directions), np.abs(vectors[:, ::-1][:, :2]), atol=1e-9)
+    np.testing.assert_allclose(xy.var(axis=0), values[::-1][:2])
+    np.testing.assert_allclose(xy.mean(axis=0), 0, atol=1e-12)
+    assert (np.abs(directions).max(axis=0) == directions.max(axis=0)).all()
+    np.testing.assert_allclose(principal_components(features * [1000, 1, 0.01])[0], xy, atol=1e-9)
+
+
+def test_figure_is_written_with_and_without_errors(tmp_path):
+    features, thick = clusters()
+    for wrong in (None, np.arange(len(thick)) < 40):
+        draw_cone_features(
+            features, thick, tmp_path / "plot.png", wrong=wrong, title="Clusters (simulated)"
+        )
+        assert (tmp_path / "plot.png").stat().st_size > 10_000

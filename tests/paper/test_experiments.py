@@ -1,0 +1,37 @@
+"""Every experiment file of the paper is a sweep that can be run and resumed."""
+
+import pytest
+from programs import ROOT, TINY_SWEEP
+
+from coil_paper import sweeps
+from coil_rl import compose_train
+from coil_rl.config.check import check
+from coil_rl.programs.train import train
+
+EXPERIMENTS = sorted(file.stem for file in (ROOT / "paper/conf/experiment").glob("*.yaml"))
+
+
+def first(experiment, run_dir):
+    """Return a very small configuration of the first run of the sweep."""
+    words = [sweeps.FILES, f"+experiment={experiment}"]
+    choice = next(sweeps.choices(experiment, words))
+    return compose_train([*words, *choice, *TINY_SWEEP, f"run_dir={run_dir}"])
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
+    config = first(experiment, tmp_path / "run")
+    check(config)
+    assert config.existing == "resume"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_trains_and_evaluates(experiment, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / "run"
+    config = first(experiment, run)
+    run.mkdir()
+    check(config)
+    train(config)
+    assert (run / "evaluation.csv").exists()

@@ -1,0 +1,36 @@
+import os
+import subprocess
+import sys
+
+import pytest
+from programs import LAP, ROOT, environment
+from run_folders import make_untrained_run
+
+
+def run(script, *arguments):
+    command = [sys.executable, "-m", f"coil_paper.figures.{script}", *map(str, arguments)]
+    done = subprocess.run(
+        command, env=environment(ROOT), cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", ["world", "spline"])
+def test_the_script_draws_its_figure(script, tmp_path):
+    assert run(script, tmp_path).splitlines()[-1] == str(tmp_path / f"{script}.png")
+    assert os.listdir(tmp_path) == [f"{script}.png"]
+
+
+@pytest.mark.slow
+def test_lines_draws_the_agents_of_runs_and_the_guide(tmp_path):
+    runs = [
+        make_untrained_run(tmp_path / label, f"method={label}", *LAP) for label in ("ppo", "coil")
+    ]
+    rows = [
+        line.split("|")[1].strip()
+        for line in run("lines", *runs, "--output", tmp_path).splitlines()[2:-1]
+    ]
+    assert rows == ["guide", "ppo", "coil"]
+    assert (tmp_path / "lines.png").exists()

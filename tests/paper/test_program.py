@@ -1,0 +1,211 @@
+import shutil
+from pathlib import Path
+
+import pytest
+from drives import drive as circle
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+from programs import ROOT, TRACK, called, program
+from run_folders import driven, make_run
+
+from coil_paper import sweeps
+from coil_paper.program import INDEX
+
+
+@pytest.fixture(autouse=True)
+def here(monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+
+def outcome(*arguments):
+    """Return the exit code, standard output and standard error."""
+    done = called("reproduce", *arguments, code=None)
+    return done.returncode, done.stdout, done.stderr
+
+
+def test_results_write_pages_numbers_and_pictures_and_print_the_pages():
+    code, out, _ = outcome("table=1", "figure=6", "hydra.run.dir=run")
+    files = {path.name for path in Path("run").iterdir()}
+    made = {
+        "table_1.md",
+        "table_1.csv",
+        "table_1.png",
+        "figure_6.md",
+        "figure_6.csv",
+        "figure_6.png",
+    }
+    assert code == 0
+    assert files == made | {"RESULTS.md"}
+    pages = [Path("run", f"{name}.md").read_text() for name in ("table_1", "figure_6")]
+    assert out.startswith(f"{pages[0]}\n{pages[1]}\nreproduce: table_1, figure_6 made; see ")
+    assert "Made by `coil-reproduce table=1 budget=paper` at commit `" in pages[0]
+
+
+def test_every_figure_of_the_paper_is_either_reproduced_or_named():
+    with initialize_config_module("coil_paper.conf", version_base="1.3"):
+        config = compose("reproduce")
+    named = [number for numbers in config.other_figures.values() for number in numbers]
+    made = [
+        int(name.removeprefix("figure_")) for name in config.results if name.startswith("figure_")
+    ]
+    assert sorted(named + made) == list(range(1, 33))
+
+
+def test_options_reach_the_result_and_the_command_on_its_page():
+    other_options = ("~results.table_5.worlds", "+results.table_4.labels=[]")
+    assert (
+        outcome("figure=6", "results.figure_6.iterations=7", *other_options, "hydra.run.dir=run")[0]
+        == 0
+    )
+    assert len(Path("run/figure_6.csv").read_text().splitlines()) == 1 + 8
+    assert (
+        "`coil-reproduce figure=6 budget=paper results.figure_6.iterations=7`"
+        in Path("run/figure_6.md").read_text()
+    )
+    text = Path("run/RESULTS.md").read_text()
+    everything = (
+        "results.figure_6.iterations=7 '~results.table_5.worlds' '+results.table_4.labels=[]'"
+    )
+    assert f"`coil-reproduce all=true budget=paper {everything}` writes this file" in text
+
+
+def test_a_further_result_is_requested_by_its_kind_and_name():
+    mine = "+results.figure_of_mine={_target_: coil_paper.reproduce.toymaker.Figure6}"
+    code, out, _ = outcome("figure=of_mine", mine, "hydra.run.dir=run")
+    assert code == 0
+    assert "Made by `coil-reproduce figure=of_mine" in out
+
+
+def test_results_md_collects_all_results_made_so_far():
+    assert outcome("table=1", "budget=smoke")[0] == 0
+    first = Path("outputs/reproduce/smoke/table_1.md").read_text()
+    assert outcome("table=[1]", "figure=[6]", "budget=smoke")[0] == 0
+    assert Path("outputs/reproduce/smoke/table_1.md").read_text() == first
+    text = Path("outputs/reproduce/smoke/RESULTS.md").read_text()
+    assert text.count("Smoke test at the smallest budget") == 1
+    assert text.index("## Table 1") < text.index("## Figure 6") < text.index("## Not made yet")
+    assert "- `coil-reproduce table=4 budget=smoke`" in text.split("## Not made yet")[1]
+
+
+def test_table_7_is_an_alias_of_table_6_and_recordings_need_no_runs():
+    circle(Path("mine.mcap"), scans=250, odometry=True, commands=True)
+    arguments = ["table=[6,7]", "results.table_6.recordings=[mine.mcap]"]
+    code, out, _ = outcome(*arguments, "hydra.run.dir=run")
+    assert code == 0
+    assert "reproduce: table_6 made" in out
+    assert {path.name for path in Path("run").iterdir()} == {
+        f"table_6.{end}" for end in ("md", "csv", "png")
+    } | {INDEX}
+    text = Path("run", INDEX).read_text()
+    assert text.count("## Table 6: the robot") == text.count("### Table 7, measured") == 1
+    again, *_ = outcome("table=7", *arguments[1:], "hydra.run.dir=again")
+    assert again == 0
+    assert Path("again/table_6.csv").read_bytes() == Path("run/table_6.csv").read_bytes()
+
+
+@pytest.fixture
+def two_runs(monkeypatch):
+    """Finished runs of COIL and PPO, and the list of commands that a sweep starts."""
+    sweep = sweeps.planned("paper", ["compile=true"], [0])
+    for folder, label in zip(sweep.all_folders, ("coil", "ppo"), strict=True):
+        make_run(folder, label, 0, driven("guide", {"a": 1.0}) + driven(label, {"a": 2.0}))
+    started = []
+
+    def start(words):
+        started.append(words)
+        return 3
+
+    monkeypatch.setattr(sweeps, "start", start)
+    return sweep, started
+
+
+def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs):
+    sweep, started = two_runs
+    choices = ["experiments=[paper]", "labels=[coil,ppo]"]
+    arguments = ["figure=22", "budgets.paper.seeds_of.paper=1", "~results.figure_22.worlds"]
+    arguments += [f"results.figure_22.{choice}" for choice in choices]
+    code, out, _ = outcome(*arguments)
+    assert (code, started) == (0, [])
+    assert (
+        "2 runs with the seeds 0, made at commit `unknown`. Training frames: 20,000 (coil, ppo)."
+        in out
+    )
+    assert outcome(*arguments)[1] == out
+    (sweep.all_folders[1] / "evaluation.csv").unlink()
+    code, _, error = outcome(*arguments, "hydra/launcher=basic")
+    assert code == 2
+    assert "the sweep of paper ended with exit code 3" in error
+    (command,) = started
+    words = ["-m", sweeps.FILES, "+experiment=paper", "compile=true", "seed=0"]
+    assert command == [*words, "hydra/launcher=basic"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "nothing is requested; give one of table=1, table=4"),
+        ("table=[1,3]", "table=3 does not exist; there are table=1, table=4"),
+        ("claim=table_1", "claim=table_1 does not exist"),
+        ("figure=3", "figure=3 is a diagram, which is not reproduced; there are table=1"),
+        ("claim=tabular_coal", "did you mean claim=tabular_coil?"),
+        ("tabel=1", "there is no key tabel"),
+        ("table=1 results.table_1.tolerance=0", "results.table_1: tolerance=0 must be more than 0"),
+        ("table=1 results.table_1._target_=builtins.dict", "builtins.dict makes dict, not Result"),
+        ("table=1 budget=small", "budget=small must be one of smoke, paper, full"),
+        (
+            "table=1 budgets.paper.seeds=0",
+            "budgets.paper.seeds=0 must be greater than or equal to 1",
+        ),
+        ("-m table=1,4", "leave out -m, and request several as in table=[1,4]"),
+    ],
+)
+def test_a_mistake_is_one_sentence_and_leaves_no_file(arguments, message):
+    code, _, error = outcome(*arguments.split())
+    assert code == 2
+    assert len(error.splitlines()) == 1
+    assert message in error
+    assert not list(Path().iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("budget", ["smoke", "full"])
+def test_every_budget_fits_every_experiment(budget):
+    with initialize_config_module("coil_paper.conf", version_base="1.3"):
+        config = compose("reproduce", ["table=1"])
+    results = instantiate(config.results, _convert_="all").values()
+    chosen = config.budgets[budget]
+    experiments = {name for result in results for name in result.experiments}
+    plans = [
+        sweeps.planned(name, [*chosen.every, *chosen.only.get(name, [])], range(chosen.seeds))
+        for name in experiments
+    ]
+    files = (ROOT / "paper" / "conf" / "experiment").glob("*.yaml")
+    assert experiments == {path.stem for path in files}
+    assert set(chosen.only) <= experiments
+    for plan in plans:
+        assert len(set(plan.all_folders)) == len(plan.all_folders) >= chosen.seeds
+
+
+@pytest.mark.slow
+def test_a_figure_trains_its_runs_and_a_lost_run_again():
+    choices = ["experiments=[paper]", "labels=[coil,ppo]"]
+    tiny = [*TRACK, "budget.frames=512", "budget.num_envs=8"]
+    arguments = ["figure=22", "budget=smoke", "~results.figure_22.worlds", f"train={tiny}"]
+    arguments += [f"results.figure_22.{choice}" for choice in choices]
+    program("reproduce", *arguments, cwd=Path())
+    pages = [
+        Path(f"outputs/reproduce/smoke/{name}").read_text()
+        for name in ("figure_22.md", "figure_22.csv")
+    ]
+    evaluated = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
+    assert len(evaluated) == 4
+    assert "> **Smoke test at the smallest budget" in pages[0]
+    lost = sorted(evaluated)[0]
+    shutil.rmtree(lost.parent)
+    program("reproduce", *arguments, cwd=Path())
+    again = {path: path.stat().st_mtime_ns for path in Path().rglob("evaluation.csv")}
+    assert {path for path in evaluated if evaluated[path] != again[path]} == {lost}
+    assert [
+        Path(f"outputs/reproduce/smoke/{name}").read_text()
+        for name in ("figure_22.md", "figure_22.csv")
+    ] == pages
