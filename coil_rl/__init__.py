@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from coil_rl.learners import TRPO as TRPO
     from coil_rl.learners import DynamicCoil as DynamicCoil
     from coil_rl.learners import Reinforce as Reinforce
+    from coil_rl.measures import Measure as Measure
     from coil_rl.programs.app import run_program as run_program
-    from coil_rl.report.measures import Measure as Measure
     from coil_rl.run.controller import Controller as Controller
     from coil_rl.run.evaluation import EvaluationResult as EvaluationResult
     from coil_rl.run.evaluation import evaluate_policy as evaluate_policy
@@ -96,7 +96,7 @@ _NAMES = {
     "coil_rl.config.values": "check_values",
     "coil_rl.programs.app": "run_program",
     "coil_rl.run.folder": "versions",
-    "coil_rl.report.measures": "Measure",
+    "coil_rl.measures": "Measure",
     "coil_rl.run.rollout": "Rollout",
     "coil_rl.run.controller": "Controller",
     "coil_rl.run.parts": "EnvMaker",

@@ -14,7 +14,7 @@ from torchrl.envs import Compose, EnvBase, GymEnv, PendulumEnv, SerialEnv, Trans
 from coil_rl.config import schema  # noqa: F401 registers the configuration schema
 from coil_rl.envs import ConeTrackEnv, shipped_tracks
 from coil_rl.guides import SplineGuide
-from coil_rl.report.measures import Measure, measures_of
+from coil_rl.measures import Measure, measures_of
 from coil_rl.transforms import GuideActions
 
 

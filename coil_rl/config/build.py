@@ -15,8 +15,8 @@ from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
+from coil_rl.measures import measures_of
 from coil_rl.report import Returns
-from coil_rl.report.measures import measures_of
 from coil_rl.report.pictures import Picture
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles

@@ -27,7 +27,7 @@ from coil_rl.config.values import check_values
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
-from coil_rl.report.measures import measures_of
+from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.transforms import GuideActions

@@ -84,7 +84,20 @@ def prepare(
     folder: str | Path,
     overrides: Sequence[str] = (),
 ) -> Run:
-    """Return a run that is checked and ready to train; arguments and errors as for `train`."""
+    """Return a run that is checked and ready to train.
+
+    Args:
+        env: as for `train`.
+        guide: as for `train`.
+        method: as for `train`.
+        frames: as for `train`.
+        seed: as for `train`.
+        folder: as for `train`.
+        overrides: as for `train`.
+
+    Raises:
+        UserError: for a mistake in an argument.
+    """
     env_words, env_nodes = _env(env, f"{folder}#env")
     guide_words, guide_nodes = _guide(guide, f"{folder}#guide")
     words = [*env_words, *guide_words]

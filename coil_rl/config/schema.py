@@ -16,7 +16,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from pydantic import AfterValidator, ConfigDict, Field, GetPydanticSchema
 from pydantic_core import PydanticCustomError, core_schema
 
-from coil_rl.report.measures import REDUCTIONS
+from coil_rl.measures import REDUCTIONS
 
 LARGEST = 2**63 - 1
 # Keys in which two runs with the same numbers may differ.
@@ -94,7 +94,7 @@ class TrainingConfig(NodeConfig):
 
 @dataclass
 class MeasureConfig(NodeConfig):
-    """A measure of an episode, see `coil_rl.report.measures.Measure`."""
+    """A measure of an episode, see `coil_rl.measures.Measure`."""
 
     entry: Any = MISSING
     reduction: Annotated[str, one_of(*REDUCTIONS)] = "mean"
@@ -242,13 +242,14 @@ class ReportConfig(ProgramConfig):
 
 def fingerprint(config: DictConfig) -> str:
     """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
-    identity: dict[str, Any] = {
-        str(key): OmegaConf.to_container(config[key], resolve=True)
-        if OmegaConf.is_config(config[key])
-        else config[key]
-        for key in sorted(map(str, config))
-        if key not in (*IGNORED_KEYS, "hydra")
-    }
+    identity: dict[str, Any] = {}
+    for key in sorted(map(str, config)):
+        if key in (*IGNORED_KEYS, "hydra"):
+            continue
+        value = config[key]
+        if OmegaConf.is_config(value):
+            value = OmegaConf.to_container(value, resolve=True)
+        identity[key] = value
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
 
 

@@ -28,7 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.schema import TrainConfig
 from coil_rl.errors import UserError, did_you_mean
-from coil_rl.imitation.estimators import ESTIMATORS, TRUSTED
+from coil_rl.trusted import ESTIMATORS, TRUSTED
 
 ENTRY_POINTS = (
     "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted
@@ -61,9 +61,14 @@ _own: frozenset[str] = frozenset()  # targets in the configuration of the comman
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
     """Let the run folders that this process reads from here on use parts of these packages, and of no others.
 
-    The names are top-level; a folder may call everything that is defined in these packages. The
-    targets that `command` names, the configuration that the user composed, are trusted too. A
-    package that is never trusted is a `UserError`.
+    A folder may call everything that is defined in these packages.
+
+    Args:
+        packages: their top-level names.
+        command: the configuration that the user composed; what it names is trusted too.
+
+    Raises:
+        UserError: for a package that is never trusted.
     """
     global _packages, _own
     names = list(packages)
@@ -117,11 +122,9 @@ def check_config(config: DictConfig, path: Path) -> None:
                 f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
             )
         # Only the logger is saved with references, and none to itself, so that they cannot grow.
-        known = (
-            r"\$\{(?!logger\b)\w[\w.]*\}"
-            if name.startswith("logger.") and key != "_target_"
-            else r"(?!)"
-        )
+        known = r"(?!)"
+        if name.startswith("logger.") and key != "_target_":
+            known = r"\$\{(?!logger\b)\w[\w.]*\}"
         if isinstance(value, str) and "${" in re.sub(known, "", value):
             raise UserError(
                 f"{path}: {name:.100}={value!r:.100} is a reference; put the value in its place"
@@ -130,13 +133,11 @@ def check_config(config: DictConfig, path: Path) -> None:
 
 def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any], Any, Any]]:
     """Yield full key, parent, key and value of each entry of nested mappings and lists."""
-    parent = (
-        node
-        if isinstance(node, Mapping)
-        else dict(enumerate(node))
-        if isinstance(node, list)
-        else {}
-    )
+    parent: Mapping[Any, Any] = {}
+    if isinstance(node, Mapping):
+        parent = node
+    elif isinstance(node, list):
+        parent = dict(enumerate(node))
     for key, value in parent.items():
         full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
         yield full, parent, key, value
@@ -155,64 +156,73 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
 
 
 def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
-    refusal = f"{path}: {name:.100} names {target!r:.100}"
+    """Raise a `UserError` if an entry names something that a folder may not call.
+
+    Args:
+        target: what it names.
+        name: full key of the entry.
+        node: mapping that holds the entry.
+        path: of the configuration, for the message.
+    """
+    named = f"{path}: {name:.100} names {target!r:.100}"
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if not package.isidentifier():
-        raise UserError(f"{refusal}, which is not the full name of a class; give one")
+        raise UserError(f"{named}, which is not the full name of a class; give one")
     allowed = NAMED | _shipped_targets() | _own
     if target in allowed and not target.startswith(LOGGERS):
         return
-    if (
-        package not in NEVER_TRUSTED
-        and package in _packages | metadata.entry_points(group=ENTRY_POINTS).names
-    ):
-        if (
-            name.endswith(".id") and "controllers" not in name
-        ):  # a Gymnasium env, which its module registers
-            return
-        try:
-            origin = str(getattr(hydra.utils.get_object(target), "__module__", None)).partition(
-                "."
-            )[0]
-        except Exception as error:
-            raise UserError(
-                f"{refusal}, which {package} does not have; check that the package is installed"
-            ) from error
-        if origin != package:
-            raise UserError(
-                f"{refusal}, which is defined elsewhere; name the package that defines it"
-            )
+    entry_points = metadata.entry_points(group=ENTRY_POINTS).names
+    if package not in NEVER_TRUSTED and package in _packages | entry_points:
+        # A Gymnasium env is registered by its module, and has no name of its own there.
+        if not name.endswith(".id") or "controllers" in name:
+            _check_origin(target, package, named)
     elif target in allowed:
-        plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
-        if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
-            allowed_as = (
-                "which may only be the logger, with log_dir: ${run_dir} and a plain exp_name"
-            )
-            reason = "because a run writes only into its own folder"
-            raise UserError(
-                f"{refusal}, {allowed_as}, {reason}; trust=[torchrl] on the command line allows it"
-            )
+        _check_logger(name, node, named)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
         raise UserError(
-            f"{refusal}, which is no part of a run and could run code{similar or '; remove it'}"
+            f"{named}, which is no part of a run and could run code{similar or '; remove it'}"
         )
     else:
-        remedy = f"allow it with trust=[{package:.100}] on the command line"
         raise UserError(
-            f"{refusal}, which could run code; if you know the folder and the package, {remedy}"
+            f"{named}, which could run code; if you know the folder and the package, allow it with "
+            f"trust=[{package:.100}] on the command line"
+        )
+
+
+def _check_origin(target: str, package: str, named: str) -> None:
+    """Raise a `UserError` if a part is not defined in the trusted package that names it."""
+    try:
+        origin = str(getattr(hydra.utils.get_object(target), "__module__", None))
+    except Exception as error:
+        raise UserError(
+            f"{named}, which {package} does not have; check that the package is installed"
+        ) from error
+    if origin.partition(".")[0] != package:
+        raise UserError(f"{named}, which is defined elsewhere; name the package that defines it")
+
+
+def _check_logger(name: str, node: Mapping[Any, Any], named: str) -> None:
+    """Raise a `UserError` for a logger that could write outside of the folder of its run."""
+    plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
+    if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
+        raise UserError(
+            f"{named}, which may only be the logger, with log_dir: ${{run_dir}} and a plain "
+            "exp_name, because a run writes only into its own folder; trust=[torchrl] on the "
+            "command line allows it"
         )
 
 
 @cache
 def _shipped_targets() -> frozenset[str]:
+    """Return all targets that the shipped configuration names in the groups of a run."""
     conf = resources.files("coil_rl.conf")
-    names = [*(field.name for field in fields(TrainConfig)), "cases", "network"]
-    groups = [group for name in names if (group := conf / name).is_dir()]
-    texts = [
-        file.read_text(encoding="utf-8")
-        for group in groups
-        for file in group.iterdir()
-        if ".yaml" in file.name
-    ]
-    return frozenset(target for text in texts for target in re.findall(r"_target_: ([\w.]+)", text))
+    found: set[str] = set()
+    for name in (*(field.name for field in fields(TrainConfig)), "cases", "network"):
+        group = conf / name
+        if not group.is_dir():
+            continue
+        for file in group.iterdir():
+            if ".yaml" in file.name:
+                found |= set(re.findall(r"_target_: ([\w.]+)", file.read_text(encoding="utf-8")))
+    return frozenset(found)

@@ -28,7 +28,7 @@ from sklearn.tree import DecisionTreeRegressor
 from sklearn.tree._tree import Tree
 
 from coil_rl.errors import UserError
-from coil_rl.imitation.estimators import ESTIMATORS, PARTS
+from coil_rl.trusted import ESTIMATORS, PARTS
 
 CLASSES = {
     *(name.rpartition(".")[2] for name in ESTIMATORS),

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.listening.measures import ADVICE, InterceptedPolicy, agreement, gradient, intervention
-from coil_rl.report.measures import summarise
+from coil_rl.measures import summarise
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from coil_rl.errors import UserError
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 from coil_rl.report.runs import DRIVER, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
 

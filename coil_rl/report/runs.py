@@ -11,8 +11,8 @@ import pandas as pd
 import yaml
 
 from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.measures import Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
-from coil_rl.report.measures import Measure, measures_of
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "case")

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.learners.learner import CaseResults
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.policy_batch import policy_batch
 

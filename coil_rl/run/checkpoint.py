@@ -68,8 +68,10 @@ def load_newest(folder: Path) -> Any | None:
         try:
             state = load(previous)
         except UserError:
-            remedy = "put one of them back from a copy, or train again in another folder"
-            raise UserError(f"both {newest} and {previous} are damaged; {remedy}") from error
+            raise UserError(
+                f"both {newest} and {previous} are damaged; put one of them back from a copy, or "
+                "train again in another folder"
+            ) from error
     print(f"{reason.split(';')[0]}; using {previous.name}", file=sys.stderr)
     # Otherwise the next checkpoint would replace the intact file by the damaged one.
     previous.replace(newest)

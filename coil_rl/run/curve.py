@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from coil_rl.files import whole_file
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 from coil_rl.report.runs import CHOICE, RETURN
 from coil_rl.run import checkpoint
 from coil_rl.run.evaluation import Totals, episodes

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 
 
 @dataclass(frozen=True)

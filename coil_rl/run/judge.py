@@ -20,8 +20,8 @@ from coil_rl.compiled import compile_steps
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.guides.simple import FollowAdvice
+from coil_rl.measures import Measure, summarise
 from coil_rl.report import Returns, markdown_table, write_csv
-from coil_rl.report.measures import Measure, summarise
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy

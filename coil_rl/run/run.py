@@ -21,8 +21,8 @@ from coil_rl.compiled import compile_steps
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import write_text
 from coil_rl.learners.learner import Callback, Learner
+from coil_rl.measures import Measure
 from coil_rl.report import draw_learning_curves, draw_phases
-from coil_rl.report.measures import Measure
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import SelectionCases
@@ -435,15 +435,14 @@ class Run:
 
     def _settings_of_parts(self) -> dict[str, Any]:
         """Return what reports need of a run that was made from parts."""
-        measured = {
-            name: {
+        measured = {}
+        for name, measure in self.trial.evaluation.measures.items():
+            measured[name] = {
                 "entry": measure.entry if isinstance(measure.entry, str) else list(measure.entry),
                 "reduction": measure.reduction,
                 "title": measure.title,
                 "format": measure.format,
             }
-            for name, measure in self.trial.evaluation.measures.items()
-        }
         return {
             "made_from_parts": True,
             "label": self.label,

@@ -11,7 +11,7 @@ from worlds import Script
 
 from coil_rl.listening import WholeEpisode
 from coil_rl.listening.survey import Ablation, ablations, drive_ablated, survey, table_by_section
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 from coil_rl.run.judge import Evaluation
 from coil_rl.transforms import GuideActions
 

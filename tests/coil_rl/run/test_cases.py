@@ -7,7 +7,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.config.build import assemble, build_learner, env_maker
 from coil_rl.errors import UserError
-from coil_rl.report.measures import Measure
+from coil_rl.measures import Measure
 from coil_rl.run.cases import SelectionCases
 
 pytest.importorskip("gymnasium.envs.classic_control")

@@ -12,7 +12,7 @@ from worlds import Script, driving_measures
 from coil_rl.envs import ConeTrackEnv, DrivingTasksEnv, Track, random_tracks
 from coil_rl.guides import ConstantGuide, SplineGuide
 from coil_rl.learners.networks import actor
-from coil_rl.report.measures import REDUCTIONS, Measure, summarise
+from coil_rl.measures import REDUCTIONS, Measure, summarise
 from coil_rl.run.evaluation import Totals, evaluate_policy
 
 TRACKS = random_tracks(2, seed=5)

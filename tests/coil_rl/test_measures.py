@@ -3,7 +3,7 @@ import math
 import pytest
 from worlds import driving_measures
 
-from coil_rl.report.measures import Measure, measures_of, summarise
+from coil_rl.measures import Measure, measures_of, summarise
 
 
 def test_measure_of_a_yaml_file_has_tuples_as_keys():

@@ -11,9 +11,10 @@ TRUSTED: dict[str, Any] = yaml.safe_load(
 
 
 def _full_names(modules: dict[str, list[str]]) -> frozenset[str]:
-    return frozenset(
-        f"sklearn.{module}.{name}" for module, names in modules.items() for name in names
-    )
+    found: set[str] = set()
+    for module, names in modules.items():
+        found |= {f"sklearn.{module}.{name}" for name in names}
+    return frozenset(found)
 
 
 ESTIMATORS = _full_names(TRUSTED["estimators"])  # regressors of scikit-learn and their parts
