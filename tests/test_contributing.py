@@ -47,8 +47,8 @@ def test_walks_name_every_file_between_the_command_and_the_optimiser_step_and_th
 
     def traced_advice(self, tensordict):
         files = files_on_the_stack()
-        if "coil_rl/train/rollout.py" in files:
-            stacks.setdefault("advice", files[files.index("coil_rl/train/rollout.py") :])
+        if "coil_rl/run/rollout.py" in files:
+            stacks.setdefault("advice", files[files.index("coil_rl/run/rollout.py") :])
         return advise(self, tensordict)
 
     monkeypatch.setattr(torch.optim.Adam, "step", traced_step)

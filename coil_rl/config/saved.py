@@ -47,6 +47,8 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
         raise UserError(f"{key}={folder} is not the folder of a run: it has no config.yaml")
     try:
         values = read_yaml(path)
+        if values is None:
+            raise UserError(f"{path} is not the configuration of a run (it is empty)")
         if not isinstance(values, dict):
             raise UserError(f"{path} is not the configuration of a run, but a list")
         if values.get("made_from_parts"):

@@ -10,10 +10,11 @@ import torch
 from hydra import compose, initialize_config_module
 
 from coil_rl.config.check import check
+from coil_rl.config.load import open_run
 from coil_rl.errors import UserError
 from coil_rl.programs import evaluate
 from coil_rl.programs.train import resume, train
-from coil_rl.run import checkpoint, fallback
+from coil_rl.run import checkpoint
 
 METHODS = sorted(
     file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
@@ -233,6 +234,4 @@ def test_agent_falls_back_to_its_guide_where_its_critic_values_a_state_low(tmp_p
     with pytest.raises(
         UserError, match=r"evaluation.fallback=true has no effect on .*ppo: its agent has no guide"
     ):
-        fallback.build_fallback(
-            composed("ppo", plain, "evaluation.fallback=true"), plain, torch.nn.Module()
-        )
+        open_run(plain).make_fallback(torch.nn.Module())

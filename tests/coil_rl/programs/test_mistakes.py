@@ -48,7 +48,8 @@ def started(monkeypatch, tmp_path):
 
 
 def files():
-    return {str(path) for path in Path().rglob("*")}
+    paths = {str(path) for path in Path().rglob("*")}
+    return {path for path in paths if not path.startswith(".hypothesis")}
 
 
 def refusal(name, *arguments):
@@ -67,10 +68,10 @@ def refusal(name, *arguments):
     [
         # keys
         ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
-        ("sed=1", "resume; did you mean seed?"),
+        ("sed=1", "init; did you mean seed?"),
         (
             "budget.step=1",
-            "no key budget.step; budget has frames, num_envs, steps, minibatches; "
+            "no key budget.step; budget has frames, num_envs, steps, minibatches, stages; "
             "did you mean steps?",
         ),
         (

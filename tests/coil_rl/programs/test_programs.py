@@ -125,7 +125,7 @@ def test_run_stopped_during_its_evaluation_resumes_to_the_same_numbers(run, tmp_
         (
             "train",
             ["-m", "resume=run,other"],
-            "resume=run,other takes no argument but trust=[PACKAGE]: "
+            "resume=run,other takes no argument but trust=[PACKAGE] and budget.frames=NUMBER: "
             "the run has its own config.yaml; leave out -m",
         ),
     ],
