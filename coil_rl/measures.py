@@ -19,21 +19,30 @@ class Measure:
     """A measure of an episode: an entry of the env, reduced over the steps.
 
     Two measures have a meaning in reports: `completed`, the success that drivers are ordered by
-    first, and `crashed`, the failure that is counted by seed. Another reduction, or two bounds, are
-    a `ValueError`.
+    first, and `crashed`, the failure that is counted by seed.
+
+    Args:
+        entry: key of one number a row, after a step; those of several agents are summed.
+        reduction: of the numbers of the steps: their `mean`, `sum`, `min`, `max`, the `last` one;
+            whether `any` is not 0, their `count`, or the mean of those that are not 0
+            (`mean_nonzero`). Without a number, a mean is NaN.
+        where: key of a flag; only the steps with it count.
+        at_least: makes the measure a flag: whether the number is at least this.
+        at_most: makes the measure a flag: whether the number is at most this.
+        title: heading of its column; a measure without one is in the CSV files only.
+        format: of its numbers in tables.
+
+    Raises:
+        ValueError: for another reduction, or two bounds.
     """
 
-    entry: (
-        str | tuple[str, ...]
-    )  # key of one number a row, after a step; those of several agents are summed
-    # `mean`, `sum`, `min`, `max` or `last` of the numbers; whether `any` is not 0, their `count`,
-    # or their mean (`mean_nonzero`). Without a number, a mean is NaN.
+    entry: str | tuple[str, ...]
     reduction: str = "mean"
-    where: str | tuple[str, ...] | None = None  # key of a flag; only the steps with it count
-    at_least: float | None = None  # the measure becomes a flag: the number is at least this
-    at_most: float | None = None  # the measure becomes a flag: the number is at most this
-    title: str = ""  # heading of its column; a measure without one is in the CSV files only
-    format: str = ".1f"  # of its numbers in tables
+    where: str | tuple[str, ...] | None = None
+    at_least: float | None = None
+    at_most: float | None = None
+    title: str = ""
+    format: str = ".1f"
 
     def __post_init__(self) -> None:
         if self.reduction not in REDUCTIONS:
@@ -49,7 +58,10 @@ class Measure:
         return cls(_key(entry), where=None if where is None else _key(where), **options)
 
     def pool(self, values: Sequence[float]) -> float:
-        """Return the mean of several episodes without NaN; of numbers, the minimum of minima, the maximum of maxima."""
+        """Return the mean of several episodes without NaN.
+
+        Of numbers, return the minimum of minima, and the maximum of maxima.
+        """
         numbers = [float(value) for value in values if not math.isnan(value)]
         is_flag = self.at_least is not None or self.at_most is not None
         pools: dict[str, Callable[[Sequence[float]], float]] = (

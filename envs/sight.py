@@ -45,7 +45,11 @@ class View:
 
 
 class Frame:
-    """The coordinate frames of cars at poses [3, B] (m, m, radians): x ahead, y to the left."""
+    """The coordinate frames of cars: x ahead, y to the left.
+
+    Args:
+        pose: of the cars, [3, B] (m, m, radians).
+    """
 
     def __init__(self, pose: Tensor) -> None:
         self.position, heading = pose[:2], pose[2]

@@ -30,18 +30,6 @@ MODULES = [
 CONF = Path(__file__).parents[1] / "conf"
 TARGET = re.compile(r"_target_: *(coil_rl\.[\w.]+)")
 NAME = re.compile(r"    (\*{0,2}\w[\w, ]*):")
-# Rooms whose docstrings still have to be completed; take a room out when it is done.
-UNFINISHED = (
-    "coil_rl",
-    "learners",
-    "listening",
-    "programs",
-    "report",
-    "reproduce",
-    "robot",
-    "tabular",
-    "train",
-)
 
 Public = Callable[..., Any]
 
@@ -135,17 +123,7 @@ def faults(thing: Public) -> Iterator[str]:
 ROOMS = sorted({room_of(thing) for thing in public()})
 
 
-def cases() -> list[object]:
-    found = []
-    for room in ROOMS:
-        marks = []
-        if room in UNFINISHED:
-            marks.append(pytest.mark.xfail(strict=False, reason="still to be completed"))
-        found.append(pytest.param(room, marks=marks, id=room))
-    return found
-
-
-@pytest.mark.parametrize("room", cases())
+@pytest.mark.parametrize("room", ROOMS)
 def test_public_classes_and_functions_document_their_arguments(room):
     in_room = [thing for thing in public() if room_of(thing) == room]
     found = [fault for thing in in_room for fault in faults(thing)]

@@ -148,7 +148,11 @@ class ProxyConfig(NodeConfig):
 
 @dataclass
 class ProgramConfig(NodeConfig):
-    """Base of the root configurations: Hydra's help text and callback of this project."""
+    """Base of the root configurations: Hydra's help text and callback of this project.
+
+    Args:
+        defaults: Hydra's list of files.
+    """
 
     defaults: list[Any] = field(
         default_factory=lambda: [

@@ -21,7 +21,7 @@ from dataclasses import fields
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import hydra.utils
 from omegaconf import DictConfig, OmegaConf
@@ -155,6 +155,17 @@ def _import_path(name: str, key: Any, value: Any) -> Any:
     return value.replace(":", ".", 1) if names_code and isinstance(value, str) else None
 
 
+class _Entry(NamedTuple):
+    """An entry of a configuration that names something to be called."""
+
+    path: Path  # of the file
+    name: str  # full key
+    target: Any  # what it names
+
+    def __str__(self) -> str:
+        return f"{self.path}: {self.name:.100} names {self.target!r:.100}"
+
+
 def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
     """Raise a `UserError` if an entry names something that a folder may not call.
 
@@ -164,10 +175,10 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
         node: mapping that holds the entry.
         path: of the configuration, for the message.
     """
-    named = f"{path}: {name:.100} names {target!r:.100}"
+    entry = _Entry(path, name, target)
     package = target.partition(".")[0] if isinstance(target, str) else ""
     if not package.isidentifier():
-        raise UserError(f"{named}, which is not the full name of a class; give one")
+        raise UserError(f"{entry}, which is not the full name of a class; give one")
     allowed = NAMED | _shipped_targets() | _own
     if target in allowed and not target.startswith(LOGGERS):
         return
@@ -175,39 +186,39 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
     if package not in NEVER_TRUSTED and package in _packages | entry_points:
         # A Gymnasium env is registered by its module, and has no name of its own there.
         if not name.endswith(".id") or "controllers" in name:
-            _check_origin(target, package, named)
+            _check_origin(entry, package)
     elif target in allowed:
-        _check_logger(name, node, named)
+        _check_logger(entry, node)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
         raise UserError(
-            f"{named}, which is no part of a run and could run code{similar or '; remove it'}"
+            f"{entry}, which is no part of a run and could run code{similar or '; remove it'}"
         )
     else:
         raise UserError(
-            f"{named}, which could run code; if you know the folder and the package, allow it with "
+            f"{entry}, which could run code; if you know the folder and the package, allow it with "
             f"trust=[{package:.100}] on the command line"
         )
 
 
-def _check_origin(target: str, package: str, named: str) -> None:
+def _check_origin(entry: _Entry, package: str) -> None:
     """Raise a `UserError` if a part is not defined in the trusted package that names it."""
     try:
-        origin = str(getattr(hydra.utils.get_object(target), "__module__", None))
+        origin = str(getattr(hydra.utils.get_object(entry.target), "__module__", None))
     except Exception as error:
         raise UserError(
-            f"{named}, which {package} does not have; check that the package is installed"
+            f"{entry}, which {package} does not have; check that the package is installed"
         ) from error
     if origin.partition(".")[0] != package:
-        raise UserError(f"{named}, which is defined elsewhere; name the package that defines it")
+        raise UserError(f"{entry}, which is defined elsewhere; name the package that defines it")
 
 
-def _check_logger(name: str, node: Mapping[Any, Any], named: str) -> None:
+def _check_logger(entry: _Entry, node: Mapping[Any, Any]) -> None:
     """Raise a `UserError` for a logger that could write outside of the folder of its run."""
     plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
-    if name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
+    if entry.name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
         raise UserError(
-            f"{named}, which may only be the logger, with log_dir: ${{run_dir}} and a plain "
+            f"{entry}, which may only be the logger, with log_dir: ${{run_dir}} and a plain "
             "exp_name, because a run writes only into its own folder; trust=[torchrl] on the "
             "command line allows it"
         )

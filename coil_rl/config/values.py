@@ -15,7 +15,14 @@ LARGEST_BATCH = 2**28  # frames
 
 
 def check_values(config: DictConfig) -> None:
-    """Raise a `UserError` for an unknown key, or a value out of range, in the configuration of any program."""
+    """Check the values of the configuration of any program.
+
+    Args:
+        config: composed by Hydra, or read from a folder.
+
+    Raises:
+        UserError: for an unknown key, or a value out of range.
+    """
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     schema: Any = OmegaConf.get_type(config)
     try:

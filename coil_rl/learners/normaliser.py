@@ -122,12 +122,11 @@ class Moments(nn.Module):
 
 def advice_keys(env: EnvBase) -> set[NestedKey]:
     """Return the entries of an env that hold advice."""
-    return {
-        key
-        for module in env.modules()
-        if isinstance(module, GuideActions)
-        for key in module.out_keys
-    }
+    keys: set[NestedKey] = set()
+    for module in env.modules():
+        if isinstance(module, GuideActions):
+            keys |= set(module.out_keys)
+    return keys
 
 
 def normaliser(

@@ -204,21 +204,25 @@ def program(name: str) -> Iterator[None]:
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
-    """Raise a `KeyboardInterrupt`, and remember it, because a module that is being imported may swallow it."""
+    """Raise a `KeyboardInterrupt`, and remember it.
+
+    A module that is being imported may swallow it.
+    """
     _interrupts.append(signum)
     raise KeyboardInterrupt
 
 
 def refuse(name: str, error: Exception) -> NoReturn:
-    """End the program with one sentence and exit code 2, and remove new folders that hold no files of the task."""
+    """End the program with one sentence and exit code 2.
+
+    New folders that hold no files of the task are removed.
+    """
     for folder in filter(os.path.exists, _new_folders):  # a name may be too long for one
         inside = {path for path in folder.rglob("*") if not path.is_dir()}
-        of_jobs = {
-            path.with_name(name)
-            for path in inside
-            if path.name == "hydra.yaml"
-            for name in HYDRA_FILES
-        }
+        of_jobs = set()
+        for path in inside:
+            if path.name == "hydra.yaml":
+                of_jobs |= {path.with_name(file) for file in HYDRA_FILES}
         if all(path.name == "multirun.yaml" or path in of_jobs for path in inside):
             shutil.rmtree(folder, ignore_errors=True)
     _new_folders.clear()

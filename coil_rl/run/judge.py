@@ -344,6 +344,10 @@ def evaluate_guides(
 
 
 def guide_titles(guides: Iterable[str]) -> list[str]:
-    """Return the names of guides in tables: `guide` for a single one, otherwise `guide NAME`."""
+    """Return the names of guides in tables: `guide` for a single one, otherwise `guide NAME`.
+
+    Args:
+        guides: their names.
+    """
     names = list(guides)
     return ["guide"] if len(names) == 1 else [f"guide {name}" for name in names]

@@ -79,12 +79,14 @@ class MDP:
         total = self.P.sum(axis=2)
         valid = np.isclose(total, 1, rtol=0, atol=1e-9) & (self.P >= 0).all(axis=2)
         for s, a in np.argwhere(~valid | ~np.isfinite(self.R).all(axis=2)):
-            where = f"state {self.states[s]}, action {self.actions[a]}"
+            state, action = self.states[s], self.actions[a]
             if valid[s, a]:
-                raise ValueError(f"R[{s}, {a}]={self.R[s, a]} must be finite ({where})")
+                raise ValueError(
+                    f"R[{s}, {a}]={self.R[s, a]} must be finite (state {state}, action {action})"
+                )
             raise ValueError(
-                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 ({where}); "
-                f"they sum to {total[s, a]:g}"
+                f"P[{s}, {a}]={self.P[s, a]} must be probabilities that sum to 1 (state {state}, "
+                f"action {action}); they sum to {total[s, a]:g}"
             )
 
     @property
