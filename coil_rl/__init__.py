@@ -82,7 +82,8 @@ _NAMES = {
     "coil_rl.envs.limits": "check_range",
     "coil_rl.errors": "UserError did_you_mean",
     "coil_rl.files": "write_text",
-    "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide SplineGuide ZeroGuide",
+    "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
+    "SplineGuide ZeroGuide",
     "coil_rl.config.learned_guide": "LearnedGuide",
     "coil_rl.imitation": "Imitation",
     "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
@@ -102,8 +103,8 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
-    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling "
-    "set_progress",
+    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction "
+    "RewardCoupling set_progress",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

@@ -79,7 +79,10 @@ def _key(key: Any) -> str | tuple[str, ...]:
 
 
 def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
-    """Return measures by name from the key `evaluation.measures` of a configuration; errors are `UserError`s."""
+    """Return measures by name from the key `evaluation.measures` of a configuration.
+
+    Errors are `UserError`s.
+    """
     measures = {}
     for name, node in nodes.items():
         try:
@@ -92,7 +95,10 @@ def measures_of(nodes: Mapping[str, Any]) -> dict[str, Measure]:
 def summarise(
     episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]
 ) -> list[dict[str, Any]]:
-    """Return the means of each case in the order of the episodes, then their mean as the case `mean`."""
+    """Return the means of each case, then their mean as the case `mean`.
+
+    The cases are in the order of the episodes.
+    """
     reward = {"reward": Measure("reward"), **measures}
     cases: dict[str, list[Mapping[str, Any]]] = {}
     for episode in episodes:

@@ -51,8 +51,8 @@ class GymnasiumEnv(SeededRows):
     at which the env is drawn, NaN if it does not say.
 
     Args:
-        id: registered name; "MODULE:NAME" imports the module first. Or a maker of an env: a class or
-            function, or the "MODULE:NAME" of one.
+        id: registered name; "MODULE:NAME" imports the module first. Or a maker of an env: a class
+            or function, or the "MODULE:NAME" of one.
         num_envs: B, number of rows.
         options: keyword arguments of `gymnasium.make`, or of the maker.
         wrappers: callables that take an env and return one, applied in this order.

@@ -1,3 +1,6 @@
-"""From YAML to a run: schema, composition, checks, trust; the only package besides the programs that reads it."""
+"""From YAML to a run: schema, composition, checks, trust.
+
+Besides the programs it is the only package that reads YAML.
+"""
 
 import coil_rl.config.schema  # noqa: F401  registers the root configurations and resolvers with Hydra

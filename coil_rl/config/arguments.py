@@ -19,7 +19,9 @@ STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=Fal
 def check_arguments(
     target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
 ) -> None:
-    """Raise a `UserError` for an unknown or missing argument, or one that does not fit its annotation.
+    """Check the arguments of a node.
+
+    An unknown or missing argument, or one that does not fit its annotation, is a `UserError`.
 
     Args:
         target: class or function.
@@ -79,7 +81,10 @@ _TARGET = object()
 
 
 def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any:
-    """Return a value without nodes inside it that have a `_target_`, whose results are not known yet."""
+    """Return a value without the nodes inside it that have a `_target_`.
+
+    Their results are not known yet.
+    """
     if isinstance(value, Mapping):
         entries = {key: _known(entry, sequence) for key, entry in value.items()}
         return (
@@ -95,7 +100,10 @@ def _known(value: Any, sequence: type[list[Any]] | type[tuple[Any, ...]]) -> Any
 
 
 def validation_message(error: ValidationError, value: Any, name: str = "") -> str:
-    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value; `name` is the key of the value."""
+    """Return `KEY=VALUE must be ...` for the most deeply nested error in a value.
+
+    `name` is the key of the value.
+    """
     details = [(_path(detail["loc"], value), detail) for detail in error.errors(include_url=False)]
     path = max((path for path, _ in details), key=len)
     expected = []
@@ -130,7 +138,10 @@ def _path(location: Iterable[int | str], value: Any) -> tuple[int | str, ...]:
 
 
 def _parameters(target: Callable[..., Any]) -> list[inspect.Parameter] | None:
-    """Return the parameters of a target, including those that a class of this project passes on to its base class."""
+    """Return the parameters of a target.
+
+    They include those that a class of this project passes on to its base class.
+    """
     has_init = inspect.isclass(target) and target.__init__ is not object.__init__
     try:
         # The signature of a class with a metaclass, such as an env of TorchRL, is that of the

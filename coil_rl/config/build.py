@@ -143,7 +143,7 @@ def recorded(pictures: list[Picture]) -> dict[str, NestedKey]:
 
 
 def advises_only(config: DictConfig) -> bool:
-    """Return whether the env of the agent is that of its guides: a method adds only their advice."""
+    """Return whether all that a method adds to the env of its guides is their advice."""
     added = {get_object(node["_target_"]) for node in config.method.transforms.values()}
     return added == {GuideActions} and not config.degrade and not config.action
 
@@ -226,7 +226,10 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
 
 
 def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:
-    """Return the transforms of method, `degrade` if the method has any, `advice`, `action` and network."""
+    """Return the transforms of an env.
+
+    They are those of the method, `degrade` if the method has any, `advice`, `action` and network.
+    """
     transforms = build_all(config.method.transforms, "method.transforms")
     if transforms:
         transforms += build_all(config.degrade, "degrade")
@@ -244,7 +247,9 @@ def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:
 def build_learner(
     config: DictConfig, env: EnvBase, guides: Mapping[str, TensorDictModuleBase] | None = None
 ) -> Learner:
-    """Return the learner of a configuration, which observes `observes` and `method.observes` of an env.
+    """Return the learner of a configuration for an env.
+
+    It observes the entries `observes` and `method.observes`.
 
     `guides` are for a learner that trains guides.
     """

@@ -44,7 +44,10 @@ WATCHED = ("episode", "step")  # groups of `watch`
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration of a program that acts or trains."""
+    """Raise a `UserError` for the first mistake in a configuration.
+
+    It is of a program that acts or trains.
+    """
     check_parts(config)
     make_folder(Path(config.run_dir))
 

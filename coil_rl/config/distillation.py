@@ -86,7 +86,10 @@ def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
 
 
 def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictModuleBase]:
-    """Return the guides of a configuration, with an untrained proxy for each guide without parameters."""
+    """Return the guides of a configuration.
+
+    A guide without parameters is replaced by an untrained proxy.
+    """
     guides = build_guides(config)
     for name in guides_without_parameters(guides):
         proxy = proxy_config(config, name)

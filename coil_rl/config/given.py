@@ -34,8 +34,8 @@ def kept(name: str) -> Any:
     if name not in _objects:
         part = name.rpartition("#")[2]
         raise UserError(
-            f"this run was made in Python with an object as its {part}, which no import path names; "
-            f"open it in Python with coil_rl.open_run(FOLDER, {part}=OBJECT)"
+            f"this run was made in Python with an object as its {part}, which no import path "
+            f"names; open it in Python with coil_rl.open_run(FOLDER, {part}=OBJECT)"
         )
     return _objects[name]
 

@@ -148,7 +148,8 @@ def _guarded(folder: Path) -> Iterator[None]:
         raise UserError(f"run={folder} is its own guide; give a run that does not depend on itself")
     if len(_loading) == LONGEST_CHAIN:
         raise UserError(
-            f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a shorter one"
+            f"run={folder} ends a chain of more than {LONGEST_CHAIN} learned guides; give a "
+            "shorter one"
         )
     _loading.append(place)
     try:

@@ -52,7 +52,9 @@ def open_run(
 
 
 def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModuleBase]:
-    """Return the first guides of a run that trains its guides: the proxy of a guide if there is one.
+    """Return the first guides of a run that trains its guides.
+
+    The proxy of a guide takes its place, if there is one.
 
     Args:
         folder: of the run.

@@ -1,4 +1,7 @@
-"""Instantiation of nodes with a `_target_`, after a check of their arguments; the only caller of `instantiate`."""
+"""Instantiation of nodes with a `_target_`, after a check of their arguments.
+
+This is the only caller of Hydra's `instantiate`.
+"""
 
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
@@ -13,7 +16,9 @@ from coil_rl.errors import UserError
 
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
-    """Instantiate a node of the configuration, and the nodes inside it, after a check of its arguments.
+    """Instantiate a node of the configuration, and the nodes inside it.
+
+    Their arguments are checked first.
 
     A target that does not exist, refuses an argument, or returns another type is a `UserError`.
 
@@ -50,7 +55,9 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
 
 
 def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, Any]:
-    """Return a node with its references resolved after the checks of `build`, without building anything.
+    """Return a node with its references resolved, after the checks of `build`.
+
+    Nothing is built.
 
     `program` has the names of the arguments that the program adds.
     """
@@ -58,7 +65,8 @@ def check_node(node: Any, name: str, program: Iterable[str] = ()) -> dict[str, A
         node = OmegaConf.to_container(node, resolve=True, throw_on_missing=True)
     if not isinstance(node, Mapping) or "_target_" not in node:
         raise UserError(
-            f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or function"
+            f"{name}={yaml_text(node)} has no _target_; give it one, the full name of a class or "
+            "function"
         )
     _check(node, name, program)
     return dict(node)
@@ -76,7 +84,10 @@ def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:
-    """Return the class or function of a full name; `name` is the key that names it, for the message."""
+    """Return the class or function of a full name.
+
+    `name` is the key that names it, for the message.
+    """
     try:
         target: Callable[..., Any] = hydra.utils.get_object(path)
     except Exception as error:

@@ -1,4 +1,7 @@
-"""Runs from Python: the words of the command line as arguments, with objects where a name is not enough."""
+"""Runs from Python: the words of the command line as arguments.
+
+Where a name is not enough, an object may be given.
+"""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -141,7 +144,10 @@ def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConf
 
 @contextmanager
 def _own_hydra() -> Iterator[None]:
-    """Compose files of this package in the block, also inside a program of Hydra with its own files."""
+    """Compose files of this package in the block.
+
+    This works inside a program of Hydra with its own files, too.
+    """
     program = GlobalHydra.instance()
     outer = program.hydra
     program.clear()

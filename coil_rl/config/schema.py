@@ -29,7 +29,10 @@ def one_of(*choices: str) -> GetPydanticSchema:
 
 
 def format_of_numbers(spec: str) -> str:
-    """Return a format for numbers, as Python's `format` takes it, with a width of at most two digits."""
+    """Return a format for numbers, as Python's `format` takes it.
+
+    Its width has at most two digits.
+    """
     if not re.fullmatch(r"[+,]?\d{0,2}(\.\d)?[efg%]?", spec):
         raise PydanticCustomError("format", "a format of numbers, such as .1f")
     return spec
@@ -53,7 +56,9 @@ class NodeConfig:
 
 @dataclass
 class BudgetConfig(NodeConfig):
-    """Amount of experience: frames in total, envs in parallel, steps of each per batch, and minibatches per pass.
+    """Amount of experience.
+
+    It is frames in total, envs in parallel, steps of each per batch, and minibatches per pass.
 
     `stages` are earlier lengths, in frames, of a run that was made longer.
     """
@@ -67,7 +72,10 @@ class BudgetConfig(NodeConfig):
 
 @dataclass
 class CurveConfig(NodeConfig):
-    """Evaluation of the policies that a run keeps, see `coil_rl.run.curve`; `env` and `cases` are overrides."""
+    """Evaluation of the policies that a run keeps, see `coil_rl.run.curve`.
+
+    `env` and `cases` are overrides.
+    """
 
     points: Annotated[int, Field(ge=1, le=1000)] = 16
     batches: Annotated[int, Field(ge=1, le=1000)] = 1
@@ -79,7 +87,10 @@ class CurveConfig(NodeConfig):
 
 @dataclass
 class TrainingConfig(NodeConfig):
-    """Training values for an env, and overrides of `env` in training; `imitation_env` is for methods that imitate."""
+    """Training values for an env, and overrides of `env` in training.
+
+    `imitation_env` is for methods that imitate.
+    """
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
     noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
@@ -125,7 +136,10 @@ class EvaluationConfig(NodeConfig):
 
 @dataclass
 class MethodConfig(NodeConfig):
-    """Transforms of the agent, the kind of its learner, and what it observes besides the env's entries."""
+    """A method: transforms of the agent, the kind of its learner, and what it observes.
+
+    `observes` are entries besides those of the env.
+    """
 
     name: str = MISSING
     observes: list[Any] | None = MISSING  # None: no agent
@@ -245,7 +259,10 @@ class ReportConfig(ProgramConfig):
 
 
 def fingerprint(config: DictConfig) -> str:
-    """Return ten hexadecimal digits that identify the numbers of a run, also while Hydra composes its configuration."""
+    """Return ten hexadecimal digits that identify the numbers of a run.
+
+    They are known while Hydra composes its configuration, too.
+    """
     identity: dict[str, Any] = {}
     for key in sorted(map(str, config)):
         if key in (*IGNORED_KEYS, "hydra"):
@@ -258,7 +275,10 @@ def fingerprint(config: DictConfig) -> str:
 
 
 def agent_label(config: DictConfig) -> str:
-    """Return the default label of a run: the method, and the learner unless it is PPO or the method's own."""
+    """Return the default label of a run: the method, and the learner.
+
+    PPO, and the learner of the method itself, are left out.
+    """
     name = str(config.method.name)
     if OmegaConf.is_missing(config, "learner") or config.method.learner != "agent":
         return name

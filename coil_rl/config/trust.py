@@ -1,4 +1,6 @@
-"""The gate for received run folders: what a `config.yaml` that somebody else may have written can name.
+"""The gate for received run folders: what a `config.yaml` can name.
+
+Somebody else may have written it.
 
 Instantiating a configuration calls whatever its `_target_` keys name, and imports what `of` of a
 controller, the `controllers` of an env and the `id` of a Gymnasium env name as `MODULE:NAME`. So
@@ -59,7 +61,9 @@ _own: frozenset[str] = frozenset()  # targets in the configuration of the comman
 
 
 def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -> None:
-    """Let the run folders that this process reads from here on use parts of these packages, and of no others.
+    """Let the run folders that this process reads from here on use parts of packages.
+
+    They may use parts of no others.
 
     A folder may call everything that is defined in these packages.
 
@@ -75,11 +79,13 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
     for name in names:
         if not name.isidentifier():
             raise UserError(
-                f"trust=[{name}] must be a list of names of installed packages, such as trust=[my_package]"
+                f"trust=[{name}] must be a list of names of installed packages, such as "
+                "trust=[my_package]"
             )
         if name in NEVER_TRUSTED:
             raise UserError(
-                f"trust=[{name}] cannot be: functions of {name} run any code; name the package of the part"
+                f"trust=[{name}] cannot be: functions of {name} run any code; name the package of "
+                "the part"
             )
     _packages = frozenset(names)
     _own = frozenset() if command is None else _targets(command)
@@ -100,7 +106,9 @@ def _targets(config: DictConfig) -> frozenset[str]:
 
 
 def check_config(config: DictConfig, path: Path) -> None:
-    """Raise a `UserError` for anything in the configuration of a folder that could run code or write elsewhere.
+    """Check a configuration that somebody else may have written.
+
+    Anything that could run code or write elsewhere is a `UserError`.
 
     Nothing is resolved, and nothing is imported but packages that the user trusts.
     """

@@ -60,4 +60,7 @@ def _unknown_key(config: DictConfig, *path: str) -> str:
     name = ".".join(parents)
     node = OmegaConf.select(config, name) if name else config
     known = [field.name for field in fields(OmegaConf.get_type(node)) if field.name != "defaults"]  # type: ignore[arg-type]
-    return f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}{did_you_mean(key, known)}"
+    return (
+        f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}"
+        f"{did_you_mean(key, known)}"
+    )

@@ -130,7 +130,7 @@ class ControllerGuide(TensorDictModuleBase):
     | it is | it becomes |
     | --- | --- |
     | a TensorDictModule, or a class of such | the guide itself, with its own `in_keys` |
-    | another `nn.Module`, or a class of such | a network from the entries [B, N] to actions [B, A] |
+    | another `nn.Module`, or a class of such | a network: entries [B, N] to actions [B, A] |
     | a class with a method `act` | `PerRow`: one object for each row of the env |
     | an object with a method `act` | `PerRow`: one copy for each row of the env |
     | a function | `FunctionGuide`: of one observation, or of a batch of them |

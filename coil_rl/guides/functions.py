@@ -13,7 +13,9 @@ from coil_rl.transforms.action_space import nested_key
 
 
 class FunctionGuide(TensorDictModuleBase):
-    """A function as a guide: it gets the observations of all rows at once, or of one row after the other.
+    """A function as a guide, of one observation or of a batch of them.
+
+    It gets the observations of all rows at once, or of one row after the other.
 
     A function for a batch gets tensors [B, N] and returns actions [B, A]. One for a single
     observation gets NumPy arrays [N] and returns an action [A], a number or an index. Which of the

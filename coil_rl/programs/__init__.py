@@ -1,4 +1,7 @@
-"""The console programs. Modules here import torch and all that depends on it only inside their functions."""
+"""The console programs.
+
+Modules here import torch, and all that depends on it, only inside their functions.
+"""
 
 import os
 import signal

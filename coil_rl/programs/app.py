@@ -1,4 +1,6 @@
-"""Frame of the console programs: Hydra composes the configuration, and a mistake of the user becomes one sentence.
+"""Frame of the console programs.
+
+Hydra composes the configuration, and a mistake of the user becomes one sentence.
 
 A program imports torch, and whatever imports it, inside its functions. Help texts and wrong
 overrides then take a second:
@@ -49,7 +51,10 @@ _interrupts: list[int] = []  # signals of this program
 
 
 class NewFolders(Callback):
-    """Record the folders that Hydra is about to make, because it makes them before the configuration is checked."""
+    """Record the folders that Hydra is about to make.
+
+    It makes them before the configuration is checked.
+    """
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Record the folder of a run."""
@@ -106,7 +111,10 @@ def check_used(used: Iterable[str], reason: str) -> None:
 
 
 def check_run(config: DictConfig) -> None:
-    """Check everything that a run needs, unless it is finished; see `coil_rl.config.check.check`."""
+    """Check everything that a run needs, unless it is finished.
+
+    See `coil_rl.config.check.check`.
+    """
     from coil_rl.config.saved import holds
     from coil_rl.run.folder import is_evaluated
 

@@ -26,7 +26,7 @@ OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `t
 
 
 def evaluate(config: DictConfig) -> float:
-    """Evaluate the configured run or guides, and return the mean reward of the deterministic policy."""
+    """Evaluate a run or guides; return the mean reward of the deterministic policy."""
     import torch
 
     from coil_rl.config.build import assemble, env_maker, trial
@@ -81,7 +81,10 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 
 
 def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> list[str]:
-    """Return the keys of `evaluation` that the command line changes; set the tracks that it gives."""
+    """Return the keys of `evaluation` that the command line changes.
+
+    The tracks that it gives are set.
+    """
     from coil_rl.errors import UserError
 
     changed = list(OWN)
@@ -97,7 +100,10 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
 
 
 def check(config: DictConfig) -> None:
-    """Raise a `UserError` for the first mistake in the configuration, and make the folder of the results."""
+    """Raise a `UserError` for the first mistake in the configuration.
+
+    Otherwise make the folder of the results.
+    """
     given = config.run is not None
     reason = (
         f"run={config.run} has its own configuration"

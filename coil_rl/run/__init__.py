@@ -1,1 +1,4 @@
-"""One training run: its envs, rollouts, training loop, evaluation, checkpoints and folder; without YAML."""
+"""One training run, without YAML.
+
+Its envs, rollouts, training loop, evaluation, checkpoints and folder are here.
+"""

@@ -27,7 +27,10 @@ def save(state: Any, path: Path) -> None:
 
 
 def load(path: Path, device: str = "cpu") -> Any:
-    """Read a state without running code; a file that is not exactly what `save` wrote is a `UserError`."""
+    """Read a state without running code.
+
+    A file that is not exactly what `save` wrote is a `UserError`.
+    """
     if not path.is_file():
         raise UserError(
             f"there is no file {path}; give the folder of a run that coil-train has finished"
@@ -44,7 +47,10 @@ def load(path: Path, device: str = "cpu") -> Any:
 
 
 def save_newest(state: Any, folder: Path) -> None:
-    """Write the checkpoint of a run and keep the previous one; at any moment one of the two is intact."""
+    """Write the checkpoint of a run and keep the previous one.
+
+    At any moment one of the two is intact.
+    """
     content = _content(state)
     with whole_file(folder / NEWEST) as unfinished:
         unfinished.write_bytes(content)
@@ -53,7 +59,9 @@ def save_newest(state: Any, folder: Path) -> None:
 
 
 def load_newest(folder: Path) -> Any | None:
-    """Return the newest checkpoint of a run, or the previous one if it is damaged; None before the first one.
+    """Return the newest checkpoint of a run; None before the first one.
+
+    If it is damaged, the previous one is returned.
 
     The use of the previous one is reported on standard error. If both are damaged, that is a
     `UserError`.

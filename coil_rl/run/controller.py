@@ -26,7 +26,7 @@ from coil_rl.transforms import GuideActions
 
 
 class Controller:
-    """A trained policy with the face of a controller: `act(observation)` returns the executed action.
+    """A trained policy as a controller: `act(observation)` returns the executed action.
 
     Actions are deterministic. Call `reset()` at the start of each episode.
 

@@ -114,7 +114,10 @@ class Totals:
         self.state: dict[str, tuple[Tensor, Tensor]] = {}
 
     def add(self, after: TensorDictBase, running: Tensor) -> None:
-        """Add the entries after a step of the rows that are `running`, one flag a row; several agents' are summed."""
+        """Add the entries after a step of the rows that are `running`.
+
+        There is one flag a row. Entries of several agents are summed.
+        """
         running = running.reshape(-1)
         self.steps = self.steps.to(running.device) + running.long()
         for reduction, names in self.groups.items():
@@ -169,7 +172,9 @@ def episodes(
     sampled: bool | Tensor = False,
     tick: Callable[[], Any] | None = None,
 ) -> Iterator[tuple[TensorDictBase, Tensor]]:
-    """Yield the entries after each step of one episode on every row, and whether the row was still in it, [*B, 1].
+    """Yield the entries after each step of one episode on every row.
+
+    With them comes whether the row was still in its episode, [*B, 1].
 
     Arguments as for `evaluate_policy`.
     """

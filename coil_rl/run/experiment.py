@@ -89,7 +89,9 @@ class Experiment:
         return self.stage_updates[-1]
 
     def resume(self) -> None:
-        """Continue from the last intact checkpoint of the folder, or from the beginning without one.
+        """Continue from the last intact checkpoint of the folder.
+
+        Without a checkpoint the run begins anew.
 
         Raises:
             UserError: if the checkpoint or the log is damaged, or belongs to another run.

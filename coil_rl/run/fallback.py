@@ -1,4 +1,7 @@
-"""Fallback at test time: the guide acts where the agent's critic values a state less than those of the guide."""
+"""Fallback at test time: the guide acts where the agent's critic expects little.
+
+That is where it values a state less than those that the guide visits.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +26,9 @@ LEAVE, BACK = 0.01, 0.05  # shares of the guide's states that are worth less tha
 
 
 class Fallback(TensorDictModuleBase):
-    """Policy that leaves steps to the first guide by the values of a critic, with hysteresis (after CALF, 2025).
+    """Policy that leaves steps to the first guide by the values of a critic.
+
+    It has a hysteresis (after CALF, 2025).
 
     The guide acts from a state on that is worth less than `leave`, until one is worth at least
     `back`. It serves for one episode of each row. The policy is that of the agent, the critic

@@ -89,7 +89,10 @@ def weights_file(folder: Path, which: str = "last") -> Path:
 def check_same(
     saved: Mapping[str, Any], requested: Mapping[str, Any], holder: str, remedy: str
 ) -> None:
-    """Raise a `UserError` if two results of `flat` differ; the message begins with the holder of the first one."""
+    """Raise a `UserError` if two configurations differ.
+
+    The message begins with the holder of the first one.
+    """
     for key in dict.fromkeys([*saved, *requested]):
         if saved.get(key) != requested.get(key):
             raise UserError(
@@ -108,7 +111,10 @@ def is_evaluated(folder: Path) -> bool:
 
 
 def report_changed_versions(folder: Path) -> None:
-    """Print one line on standard error if a run was begun with other versions of Python or of the packages."""
+    """Say on standard error if a run was begun with other versions.
+
+    They are the versions of Python and of the packages.
+    """
     try:
         begun = dict(json.loads((folder / "versions.json").read_text()))
     except (OSError, TypeError, ValueError):

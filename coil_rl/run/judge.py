@@ -328,7 +328,9 @@ def evaluate_guides(
     guides: Mapping[str, TensorDictModuleBase],
     count: int | None = None,
 ) -> dict[str, EvaluationResult]:
-    """Evaluate each guide alone, once in each case of the test; return the results by `guide_titles`.
+    """Evaluate each guide alone, once in each case of the test.
+
+    The results have the names of `guide_titles`.
 
     Args:
         make_env: makes the env.

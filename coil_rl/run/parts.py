@@ -56,7 +56,9 @@ class EnvMaker:
         *,
         count: int | None = None,
     ) -> EnvBase:
-        """Return an env with all transforms; it also writes the sum of the rewards, `episode_reward`.
+        """Return an env with all transforms.
+
+        It also writes the sum of the rewards, `episode_reward`.
 
         Args:
             rows: number of rows; None: as many as a training has.
@@ -82,7 +84,9 @@ class EnvMaker:
         *,
         count: int | None = None,
     ) -> tuple[EnvBase, TensorDictModuleBase]:
-        """Return an env in which the guides act alone, with degraded advice, and the policy that does so.
+        """Return an env in which the guides act alone, and the policy that does so.
+
+        Their advice is degraded as the run says.
 
         Args:
             rows: number of rows for each guide. Those of the first guide come first.

@@ -1,4 +1,7 @@
-"""Faster evaluation of policies: several in one batch, and operations that are traced once and repeated."""
+"""Faster evaluation of policies.
+
+Several act in one batch, and their operations are traced once and repeated.
+"""
 
 import copy
 from collections.abc import Callable, Sequence
@@ -21,13 +24,19 @@ def policy_batch(
 
 
 def is_tensors(policy: TensorDictModuleBase) -> bool:
-    """Return whether a policy has no state but its parameters and buffers, and no memory within an episode."""
+    """Return whether a policy has no state but its parameters and buffers.
+
+    It has no memory within an episode, either.
+    """
     tensors = {name for name, _ in [*policy.named_parameters(), *policy.named_buffers()]}
     return tensors == set(policy.state_dict()) and not memory_keys(policy)
 
 
 def memory_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
-    """Return the entries that a policy writes for its next step, `("next", ...)`; none without a memory."""
+    """Return the entries that a policy writes for its next step, `("next", ...)`.
+
+    There are none without a memory.
+    """
     return [key for key in policy.out_keys if isinstance(key, tuple) and key[0] == "next"]
 
 
@@ -63,7 +72,10 @@ class TracedPolicy(TensorDictModuleBase):
 
 
 class StackedPolicies(TracedPolicy):
-    """Copies of a policy with different weights, computed in one batch, each for its own part of the rows."""
+    """Copies of a policy with different weights, computed in one batch.
+
+    Each acts on its own part of the rows.
+    """
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__(copy.deepcopy(policy))
@@ -80,7 +92,10 @@ class StackedPolicies(TracedPolicy):
 
 
 class PoliciesInTurn(TensorDictModuleBase):
-    """Copies of any policy with different states, called in turn, each for its own part of the rows."""
+    """Copies of any policy with different states, called in turn.
+
+    Each acts on its own part of the rows.
+    """
 
     def __init__(self, policy: TensorDictModuleBase, states: Sequence[dict[str, Any]]) -> None:
         super().__init__()

@@ -33,7 +33,8 @@ class Rollout:
     Example:
         >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
         >>> from coil_rl.guides import SplineGuide
-        >>> Rollout(ConeTrackEnv(shipped_tracks("train"), 8), SplineGuide(), steps=4).collect().shape
+        >>> env = ConeTrackEnv(shipped_tracks("train"), 8)
+        >>> Rollout(env, SplineGuide(), steps=4).collect().shape
         torch.Size([8, 4])
     """
 
@@ -63,7 +64,9 @@ class Rollout:
 
     @torch.no_grad()
     def collect(self, progress: float = 0.0) -> TensorDictBase:
-        """Return the next batch, [B, T]; `progress` is the finished share of the run, for the schedules of transforms.
+        """Return the next batch, [B, T].
+
+        `progress` is the finished share of the run, for the schedules of transforms.
 
         A number that is NaN or infinite is a `UserError` with its entry, step and row.
         """
@@ -91,7 +94,10 @@ class Rollout:
         return batch
 
     def _with_noise(self, carrier: TensorDictBase) -> TensorDictBase:
-        """Write the exploration noise of the next step, which is correlated with that of the step before."""
+        """Write the exploration noise of the next step.
+
+        It is correlated with that of the step before.
+        """
         if (spec := self.noise_spec) is None:
             return carrier
         share, fresh = (
@@ -122,7 +128,10 @@ class Rollout:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore what `state_dict` returned; new episodes begin where the env or a guide cannot go on with its own."""
+        """Restore what `state_dict` returned.
+
+        New episodes begin where the env or a guide cannot go on with its own.
+        """
         self.base_env.load_state_dict(state["env"])
         if self.base_env is not self.env:
             self.env.load_state_dict(state["transforms"])

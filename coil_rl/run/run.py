@@ -146,7 +146,9 @@ class Run:
         return self.make_trial()
 
     def train(self, frames: int | None = None) -> Run:
-        """Train to the end, evaluate, and return the run; one that was stopped or is shorter goes on.
+        """Train to the end, evaluate, and return the run.
+
+        A run that was stopped, or is shorter, goes on.
 
         Args:
             frames: new length of the run. Schedules over the run, such as a learning rate, then
@@ -167,7 +169,7 @@ class Run:
         return self
 
     def resume(self) -> float:
-        """Finish a run that was stopped; return the mean test reward of its deterministic policy."""
+        """Finish a run that was stopped; return the mean test reward of its policy."""
         with locked(self.folder):
             return self.finish_begun()
 
@@ -175,7 +177,8 @@ class Run:
         """Evaluate the policy and the guides, and return the rows of `evaluation.csv`.
 
         Args:
-            cases: number of cases, for an env whose cases are numbered; by default those of the run.
+            cases: number of cases, for an env whose cases are numbered; by default those of the
+                run.
             folder: for tables and pictures; by default they are not kept.
 
         Raises:
@@ -189,7 +192,7 @@ class Run:
         return pd.DataFrame(judgement.table)
 
     def controller(self, which: str | None = None) -> Controller:
-        """Return what a machine is sent: the whole policy, with guide, normaliser and memory inside.
+        """Return what a machine is sent: the policy with guide, normaliser and memory inside.
 
         Args:
             which: policy, "last" or "best" of the kept ones; by default the one that is evaluated.
@@ -201,7 +204,7 @@ class Run:
         return Controller(env, self.load_policy(env, which or self.which), self.folder)
 
     def policy(self, env: EnvBase | None = None, which: str | None = None) -> Any:
-        """Return the policy of a finished run for an env with its transforms; None without an agent.
+        """Return the policy of a finished run for an env; None without an agent.
 
         Args:
             env: of the run, such as `run.make_env(rows)`; by default a new one.
@@ -247,7 +250,7 @@ class Run:
         )
 
     def finish_begun(self) -> float:
-        """Finish the run in the folder, and return the mean test reward of its deterministic policy.
+        """Finish the run in the folder, and return the mean test reward of its policy.
 
         Raises:
             UserError: if its configuration was edited since it began.
@@ -258,7 +261,10 @@ class Run:
         return self.finish(resumed=True)
 
     def check_unchanged(self) -> None:
-        """Raise a `UserError` if the configuration of a trained run is not that of its checkpoint."""
+        """Check that the configuration of a trained run is that of its checkpoint.
+
+        Another one is a `UserError`.
+        """
         state = checkpoint.load_newest(self.folder)
         if state is not None:
             newest = self.folder / checkpoint.NEWEST
@@ -430,7 +436,10 @@ class Run:
             raise UserError(f"run {self.folder}: {error}") from error
 
     def make_fallback(self, policy: TensorDictModuleBase | None) -> Fallback:
-        """Return the policy of the run with its first guide to fall back to, see `make_fallback`."""
+        """Return the policy of the run with its first guide to fall back to.
+
+        Errors are those of `make_fallback`.
+        """
         return make_fallback(policy, self.make_env, self.make_learner, self.folder, self.device)
 
     def _settings_of_parts(self) -> dict[str, Any]:
@@ -490,7 +499,10 @@ class GuideReturns:
 def guide_returns(
     make_env: EnvMaker, guides: Mapping[str, TensorDictModuleBase]
 ) -> dict[str, float]:
-    """Return the mean return of each guide in the cases of the curve; empty without cases or guides."""
+    """Return the mean return of each guide in the cases of the curve.
+
+    It is empty without cases or guides.
+    """
     if EVALUATION not in make_env.sizes or not guides:
         return {}
     env, policy = make_env.guided(make_env.sizes[EVALUATION], EVALUATION, guides)

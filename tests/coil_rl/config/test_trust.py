@@ -17,16 +17,19 @@ from coil_rl.run import folder as run_folder
 from coil_rl.run.folder import begin
 
 CODE = """
-    os.system os.popen os.execv posix.system subprocess.run subprocess.Popen subprocess.check_output builtins.eval
-    builtins.exec builtins.open builtins.__import__ builtins.getattr joblib.load torch.load torch.save torch.compile
-    torch.hub.load torch.utils.collect_env.run torch.utils.cpp_extension.load_inline numpy.load numpy.save
-    numpy.distutils.exec_command.exec_command distutils.spawn.spawn sympy.sympify shutil.copyfile shutil.rmtree
-    pickle.loads marshal.loads importlib.import_module runpy.run_path pydoc.locate hydra.utils.call
-    hydra.utils.get_method hydra.utils.instantiate timeit.timeit code.interact pty.spawn webbrowser.open ctypes.CDLL
-    pathlib.Path.write_text functools.partial operator.methodcaller antigravity.this pandas.read_pickle
-    omegaconf.OmegaConf.save tensordict.load sklearn.utils.fixes.os.system torchrl.envs.GymEnv cloudpickle.loads
-    coil_rl.programs.app.os.system coil_rl.programs.app.shutil.rmtree coil_rl.files.write_text coil_rl.envs.save_track
-    coil_rl.envs.save_drive coil_rl.envs.RecordingWriter coil_rl.config.start.run_configured coil_rl.config.trust.trust_packages
+    os.system os.popen os.execv posix.system subprocess.run subprocess.Popen subprocess.check_output
+    builtins.eval builtins.exec builtins.open builtins.__import__ builtins.getattr joblib.load
+    torch.load torch.save torch.compile torch.hub.load torch.utils.collect_env.run
+    torch.utils.cpp_extension.load_inline numpy.load numpy.save
+    numpy.distutils.exec_command.exec_command distutils.spawn.spawn sympy.sympify shutil.copyfile
+    shutil.rmtree pickle.loads marshal.loads importlib.import_module runpy.run_path pydoc.locate
+    hydra.utils.call hydra.utils.get_method hydra.utils.instantiate timeit.timeit code.interact
+    pty.spawn webbrowser.open ctypes.CDLL pathlib.Path.write_text functools.partial
+    operator.methodcaller antigravity.this pandas.read_pickle omegaconf.OmegaConf.save
+    tensordict.load sklearn.utils.fixes.os.system torchrl.envs.GymEnv cloudpickle.loads
+    coil_rl.programs.app.os.system coil_rl.programs.app.shutil.rmtree coil_rl.files.write_text
+    coil_rl.envs.save_track coil_rl.envs.save_drive coil_rl.envs.RecordingWriter
+    coil_rl.config.start.run_configured coil_rl.config.trust.trust_packages
     coil_rl.guides.SplineGuide.__init__ coil_rl.guides.spline.math.sqrt сoil_rl.guides.SplineGuide
     torchrl.record.loggers.WandbLogger
 """.split()  # noqa: SIM905
@@ -309,7 +312,8 @@ def package(tmp_path, monkeypatch):
     """Make a package that could be installed, and return its folder."""
     folder = tmp_path / "site"
     (folder / "their_package").mkdir(parents=True)
-    source = "import os\nfrom coil_rl.guides import ZeroGuide\n\nclass TheirGuide(ZeroGuide):\n    pass\n"
+    source = "import os\nfrom coil_rl.guides import ZeroGuide\n\n"
+    source += "class TheirGuide(ZeroGuide):\n    pass\n"
     (folder / "their_package" / "__init__.py").write_text(source)
     monkeypatch.syspath_prepend(folder)
     monkeypatch.delitem(sys.modules, "their_package", raising=False)  # of another test
