@@ -10,7 +10,8 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
 
-from coil_rl.errors import UserError, did_you_mean
+from coil_rl.config.hints import similar
+from coil_rl.errors import UserError
 
 PLAIN = (bool, int, float, str, NoneType)
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
@@ -42,7 +43,7 @@ def check_arguments(
         if not accepts_any or key.startswith("_"):
             takes = ", ".join(known) or "nothing"
             raise UserError(
-                f"{name}: {title} takes no {key}; it takes {takes}{did_you_mean(key, known)}"
+                f"{name}: {title} takes no {key}; it takes {takes}{similar(key, known)}"
             )
     missing = [
         key for key, p in known.items() if p.default is p.empty and key not in {*given, *program}

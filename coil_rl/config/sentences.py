@@ -1,9 +1,14 @@
 """One sentence for an error of the user, of Hydra or of OmegaConf."""
 
 import errno
+import re
 from pathlib import Path
 
-from hydra.errors import MissingConfigException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, MissingMandatoryValue, OmegaConf
 from omegaconf.errors import (
     ConfigAttributeError,
@@ -12,7 +17,9 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean
+from coil_rl.config import hints
+from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError
+from coil_rl.run.folder import is_begun
 
 # Launchers of Hydra, and the extra of the package that installs each.
 LAUNCHERS = {
@@ -21,6 +28,13 @@ LAUNCHERS = {
     "submitit_local": "slurm",
     "ray": "ray",
 }
+
+
+TYPED = re.compile(r"Could not override '([^']+)'")
+NO_INTEGER = re.compile(
+    r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
+    re.DOTALL,
+)
 
 
 def is_no_bug(error: BaseException) -> bool:
@@ -51,18 +65,40 @@ def _message(error: BaseException) -> str:
             "the command line cannot be composed; give each group a name, GROUP=CHOICE (see --help)"
         )
     if isinstance(error, OverrideParseException):
-        return (
-            f"{error.override!r} cannot be parsed; "
-            "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
-        )
+        return _unreadable_override(error)
+    return _not_composed(error)
+
+
+def _not_composed(error: BaseException) -> str:
+    """Return the message for keys and values that do not fit the schema."""
+    if isinstance(error, ConfigCompositionException):
+        without_package = hints.file_without_package(str(error))
+        if without_package:
+            return without_package
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
-            return _unknown_key(key_error)
+            return _unknown_key(key_error, TYPED.search(str(error)))
+    number = NO_INTEGER.search(str(error))
+    if number is not None and float(number[2]).is_integer():
+        return (
+            f"{number[1]}={number[2]} must be a whole number; "
+            f"write {number[1]}={int(float(number[2])):_}"
+        )
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return _wrong_value(error, error.full_key)
     if isinstance(error.__cause__, OmegaConfBaseException):
         return f"{_first_paragraph(error)}: {_first_paragraph(error.__cause__)}"
     return _first_paragraph(error)
+
+
+def _unreadable_override(error: OverrideParseException) -> str:
+    """Return the message for an argument that is no KEY=VALUE."""
+    if is_begun(Path(error.override)):
+        return f"{error.override!r} is the folder of a run; write run={error.override} (see --help)"
+    return (
+        f"{error.override!r} cannot be parsed; "
+        "write KEY=VALUE, and quote special characters: 'KEY=\"VALUE\"'"
+    )
 
 
 def _unusable_file(error: OSError) -> str:
@@ -92,26 +128,29 @@ def _unknown_file(error: MissingConfigException) -> str:
         )
     options = sorted(error.options or [])
     if not options:
-        return f"there is no {group}={name}"
+        return f"there is no {group}={name}{hints.choice(group, name, options)}"
     return (
         f"there is no {group}={name}; "
-        f"{group} can be {', '.join(options)}{did_you_mean(name, options)}"
+        f"{group} can be {', '.join(options)}{hints.choice(group, name, options)}"
     )
 
 
-def _unknown_key(error: OmegaConfBaseException) -> str:
-    """Return the message for a key that the configuration does not have."""
+def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> str:
+    """Return the message for a key that the configuration does not have.
+
+    `typed` is what was typed, where the key is only its first part.
+    """
     key, parent = str(error.full_key or error.key), error.parent_node
     names = parent if isinstance(parent, DictConfig) else []
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
-    add = ""
-    if parent is not None and OmegaConf.get_type(parent) is dict:
-        add = f"; +{key}=VALUE adds it"
-    return (
-        f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}"
-        f"{did_you_mean(str(error.key), known)}"
-    )
+    hint = hints.similar(str(error.key), known)
+    if not hint and parent is not None:
+        hint = hints.where(typed[1] if typed else key, parent._get_root())
+    # The arguments of a part are all in its node.
+    takes_any = parent is not None and OmegaConf.get_type(parent) is dict
+    add = f"; +{key}=VALUE adds it" if takes_any and "_target_" not in names else ""
+    return f"there is no key {key}; {node} has {', '.join(known) or 'none'}{add}{hint}"
 
 
 def _wrong_value(error: OmegaConfBaseException, key: str) -> str:

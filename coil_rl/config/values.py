@@ -9,7 +9,8 @@ from omegaconf import DictConfig, OmegaConf
 from pydantic import TypeAdapter, ValidationError
 
 from coil_rl.config.arguments import validation_message
-from coil_rl.errors import UserError, did_you_mean
+from coil_rl.config.hints import similar
+from coil_rl.errors import UserError
 
 LARGEST_BATCH = 2**28  # frames
 
@@ -62,5 +63,5 @@ def _unknown_key(config: DictConfig, *path: str) -> str:
     known = [field.name for field in fields(OmegaConf.get_type(node)) if field.name != "defaults"]  # type: ignore[arg-type]
     return (
         f"there is no key {key}; {name or 'the configuration'} has {', '.join(known)}"
-        f"{did_you_mean(key, known)}"
+        f"{similar(key, known)}"
     )

@@ -1,14 +1,52 @@
-"""`coil-info`: print the versions that a bug report needs."""
+"""`coil-info`: print the versions that a bug report needs, or the command that made a run."""
 
-from coil_rl.run.folder import versions
+import json
+import sys
+from pathlib import Path
+
+from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.run.folder import COMMAND, is_begun, versions
+
+
+def describe(folder: Path) -> dict[str, str]:
+    """Return the command that made a run, and the versions that it was begun with.
+
+    Args:
+        folder: of the run.
+
+    Raises:
+        UserError: if there is no run, or its file of versions is damaged.
+    """
+    if not is_begun(folder):
+        raise UserError(f"run={folder} is not the folder of a run: it has no config.yaml")
+    command = folder / COMMAND
+    made = "not known: the run was not made on a command line"
+    if command.exists():
+        made = command.read_text(encoding="utf-8").strip()
+    file = folder / "versions.json"
+    begun = {}
+    if file.exists():
+        with file_of_a_run(file, "remove it"):
+            begun = {str(name): str(value) for name, value in json.loads(file.read_text()).items()}
+    return {"command": made, **begun}
 
 
 def main() -> None:
-    """Print a version a line."""
-    result = versions()
+    """Print one name and its value a line."""
+    arguments = sys.argv[1:]
+    try:
+        if not arguments:
+            result = versions()
+        elif len(arguments) == 1 and arguments[0].startswith("run="):
+            result = describe(Path(arguments[0].removeprefix("run=")).expanduser())
+        else:
+            raise UserError(f"{' '.join(arguments)}: coil-info takes nothing, or run=FOLDER")
+    except UserError as error:
+        print(f"info: {error}", file=sys.stderr)
+        sys.exit(2)
     width = max(map(len, result))
-    for name, version in result.items():
-        print(f"{name:{width}}  {version}")
+    for name, value in result.items():
+        print(f"{name:{width}}  {value}")
 
 
 if __name__ == "__main__":

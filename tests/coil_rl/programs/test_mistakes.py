@@ -49,7 +49,7 @@ def started(monkeypatch, tmp_path):
 
 def files():
     paths = {str(path) for path in Path().rglob("*")}
-    return {path for path in paths if not path.startswith(".hypothesis")}
+    return {path for path in paths if not path.startswith((".hypothesis", ".git"))}
 
 
 def refusal(name, *arguments):
