@@ -44,6 +44,8 @@ def similar(given: str, known: Iterable[str]) -> str:
         given: the unknown name.
         known: the names that exist.
     """
+    if given == "run":
+        return "; to go on with a run write resume=FOLDER"
     known = list(known)
     other = OTHER_NAMES.get(given)
     return f"; did you mean {other}?" if other in known else did_you_mean(given, known)
@@ -56,8 +58,6 @@ def where(key: str, root: Any) -> str:
         key: the full key that does not exist.
         root: the whole configuration.
     """
-    if key == "run":
-        return "; to go on with a run write resume=FOLDER"
     if not isinstance(root, DictConfig):
         return ""
     group, _, last = key.rpartition(".")

@@ -78,7 +78,7 @@ def _not_composed(error: BaseException) -> str:
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
             return _unknown_key(key_error, TYPED.search(str(error)))
-    number = NO_INTEGER.search(str(error))
+    number = NO_INTEGER.search(f"{error} {error.__cause__}")
     if number is not None and float(number[2]).is_integer():
         return (
             f"{number[1]}={number[2]} must be a whole number; "

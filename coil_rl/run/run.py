@@ -92,7 +92,8 @@ class Run:
         logger: makes a TorchRL logger, in addition to the CSV file.
         callbacks: makes further callbacks for a learner; `GuideReturns` for one that trains guides.
         prepare: called before the training, for what the learner needs.
-        init: policy file that the run begins with, instead of random weights.
+        init: folder of a run whose last policy, with its normaliser, this one begins with, instead
+            of random weights.
         which: policy that is evaluated, "last" or "best" of the kept ones.
         fallback: whether to evaluate the policy also with its guide to fall back to.
         compiled: whether to compile the steps of env and guides where they can be.
@@ -346,7 +347,7 @@ class Run:
         """Return the run's own copy of the policy that it begins with."""
         copy = self.folder / INIT
         if not copy.exists():
-            checkpoint.save(checkpoint.load(Path(self.init or "")), copy)
+            checkpoint.save(checkpoint.load(weights_file(Path(self.init or ""))), copy)
         return copy
 
     def selection(self, learner: Learner) -> SelectionCases:

@@ -1,0 +1,247 @@
+"""Runs from Python: the lines of the docs on a stranger's package, and what an object may be."""
+
+import csv
+import math
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from outside_package.install import SOURCE
+from programs import called
+
+import coil_rl
+from coil_rl.config import given
+from coil_rl.run import checkpoint
+
+ENV = "thermostat:Room-v0"
+SMALL = ["budget.num_envs=2", "budget.steps=16", "learner.minibatches=2", "logger=none"]
+SMALL += ["evaluation.cases=2", "evaluation.curve.num_envs=2", "evaluation.curve.points=2"]
+SMALL += ["checkpoint_every=1", "evaluation.gif=false"]
+
+
+@pytest.fixture(autouse=True)
+def package(monkeypatch, tmp_path):
+    """Make the user's package importable, as one that is installed, and work in a folder."""
+    monkeypatch.syspath_prepend(SOURCE)
+    monkeypatch.chdir(tmp_path)
+
+
+def rows(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_nine_lines_of_the_docs(tmp_path):
+    from thermostat.control import PI
+
+    observation = np.array([-6.0, 3.0], np.float32)
+    small = ["learner.anchor.looks=1", "learner.anchor.cases=2", *SMALL]
+
+    run = coil_rl.train(
+        ENV,
+        guide=PI,
+        method="coil_anchored",
+        frames=64,
+        seed=0,
+        folder="outputs/room",
+        overrides=small,
+    )
+    table = run.evaluate(cases=3)
+    controller = coil_rl.open_run("outputs/room").controller()
+    controller.reset()
+    action = controller.act(observation)
+    run.train(frames=96)
+
+    assert isinstance(table, pd.DataFrame)
+    deterministic = table[table["actions"] == "deterministic"]
+    assert list(deterministic["case"]) == ["0", "1", "2", "mean"] * 2
+    assert action.shape == (1,)
+    assert 0 <= action[0] <= 1
+    metrics = rows(tmp_path / "outputs" / "room" / "metrics.csv")
+    assert [int(float(row["frames"])) for row in metrics] == [0, 32, 64, 96]
+    # A run that was made in Python is a run for every program.
+    trusting = "trust=[thermostat]"
+    called("evaluate", "run=outputs/room", "evaluation.cases=2", trusting, "hydra.run.dir=again")
+    called("report", "folder=outputs")
+    called("train", "resume=outputs/room", trusting)
+    assert "coil-train" in called("info", "run=outputs/room").stdout
+
+
+class Held:
+    """A controller with a state of its own, which no import path names."""
+
+    def __init__(self, power):
+        self.power = power
+
+    def act(self, observation):
+        return np.array([self.power if observation[0] < 0 else 0.0])
+
+
+def proportional(observation):
+    """Return the power for one observation [2]."""
+    return np.clip(-0.2 * observation[0], 0, 1)
+
+
+def proportional_for_all(observation):
+    """Return the powers for observations [B, 2]."""
+    return (-0.2 * observation[:, :1]).clamp(0, 1)
+
+
+@pytest.mark.parametrize(
+    "guide", [Held(0.7), lambda observation: [0.4], proportional, proportional_for_all]
+)
+def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, tmp_path):
+    run = coil_rl.prepare(ENV, guide=guide, method="guide", folder=tmp_path / "run")
+    controller = run.controller()
+    observations = [np.array([error, 3.0], np.float32) for error in (-4.0, -1.0, 2.0)]
+    sent = [float(controller.act(observation)[0]) for observation in observations]
+    if guide is proportional_for_all:
+        expected = [float(guide(torch.tensor(row[None]))) for row in observations]
+    else:
+        act = getattr(guide, "act", guide)
+        expected = [float(np.ravel(act(row))[0]) for row in observations]
+    assert sent == pytest.approx(expected)
+
+
+def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    guide = Held(0.7)
+    coil_rl.train(ENV, guide=guide, method="coil", frames=32, folder=folder, overrides=SMALL)
+    observation = np.array([-6.0, 3.0], np.float32)
+    expected = coil_rl.open_run(folder).controller().act(observation)
+    monkeypatch.setattr(given, "_objects", {})  # as in another process
+    refused = called("evaluate", f"run={folder}", "trust=[thermostat]", code=2).stderr
+    assert "made in Python with an object as its guide, which no import path names" in refused
+    assert "coil_rl.open_run(FOLDER, guide=OBJECT)" in refused
+    opened = coil_rl.open_run(folder, guide=Held(0.7), trust=["thermostat"])
+    assert opened.controller().act(observation) == pytest.approx(expected)
+    with pytest.raises(coil_rl.UserError, match="env: the run names its own env"):
+        coil_rl.open_run(folder, env=Held, trust=["thermostat"])
+
+
+def make_room():
+    """Return an env of Gymnasium, as a maker that no folder can name."""
+    from thermostat.room import Room
+
+    return Room()
+
+
+def test_maker_of_an_env_is_an_env(tmp_path):
+    from thermostat.room import Room
+
+    for number, env in enumerate((Room, lambda: make_room())):
+        run = coil_rl.prepare(
+            env,
+            method="ppo",
+            frames=32,
+            folder=tmp_path / str(number),
+            overrides=[*SMALL, "env.max_steps=20"],
+        )
+        run.begin()
+        run.learn()
+        assert run.controller().act(np.zeros(2, np.float32)).shape == (1,)
+
+
+def test_torchrl_env_is_an_env(tmp_path):
+    from torchrl.envs import PendulumEnv
+
+    words = [*SMALL, "observes=[th,thdot]", "env.max_steps=10"]
+    run = coil_rl.prepare(
+        PendulumEnv, method="ppo", frames=32, folder=tmp_path / "run", overrides=words
+    )
+    assert run.make_env(3).batch_size == (3,)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"env": 3}, "env is int; give the id of a Gymnasium env"),
+        ({"env": ENV, "guide": 3}, "name a class, a function or an object"),
+        ({"env": ENV, "method": "coill"}, "there is no method=coill"),
+        ({"env": "NoSuchEnv-v3"}, "NoSuchEnv-v3 cannot be made"),
+        ({"env": ENV, "overrides": ["learner.lr=1"]}, "did you mean learning_rate"),
+    ],
+)
+def test_mistake_is_one_sentence(arguments, message, tmp_path):
+    with pytest.raises(coil_rl.UserError, match=message) as refusal:
+        coil_rl.train(**arguments, folder=tmp_path / "run")
+    assert "\n" not in str(refusal.value)
+
+
+def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
+    folder = tmp_path / "run"
+    run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SMALL)
+    first = rows(folder / "metrics.csv")
+    with pytest.raises(coil_rl.UserError, match=r"has budget\.frames=64, more than 32"):
+        run.train(frames=32)
+    capsys.readouterr()
+    called("train", f"resume={folder}", "budget.frames=128", "trust=[thermostat]")
+    longer = rows(folder / "metrics.csv")
+    learned = [name for name in first[0] if name.startswith(("train/", "learner/"))]
+    kept = [[row[name] for name in learned] for row in longer[: len(first)]]
+    assert kept == [[row[name] for name in learned] for row in first]
+    assert [float(row["frames"]) for row in longer] == [0, 32, 64, 96, 128]
+    rates = [float(row["learner/learning_rate"]) for row in longer[1:]]
+    # Half of the way of the new length, where the rate of the first length had fallen to 0.
+    assert rates == pytest.approx([1e-3, 5e-4, 5e-4, 2.5e-4])
+    evaluated = [float(row["frames"]) for row in longer if row["evaluation/return"] != "nan"]
+    assert evaluated == [0, 32, 64, 96, 128]
+    opened = coil_rl.open_run(folder, trust=["thermostat"])
+    assert (opened.budget.frames, list(opened.budget.stages)) == (128, [64])
+    error = called("train", f"resume={folder}", "budget.frames=160", "trust=[thermostat]").stderr
+    assert "goes on from 128 to 160 frames" in error
+    assert "schedules over the run, such as a learning rate, go on at 80% of their way" in error
+
+
+def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
+    first = coil_rl.train(
+        ENV, frames=64, folder=tmp_path / "first", overrides=[*SMALL, "learner.normalise=true"]
+    )
+    words = [*SMALL, "learner.normalise=true", "learner.learning_rate=0", f"init={first.folder}"]
+    second = coil_rl.train(ENV, frames=32, seed=5, folder=tmp_path / "second", overrides=words)
+    before = checkpoint.load(first.folder / "policy_last.pt")
+    after = checkpoint.load(second.folder / "policies" / f"{0:012d}.pt")
+    assert all(torch.equal(before[name], after[name]) for name in before)
+    with pytest.raises(coil_rl.UserError, match="does not fit the networks"):
+        coil_rl.train(
+            ENV,
+            frames=32,
+            folder=tmp_path / "third",
+            overrides=[*SMALL, "learner.hidden=[8]", f"init={first.folder}"],
+        )
+
+
+def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
+    from coil_rl import PPO, Budget, EnvMaker, Evaluation, GymnasiumEnv, Run, Trial
+
+    def bare(rows, cases, count):
+        if cases == "train":
+            return GymnasiumEnv(ENV, rows or 2)
+        seeds = {"test": 1000, "evaluation": 2000, "selection": 3000}
+        return GymnasiumEnv(ENV, rows, first_seed=seeds[cases], cases=count or 2)
+
+    make_env = EnvMaker(bare, sizes={"evaluation": 2, "selection": 2})
+    parts = {
+        "make_env": make_env,
+        "make_learner": lambda env: PPO(env, minibatches=2),
+        "make_trial": lambda: Trial("mine", Evaluation(["0", "1"]), make_env),
+        "budget": Budget(frames=96, steps=16, points=2, checkpoint_every=1),
+        "label": "mine",
+    }
+    run = Run(tmp_path / "runs" / "mine", **parts).train()
+    assert math.isfinite(run.evaluate()["reward"].mean())
+    again = Run(tmp_path / "runs" / "mine", **parts)
+    assert again.resume() == pytest.approx(float(rows(run.folder / "evaluation.csv")[-1]["reward"]))
+    called("report", f"folder={tmp_path / 'runs'}")
+    assert "mine" in (tmp_path / "runs" / "report.md").read_text()
+    refused = called("evaluate", f"run={run.folder}", code=2).stderr
+    assert "was made in Python from parts, which no file names" in refused
+
+
+def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
+    run = coil_rl.train(ENV, frames=32, folder=tmp_path / "run", overrides=SMALL)
+    file = run.folder / "config.yaml"
+    file.write_text(file.read_text().replace("gamma: 0.99", "gamma: 0.9"))
+    refused = called("train", f"resume={run.folder}", "trust=[thermostat]", code=2).stderr
+    assert "belongs to a run with learner.gamma=0.99, not 0.9" in refused
