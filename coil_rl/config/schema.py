@@ -96,9 +96,6 @@ class TrainingConfig(NodeConfig):
     noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
         0.0  # of the noise of continuous actions, see `Rollout`
     )
-    anchored: dict[str, Any] = field(
-        default_factory=dict
-    )  # of anchored COIL, see its file in conf/method
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
 

@@ -87,3 +87,14 @@ def test_cached_advice_equals_the_function_and_the_cache_is_bounded():
     small = GuideCache(max_rows=3)
     assert check(small, rows(1, 2, 3), rows(1, 4), rows(1, 4)) == 3 + 2 * 2
     assert len(small.index) == 3
+
+
+@pytest.mark.parametrize("change", [1e-3, 1e-6])
+def test_cache_tells_observations_apart_by_every_digit(change):
+    def advise(data):
+        return 1000 * data["observation"]
+
+    cache, first = GuideCache(), torch.tensor([[1.0], [1.0 + change]])
+    advice = cache(TensorDict({"observation": first}, [2]), advise)
+    assert torch.equal(advice, 1000 * first)
+    assert len(cache.index) == 2

@@ -35,7 +35,7 @@ def test_label_is_the_method_and_an_unusual_learner(overrides, label):
         ("preset=authors", (1e-3, None, 0.1)),
         ("env=lunar_lander", (1e-3, None, 0.3)),
         (
-            "env=lunar_lander training.learning_rate=0.1 training.anchored.margin=0.2",
+            "env=lunar_lander training.learning_rate=0.1 learner.anchor.margin=0.2",
             (0.1, None, 0.2),
         ),
     ],

@@ -37,6 +37,8 @@ def test_guide_acts_from_a_low_value_on_until_a_high_one():
     [
         ([101, 102, 103], "yes"),
         ([100, 100, 100], "yes"),
+        ([99.5, 99.5, 99.5], "yes"),
+        ([98.5, 98.5, 98.5], "no"),
         ([90, 91, 92], "no"),
         ([80, 120, 100], "undecided"),
     ],
