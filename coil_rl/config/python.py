@@ -24,6 +24,7 @@ from coil_rl.config.check import check
 from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
+from coil_rl.config.written import keep_written
 from coil_rl.errors import UserError
 from coil_rl.run.controller import Controller
 from coil_rl.run.run import Run
@@ -137,7 +138,10 @@ def compose_train(words: Sequence[str], *, with_hydra: bool = False) -> DictConf
     """
     try:
         with _own_hydra():
-            return compose("train", list(words), return_hydra_config=with_hydra)
+            config = compose("train", list(words), return_hydra_config=with_hydra)
+            task = [word for word in words if not word.startswith("hydra.")]
+            keep_written(config, "train", task, [w for w in words if w not in task])
+            return config
     except (HydraException, OmegaConfBaseException) as error:
         raise UserError(sentence(error)) from error
 

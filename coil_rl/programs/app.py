@@ -38,6 +38,7 @@ import coil_rl.config  # noqa: F401  registers the root configurations
 from coil_rl import programs
 from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.config.trust import trust_packages
+from coil_rl.config.written import keep_written, key_of
 from coil_rl.errors import UserError
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
@@ -83,7 +84,7 @@ def _record(config: DictConfig, key: str) -> None:
 def overrides() -> list[tuple[str, str]]:
     """Return the full key and the text of each override on the command line."""
     texts = HydraConfig.get().overrides.task
-    return [(text.lstrip("+~").partition("=")[0].rpartition("@")[2], text) for text in texts]
+    return [(key_of(text), text) for text in texts]
 
 
 def command_line() -> list[str]:
@@ -153,6 +154,8 @@ def run_program(
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
         try:
+            given = HydraConfig.get().overrides
+            keep_written(config, config_name, given.task, given.hydra)
             trust_packages(config.get("trust", []), config)
             check(config)
             if _interrupts:

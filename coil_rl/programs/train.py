@@ -4,6 +4,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.schema import TrainConfig
@@ -24,6 +25,16 @@ def train(config: DictConfig) -> float:
             f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
         )
     return run_configured(config, command=app.command_line())
+
+
+def check(config: DictConfig) -> None:
+    """Raise a `UserError` for the first mistake in the configuration, or for what nothing reads."""
+    from coil_rl.config.build import trains_guides
+    from coil_rl.config.written import check_read
+
+    app.check_run(config)
+    task = HydraConfig.get().overrides.task
+    check_read(config, task, trains_guides=trains_guides(config))
 
 
 def resume(folder: Path, frames: int | None = None) -> float:
@@ -94,7 +105,7 @@ def main() -> None:
     arguments = sys.argv[1:]
     resumed = next((argument for argument in arguments if argument.startswith("resume=")), None)
     if resumed is None:
-        app.run_program(train, "train")
+        app.run_program(train, "train", check)
         return
     with app.program("train"):
         resume_from_command_line(resumed, [each for each in arguments if each != resumed])

@@ -1,0 +1,166 @@
+"""What a person wrote is what runs: values of YAML files, and of the command line.
+
+Hydra composes the groups in a fixed order, env before learner before method. So a value of a later
+group replaces the one that a user wrote in a file of an earlier group, `learner: {normalise: true}`
+in a file of an env for example, and nobody says so. Here every value that is written in a file of
+somebody else than coil-rl is put into its place again, unless the command line gives another one.
+"""
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hydra.core.global_hydra import GlobalHydra
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from coil_rl.errors import UserError
+
+# Where the files are whose order of composition is meant.
+SHIPPED = ("pkg://coil_rl.", "pkg://coil_paper.", "pkg://hydra", "structured://")
+# Keys that other values refer to, and that nothing else reads.
+REFERRED = (
+    "preset",
+    "track",
+    "training.learning_rate",
+    "training.imitation_env",
+    "budget.minibatches",
+)
+REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
+
+
+@dataclass(frozen=True)
+class Written:
+    """A value in a file of a user.
+
+    Args:
+        key: its full key.
+        value: as written, perhaps a reference.
+        file: name of the file, for messages.
+    """
+
+    key: str
+    value: Any
+    file: str
+
+
+def keep_written(
+    config: DictConfig, config_name: str, task: Sequence[str], hydra: Sequence[str] = ()
+) -> None:
+    """Put the values of users' files into their places, after Hydra has composed all files.
+
+    Hydra must be initialised.
+
+    Args:
+        config: composed; it is changed in place.
+        config_name: of the program.
+        task: overrides of the command line for the program.
+        hydra: overrides of the command line for Hydra.
+
+    Raises:
+        UserError: for a value that two files give differently, or that has no place.
+    """
+    overrides = [*task, *hydra]
+    loader: Any = GlobalHydra.instance().config_loader()
+    _, files = loader._parse_overrides_and_create_caching_repo(config_name, overrides)
+    defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
+    # A choice of a file, such as method=coil, gives no value.
+    typed = [key for key in map(key_of, task) if not files.group_exists(key.replace(".", "/"))]
+    first: dict[str, Written] = {}
+    with open_dict(config):
+        for written in _written(defaults, files):
+            if any(_covers(key, written.key) for key in typed):
+                continue
+            other = first.setdefault(written.key, written)
+            if other.value != written.value:
+                raise UserError(
+                    f"{written.key} is {other.value} in {other.file} and {written.value} in "
+                    f"{written.file}; leave one out, or give it on the command line"
+                )
+            _put(config, written)
+
+
+def _put(config: DictConfig, written: Written) -> None:
+    """Set a value; a `UserError` if a node on its way is no node."""
+    parent = written.key.rpartition(".")[0]
+    node = OmegaConf.select(config, parent, throw_on_resolution_failure=False) if parent else config
+    if parent and node is not None and not isinstance(node, DictConfig):
+        raise UserError(
+            f"{written.file}: {written.key} has no place, because {parent} is {node!r}; leave it "
+            "out, or give it on the command line"
+        )
+    OmegaConf.update(config, written.key, written.value, merge=False, force_add=True)
+
+
+def key_of(text: str) -> str:
+    """Return the full key of an override of the command line.
+
+    Args:
+        text: such as "+learner.gamma=0.9", "~degrade" or "guide@other=spline".
+    """
+    return text.lstrip("+~").partition("=")[0].rpartition("@")[2].replace("/", ".")
+
+
+def _covers(one: str, other: str) -> bool:
+    """Return whether one of two keys is the other, or is inside it."""
+    return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
+
+
+def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
+    """Yield the values in the files of users, in the order of composition."""
+    for default in defaults:
+        if default.config_path is None:
+            continue
+        found = files.load_config(default.config_path)
+        if found is None or found.path.startswith(SHIPPED):
+            continue
+        values: Any = OmegaConf.to_container(found.config, resolve=False)
+        for key, value in _leaves(values, default.package or ""):
+            if key.partition(".")[0] not in ("hydra", "defaults"):
+                yield Written(key, value, f"{default.config_path}.yaml")
+
+
+def _leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
+    """Yield full key and value of everything in nested mappings that is no mapping."""
+    if not isinstance(node, Mapping):
+        yield name, node
+        return
+    for key, value in node.items():
+        yield from _leaves(value, f"{name}.{key}" if name else str(key))
+
+
+def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) -> None:
+    """Refuse an override of the command line that nothing reads.
+
+    Args:
+        config: composed.
+        task: overrides of the command line.
+        trains_guides: whether the method trains its guides, for which proxies are.
+
+    Raises:
+        UserError: for the first override without an effect.
+    """
+    references: set[str] | None = None
+    for text in task:
+        key = key_of(text)
+        if key.partition(".")[0] == "proxy" and "." in key and not trains_guides:
+            raise UserError(
+                f"{text} has no effect: method={config.method.name} trains no guides, for which a "
+                "proxy would stand; leave it out, or take method=dynamic_coil_sequential"
+            )
+        if "." not in key or not any(_covers(each, key) for each in REFERRED):
+            continue
+        references = _references(config) if references is None else references
+        if not any(_covers(each, key) for each in references):
+            raise UserError(f"{text} has no effect: nothing in this run reads {key}; leave it out")
+
+
+def _references(config: DictConfig) -> set[str]:
+    """Return the keys that values of a configuration refer to."""
+    values: Any = OmegaConf.to_container(config, resolve=False)
+    found: set[str] = set()
+    for key, value in _leaves(values, ""):
+        if isinstance(value, (str, list)):
+            found |= {name for name in REFERENCE.findall(str(value)) if name != key}
+    return found
