@@ -76,6 +76,7 @@ def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:
         raise UserError(f"{proxies} is a file, but a folder is to be made there; remove it")
     unfinished = temporary(proxies)
     try:
+        unfinished.mkdir(parents=True, exist_ok=True)  # guides with parameters need no proxy
         for name, run in runs.items():
             for file in FILES:
                 with whole_file(unfinished / name / file) as copy:

@@ -74,7 +74,7 @@ class Imitation(Learner):
     def __init__(
         self,
         env: EnvBase,
-        in_keys: Sequence[str] = ("observation",),
+        in_keys: Sequence[NestedKey] = ("observation",),
         *,
         regressor: Regressor,
         advice_key: str = "guide_action",
@@ -84,6 +84,7 @@ class Imitation(Learner):
         dataset: str | os.PathLike[str] | None = None,
         seed: int = 0,
     ) -> None:
+        in_keys = [nested_key(key) for key in in_keys]
         spec, batch_dims = env.observation_spec, len(env.batch_size)
         available = list(spec.keys(True, True))
         if advice_key not in available:

@@ -25,17 +25,18 @@ def distill(config: DictConfig) -> float:
         row: dict[str, Any] = {}
         for key, value in finished.curve[-1].items():
             row[key.removeprefix("learner/")] = value
-        means = finished.evaluation.groupby("driver", sort=False)[["reward", "completed"]].mean()
-        guide, proxy = means.iloc[0], means.iloc[-1]
+        results = finished.evaluation.groupby("driver", sort=False)
         row |= {
             "guide": name,
             "reward": reward,
-            "guide_reward": guide["reward"],
-            "completed": proxy["completed"],
+            "guide_reward": results["reward"].mean().iloc[0],
             "folder": str(finished.folder),
         }
+        if "completed" in finished.evaluation:
+            row["completed"] = results["completed"].mean().iloc[-1]
         table.append(row)
-    print(markdown_table(table, TABLES["proxies"]["columns"]))
+    columns = TABLES["proxies"]["columns"]
+    print(markdown_table(table, {key: columns[key] for key in columns if key in table[0]}))
     worst = min(table, key=lambda row: row["reward"])
     print(
         f"distill: made {len(table)}; the lowest mean reward is {worst['reward']:.1f}, "

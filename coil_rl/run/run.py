@@ -23,7 +23,7 @@ from coil_rl.files import write_text
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.report import draw_learning_curves, draw_phases
-from coil_rl.report.runs import EVALUATION, SELECTION
+from coil_rl.report.runs import EVALUATION, SELECTION, read_curve
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import SelectionCases
 from coil_rl.run.controller import Controller
@@ -41,6 +41,7 @@ from coil_rl.run.folder import (
     write_config,
 )
 from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
+from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
 
@@ -285,7 +286,7 @@ class Run:
             policy = None if self.make_learner is None else self.learn(resumed=resumed)
             fallback = self.make_fallback(policy) if self.fallback else None
             judge(self.trial, policy, self.folder, self.seed, fallback)
-            return report_outcome(self.folder)
+            reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: coil-train resume={self.folder}") from None
         except OSError as error:
@@ -295,6 +296,10 @@ class Run:
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
                 f"and continue with coil-train resume={self.folder}"
             ) from error
+        if policy is not None:
+            rows = read_curve(self.folder / "metrics.csv")
+            print(next_step(self.folder, self.budget.frames, rows))
+        return reward
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""
