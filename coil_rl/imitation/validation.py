@@ -86,9 +86,9 @@ def group_splits(groups: Tensor) -> list[Split]:
 def scores(predictions: Sequence[Tensor], targets: Sequence[Tensor], name: str) -> dict[str, float]:
     """Return mean squared error and R^2 as `mse_NAME` and `r2_NAME`.
 
-    The error is the mean over the A outputs. R^2 is that of all outputs together: outputs that never
-    vary, such as choices that a guide never takes, count by their errors only. Where all targets are
-    constant, R^2 is 1 for correct predictions and else 0.
+    The error is the mean over the A outputs. R^2 is that of all outputs together: outputs that
+    never vary, such as choices that a guide never takes, count by their errors only. Where all
+    targets are constant, R^2 is 1 for correct predictions and else 0.
 
     Args:
         predictions: [N, A] of each fold.
