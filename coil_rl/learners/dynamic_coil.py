@@ -24,6 +24,7 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides
+from coil_rl.transforms.normalised_action import given_units
 
 
 @dataclass(frozen=True)
@@ -252,6 +253,7 @@ class DynamicCoil(PPO):
         self.guide_learning_rate = schedule(guide_learning_rate)
         check_range(0, guide_learning_rate=self.guide_learning_rate(0))
         self.advice = Guides(guides, trainable=True)
+        self.advice.units = given_units(env)
         parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
         if len({id(parameter) for parameter in parameters}) < len(parameters):
             raise ValueError(
@@ -353,5 +355,7 @@ class DynamicCoil(PPO):
             observed = batch.select(*guide.in_keys)
             before = functional_call(guide, initial, (observed.copy(),))["action"]
             change = guide(observed)["action"] - before
+            if self.advice.units is not None:
+                change = change / self.advice.units.unit
             distances[f"moved_{name}"] = float(change.abs().mean())
         return distances

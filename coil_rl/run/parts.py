@@ -15,6 +15,7 @@ from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.normalised_action import normalising
 
 TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
 TEST = "test"  # cases of the table, which training never sees
@@ -71,8 +72,17 @@ class EnvMaker:
         return self.around(self.bare(rows, cases, count), advice)
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
-        """Return any env with the transforms of the method; arguments and errors as above."""
-        return transformed(env, self.transforms(advice), "method.transforms")
+        """Return any env with normalised actions and the transforms of the method.
+
+        Args:
+            env: the env.
+            advice: as above.
+
+        Raises:
+            UserError: as above.
+        """
+        transforms = [*normalising(env), *self.transforms(advice)]
+        return transformed(env, transforms, "method.transforms")
 
     def guided(
         self,
@@ -83,6 +93,8 @@ class EnvMaker:
         count: int | None = None,
     ) -> tuple[EnvBase, TensorDictModuleBase]:
         """Return an env in which the guides act alone, with degraded advice, and the policy that does so.
+
+        Its actions are in the unit of the env.
 
         Args:
             rows: number of rows for each guide. Those of the first guide come first.
