@@ -333,7 +333,27 @@ def _make(
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     for wrapper in wrappers:
         env = wrapper(env)
+    _check_statistics(env, _name(maker))
     return env
+
+
+def _check_statistics(env: Env, name: str) -> None:
+    """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
+    layer: Any = env
+    while layer is not None:
+        kinds = {kind.__name__ for kind in type(layer).__mro__}
+        if any(kind.startswith("NormalizeObservation") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
+                "evaluation begins anew; leave it out and give learner.normalise=true"
+            )
+        if any(kind.startswith("NormalizeReward") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, which changes the returns "
+                "that a table shows by statistics of its own; leave it out, returns are the env's "
+                "own"
+            )
+        layer = getattr(layer, "env", None)
 
 
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:

@@ -21,7 +21,6 @@ from torchrl.data import (
     Unbounded,
 )
 
-
 MOST_CHOICES = 32  # of a whole number that is an action
 
 

@@ -188,8 +188,8 @@ class DynamicCoil(PPO):
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
         hidden: widths of the hidden layers of agent and critic, without `network`.
         network: architecture of agent and critic, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the agent.
         action_gain: initial scale of the last weights of the agent; with 0 its mean is 0
             everywhere.
@@ -226,7 +226,7 @@ class DynamicCoil(PPO):
         critic_phases: Literal["both", "agent", "guide"] = "both",
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from coil_rl.learners.anchor import Anchor, AnchoredUpdate
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.learner import Callback, Cases
-from coil_rl.learners.normaliser import Normaliser, RunningStatistics
+from coil_rl.learners.normaliser import Normaliser, RawObservations, RunningStatistics
 from coil_rl.learners.several_agents import SummedRewards
 
 
@@ -75,6 +75,7 @@ def extensions_of(
     env: EnvBase,
     policy: nn.Module,
     *,
+    in_keys: Sequence[NestedKey],
     normaliser: Normaliser | None,
     auxiliary: Sequence[Extension],
     anchor: Anchor | None,
@@ -84,6 +85,7 @@ def extensions_of(
     Args:
         env: the env; the rewards of several agents are summed.
         policy: of the learner.
+        in_keys: entries that the policy observes.
         normaliser: of the policy; None: it has none.
         auxiliary: extensions that a user adds.
         anchor: of the policy; None: it has none.
@@ -96,4 +98,5 @@ def extensions_of(
     extensions += auxiliary
     if anchor is not None:  # the last one, because it delays the losses of the others too
         extensions.append(AnchoredUpdate(anchor, policy))
+    extensions.append(RawObservations(env, in_keys, normaliser))
     return Extensions(extensions)

@@ -10,7 +10,15 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Protocol
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    RewardSum,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
 
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
@@ -114,6 +122,13 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
 
     Transforms that do not fit are a `UserError` that begins with `name`.
     """
+    # Of the env itself and of the transforms.
+    parts = [*env.modules(), *transforms]
+    if any(isinstance(part, (VecNorm, VecNormV2)) for part in parts):
+        raise UserError(
+            f"{name}: VecNorm normalises by statistics that an evaluation begins anew; leave it "
+            "out and give learner.normalise=true"
+        )
     # The sum comes first, before a method changes the reward.
     env = TransformedEnv(env, Compose(RewardSum(), *transforms))
     try:

@@ -43,6 +43,7 @@ from coil_rl.run.folder import (
 from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
+from coil_rl.transforms.normalised_action import given_units, units_of
 
 FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
 INIT = "init.pt"  # the policy that a run began from
