@@ -121,9 +121,8 @@ class Moments(nn.Module):
         self.count: Tensor = nn.Buffer(torch.zeros((), **options))
         self.mean: Tensor = nn.Buffer(torch.zeros(shape, **options))
         self.variance: Tensor = nn.Buffer(torch.ones(shape, **options))
-        self.used: Tensor | None = None
-        if automatic:
-            self.used = nn.Buffer(torch.tensor(False, device=device))
+        self.used: Tensor | None
+        self.register_buffer("used", torch.tensor(False, device=device) if automatic else None)
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise values [*batch, *shape]."""
