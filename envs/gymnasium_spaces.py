@@ -5,7 +5,7 @@ and nested Dict and Tuple spaces become nested keys.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -111,7 +111,7 @@ def lowest_choices(space: spaces.Space[Any]) -> Any:
     return start(space)
 
 
-def has_whole_numbers(space: spaces.Space[Any]) -> bool:
+def has_whole_numbers(space: spaces.Space[Any]) -> TypeGuard[spaces.Box]:
     """Return whether a space is a Box of whole numbers, each of which is a choice as an action."""
     return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer)
 

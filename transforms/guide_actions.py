@@ -145,7 +145,7 @@ class Guides(TensorDictModuleBase):
         """
         for guide in self.guides.values():
             if hasattr(guide, "in_space"):
-                guide.in_space(space)
+                guide.in_space(space)  # type: ignore[operator]
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.

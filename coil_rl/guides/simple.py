@@ -44,7 +44,7 @@ class ConstantGuide(TensorDictModuleBase):
     """Guide with a constant action.
 
     Args:
-        value: the action in action units, one number or one per dimension.
+        value: the action in the unit of the env, one number or one per dimension.
         in_key: any entry [*batch, N], for the batch shape.
         out_key: entry for the action, [*batch, A].
     """

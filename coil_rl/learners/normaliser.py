@@ -78,7 +78,7 @@ class Normaliser(TensorDictModuleBase):
             moments.add(batch[key])  # type: ignore[operator]
             if first and moments.used is not None:
                 wrong = moments.out_of_scale
-                moments.used.fill_(wrong.any())  # type: ignore[operator,union-attr,arg-type]
+                moments.used.fill_(wrong.any())  # type: ignore[operator]
                 _say(key, moments.described(wrong))  # type: ignore[operator]
 
 

@@ -89,7 +89,11 @@ class EnvMaker:
         Raises:
             UserError: as above.
         """
-        transforms = [*normalising(env), *self.transforms(advice)]
+        try:
+            first = normalising(env)
+        except ValueError as error:
+            raise UserError(f"env: {error}") from error
+        transforms = [*first, *self.transforms(advice)]
         return transformed(env, transforms, "method.transforms")
 
     def guided(

@@ -13,6 +13,7 @@ from coil_rl.guides import ConstantGuide, ControllerGuide, EntryGuide, RandomGui
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import (
     BiasedAdvice,
+    DiscreteActions,
     GuideActions,
     NormalisedAction,
     RandomAdvice,
@@ -241,3 +242,17 @@ def test_guide_reads_its_last_action_in_the_unit_of_the_env():
 def test_normalised_action_outside_an_env_says_so():
     with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
         NormalisedAction().units  # noqa: B018
+
+
+def test_values_of_choices_are_in_the_unit_of_the_env():
+    for choices, expected in [([0.0, 0.5, 2.0], [0.0, 0.5, 2.0]), (3, [0.0, 1.0, 2.0])]:
+        env = advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions(choices))
+        state = env.reset()
+        for choice in range(3):
+            env.step(state.clone().set("action", torch.tensor([choice])))
+        got = np.concatenate(env.base_env.rows[0].env.got)
+        np.testing.assert_allclose(got, expected, atol=1e-6)
+    with pytest.raises(ValueError, match=r"must lie between the action's bounds 0.0 and 2.0"):
+        advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions([-0.5, 0.5])).reset()
+    with pytest.raises(ValueError, match="needs an action of one bounded number"):
+        advised(box([0], [INF]), ConstantGuide([0.4]), DiscreteActions(3)).reset()
