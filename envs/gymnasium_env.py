@@ -73,8 +73,8 @@ class GymnasiumEnv(SeededRows):
             one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
             `reset()`, called at the start of an episode; a function is called as `THING(env,
             observation)`. Either may be a `functools.partial`. Its action for the present
-            observation is written as ("controller", NAME), not clamped, in the env's own numbering;
-            after a termination it is the last one.
+            observation is written as ("controller", NAME), not clamped, in the env's own
+            numbering; after a termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.

@@ -84,7 +84,7 @@ class ActionSpace:
         return vectors if self.units is None else self.units.denormalise(vectors)
 
     def added(self, vectors: Tensor, others: Tensor, scale: float) -> Tensor:
-        """Return the sum of vectors and `scale` times others, added in normalised numbers, clamped.
+        """Return vectors plus `scale` times others, added in normalised numbers and clamped.
 
         Args:
             vectors: [..., A].
@@ -96,13 +96,13 @@ class ActionSpace:
         return self.denormalise(self.normalise(vectors) + scale * self.normalise(others))
 
     def mirrored(self, vectors: Tensor) -> Tensor:
-        """Return the opposite of vectors [..., A]: of numbers about the centre, of choices the order."""
+        """Return the opposite of vectors [..., A]: of choices their reverse order."""
         if self.units is not None:
             return self.denormalise(-self.normalise(vectors))
         return torch.cat([part.flip(-1) for part in vectors.split(self.choices, -1)], -1)
 
     def neutral(self) -> Tensor:
-        """Return the vector [*agents, A] in the centre of the action; of choices the first of each."""
+        """Return the vector [*agents, A] of the centre of the action, or of first choices."""
         if self.units is not None:
             return self.denormalise(torch.zeros_like(self.units.centre))
         indices = torch.zeros(*self.agents, len(self.choices), dtype=torch.int64)

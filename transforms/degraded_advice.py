@@ -362,7 +362,7 @@ class DelayedAdvice(DegradedAdvice):
 
 
 class RemovedAdvice(DegradedAdvice, ActionTransform):
-    """Placebo: the agent's previous action in place of the advice; neutral advice in the first step.
+    """Placebo: the agent's previous action in place of the advice; neutral in the first step.
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].

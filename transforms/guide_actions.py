@@ -222,9 +222,9 @@ class GuideActions(ActionTransform):
     the env and writes an action. Guides run in evaluation mode, without gradients, on a copy of the
     data. If all guides have the attribute `pure = True` (the action is a deterministic function of
     the guide's input entries of the same row), the advice for the first states of episodes is
-    cached. With discrete actions the advice is one-hot; a guide may write an index, in the numbering
-    of the env, or a one-hot vector. Advice is clamped to the bounds of the action. Guides act in the
-    unit of the env; behind `NormalisedAction` the advice is normalised.
+    cached. With discrete actions the advice is one-hot; a guide may write an index, in the
+    numbering of the env, or a one-hot vector. Advice is clamped to the bounds of the action. Guides
+    act in the unit of the env; behind `NormalisedAction` the advice is normalised.
 
     A guide may have a memory: what it reads as `k` and writes as `("next", k)`, declared by its
     `make_tensordict_primer()`, as TorchRL's `LSTMModule` and `GRUModule` do. It is kept in the data

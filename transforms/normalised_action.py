@@ -1,11 +1,11 @@
 """The normalised action: what agents compute with, whatever unit their env has.
 
-A bounded coordinate goes from -1 to 1 between its bounds. Where a bound is missing, the unit is that
-of the env: a coordinate with one bound has -1 or 1 there and no limit on the other side, and one
-without bounds stays as it is. Choices have one numbering, see `ActionSpace`.
+A bounded coordinate goes from -1 to 1 between its bounds. Where a bound is missing, the unit is
+that of the env: a coordinate with one bound has -1 or 1 there and no limit on the other side, and
+one without bounds stays as it is. Choices have one numbering, see `ActionSpace`.
 
-The env and its guides speak the env's unit. Between them and everything else stand `NormalisedAction`,
-next to the env, and `GuideActions`.
+The env and its guides speak the env's unit. Between them and everything else stand
+`NormalisedAction`, next to the env, and `GuideActions`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ActionUnits:
         return numbers if self.identity else (numbers - self.centre) / self.unit
 
     def denormalise(self, numbers: Tensor) -> Tensor:
-        """Return numbers in the unit of the env, within its bounds, for normalised ones [..., *A]."""
+        """Return numbers [..., *A] in the unit of the env, within its bounds."""
         if self.identity:
             return numbers
         return (self.centre + self.unit * numbers).clamp(*self.bounds)

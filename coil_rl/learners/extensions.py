@@ -20,10 +20,11 @@ class Extensions(Extension):
 
     Args:
         extensions: in the order in which they act.
+        raw: what is observed as it is, looked at after the first update; None: nothing.
     """
 
-    def __init__(self, extensions: Iterable[Extension]) -> None:
-        self.each = list(extensions)
+    def __init__(self, extensions: Iterable[Extension], raw: RawObservations | None = None) -> None:
+        self.each, self.raw = list(extensions), raw
 
     @property
     def keys(self) -> Sequence[NestedKey]:
@@ -55,6 +56,8 @@ class Extensions(Extension):
         metrics: dict[str, float] = {}
         for extension in self.each:
             metrics |= extension.finish(batch, progress)
+        if self.raw is not None:
+            self.raw.look(batch)
         return metrics
 
     def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
@@ -98,5 +101,4 @@ def extensions_of(
     extensions += auxiliary
     if anchor is not None:  # the last one, because it delays the losses of the others too
         extensions.append(AnchoredUpdate(anchor, policy))
-    extensions.append(RawObservations(env, in_keys, normaliser))
-    return Extensions(extensions)
+    return Extensions(extensions, RawObservations(env, in_keys, normaliser))

@@ -213,7 +213,7 @@ def normaliser(
     return Normaliser(env, chosen, automatic=normalise == "auto") if chosen else None
 
 
-class RawObservations(Extension):
+class RawObservations:
     """Warns once of observed entries that are out of scale and not normalised; changes nothing.
 
     Args:
@@ -229,8 +229,8 @@ class RawObservations(Extension):
         self.raw = [key for key in vectors_of_measurements(env, in_keys) if key not in done]
         self.batch_dims = len(env.batch_size)
 
-    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Look at the first batch; there are no metrics."""
+    def look(self, batch: TensorDictBase) -> None:
+        """Look at a batch [*B, T]; only at the first one."""
         raw, self.raw = self.raw, []
         for key in raw:
             moments = Moments(batch[key].shape[self.batch_dims + 1 :], batch[key].device)
@@ -241,7 +241,6 @@ class RawObservations(Extension):
                     f"{', '.join(found)}; use learner.normalise=auto or true",
                     stacklevel=2,
                 )
-        return {}
 
 
 def _say(key: NestedKey, found: Sequence[str]) -> None:

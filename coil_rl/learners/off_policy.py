@@ -142,7 +142,7 @@ class OffPolicy(Stateful, Learner):
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
-        self.extensions = Extensions([self.raw])
+        self.extensions = Extensions([], self.raw)
         self.anchored: AnchoredUpdate | None = None
 
     def _new_buffer(self) -> ReplayBuffer:
@@ -182,7 +182,7 @@ class OffPolicy(Stateful, Learner):
         if self.anchor is not None:
             self.anchored = AnchoredUpdate(self.anchor, policy)
             every.append(self.anchored)
-        self.extensions = Extensions([*every, self.raw])
+        self.extensions = Extensions(every, self.raw)
         self.also_store(*self.extensions.keys)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:

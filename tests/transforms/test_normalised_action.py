@@ -1,4 +1,4 @@
-"""The unit and the centre of the action: guides and env speak the env's, all else the normalised."""
+"""The unit of the action: guides and env speak the env's, all else the normalised one."""
 
 import gymnasium
 import numpy as np
@@ -67,7 +67,7 @@ def followed(env, steps=3):
 
 @pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
 @pytest.mark.parametrize(
-    "low, high",
+    ("low", "high"),
     [([-1], [1]), ([0], [1]), ([0], [2000]), ([200], [1000]), ([0, -5], [1, 3000]), ([3], [INF])],
     ids=str,
 )
@@ -109,7 +109,7 @@ def test_an_action_between_minus_one_and_one_is_left_alone():
     assert normalising(GymnasiumEnv(lambda: Seen(Discrete(3)))) == []
 
 
-@pytest.mark.parametrize("low, high", [(200, 1000), (0, 4), (-1, 1), (0, 2000)])
+@pytest.mark.parametrize(("low", "high"), [(200, 1000), (0, 4), (-1, 1), (0, 2000)])
 def test_random_guide_is_uniform_in_a_box(low, high):
     got = followed(advised(box([low, -1], [high, 3]), RandomGuide()), 2000)
     for numbers, bottom, top in zip(got.T, (low, -1), (high, 3), strict=True):
@@ -119,7 +119,7 @@ def test_random_guide_is_uniform_in_a_box(low, high):
 
 
 @pytest.mark.parametrize(
-    "space, actions",
+    ("space", "actions"),
     [(Discrete(3), 3), (Discrete(3, start=1), 3), (MultiDiscrete([3, 2]), 6), (MultiBinary(2), 4)],
     ids=str,
 )
@@ -136,7 +136,7 @@ def test_random_guide_is_uniform_among_choices(space, actions, degraded):
 
 
 @pytest.mark.parametrize(
-    "space, expected",
+    ("space", "expected"),
     [
         (box([0], [2000]), [1000]),
         (box([200, -1], [1000, 1]), [600, 0]),

@@ -67,7 +67,8 @@ def test_observations_in_physical_units_are_normalised_and_it_is_said(options, t
     run = learned(PHYSICAL, tmp_path / "run", *options)
     said = capsys.readouterr().err
     assert said.count("normalise: observation is normalised: [0] mean 32") == 1
-    assert "deviation" in said and "[1] mean" in said
+    assert "deviation" in said
+    assert "[1] mean" in said
     assert used(run)
     controller = run.controller()
     actions = [controller.act(np.float32([322 + x, 7000 + 1000 * x])) for x in (-1, 0, 1)]
@@ -106,7 +107,8 @@ def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
     capsys.readouterr()
     other.update(0.25)
     assert "normalise" not in capsys.readouterr().err  # decided once
-    assert used(whole) and bool(other.learner.normaliser.moments[0].used)
+    assert used(whole)
+    assert bool(other.learner.normaliser.moments[0].used)
 
 
 def test_raw_observations_far_out_of_scale_are_named(tmp_path):
@@ -128,7 +130,7 @@ def test_cone_world_and_robot_are_not_normalised():
 
 
 @pytest.mark.parametrize(
-    "mean, variance, wrong",
+    ("mean", "variance", "wrong"),
     [
         (0.0, 1.0, False),
         (0.0, 0.0, False),
@@ -153,7 +155,7 @@ def test_other_word_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "wrapper, message",
+    ("wrapper", "message"),
     [
         (NormalizeObservation, "statistics an evaluation begins anew; leave it out and give "),
         (NormalizeReward, "changes the returns that a table shows by statistics of its own"),
