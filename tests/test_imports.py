@@ -13,7 +13,8 @@ TENSOR_LIBRARIES = {"torch", "tensordict", "torchrl"}
 # Folder -> allowed imports besides the standard library and the folder itself.
 ALLOWED = {
     "transforms": TENSOR_LIBRARIES,
-    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "rosbags", "gymnasium"},
+    "envs": TENSOR_LIBRARIES
+    | {"numpy", "scipy", "mcap", "lz4", "zstandard", "rosbags", "gymnasium"},
     "conf": set(),
 }
 

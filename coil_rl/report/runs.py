@@ -1,5 +1,6 @@
 """Configuration, evaluation and learning curve of finished runs, read from their folders."""
 
+import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,6 +12,7 @@ import pandas as pd
 import yaml
 
 from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_file
 from coil_rl.plain_yaml import read_yaml
 from coil_rl.report.measures import Measure, measures_of
 
@@ -145,7 +147,7 @@ def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
 def _read_numbers(path: Path) -> dict[str, float]:
     """Return the numbers in a JSON file by name; none without the file."""
     with file_of_a_run(path, RESTORE):
-        saved = json.loads(path.read_text()) if path.exists() else {}
+        saved = json.loads(read_file(path, LARGEST_NUMBERS)) if path.exists() else {}
         return {key: float(value) for key, value in saved.items()}
 
 
@@ -190,7 +192,8 @@ def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:
 
     So numbers keep every digit, and an empty cell is an error where a number is expected.
     """
-    frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+    file = io.BytesIO(read_file(path, LARGEST_TABLE)) if isinstance(path, Path) else path
+    frame = pd.read_csv(file, dtype=str, keep_default_na=False)
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("a row with more values than columns")
     return frame

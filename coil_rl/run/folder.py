@@ -15,7 +15,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from coil_rl.errors import UserError
-from coil_rl.files import remove_unfinished, write_text
+from coil_rl.files import LARGEST_NUMBERS, read_file, remove_unfinished, write_text
 from coil_rl.plain_yaml import yaml_of
 
 CONFIG, COMMAND = "config.yaml", "command.txt"
@@ -110,8 +110,8 @@ def is_evaluated(folder: Path) -> bool:
 def report_changed_versions(folder: Path) -> None:
     """Print one line on standard error if a run was begun with other versions of Python or of the packages."""
     try:
-        begun = dict(json.loads((folder / "versions.json").read_text()))
-    except (OSError, TypeError, ValueError):
+        begun = dict(json.loads(read_file(folder / "versions.json", LARGEST_NUMBERS)))
+    except (OSError, RecursionError, TypeError, ValueError):
         begun = {}
     present = versions()
     names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]

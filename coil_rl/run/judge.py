@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -18,7 +19,7 @@ from tqdm import tqdm
 
 from coil_rl.compiled import compile_steps
 from coil_rl.errors import file_of_a_run
-from coil_rl.files import write_text
+from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.measures import Measure, summarise
@@ -310,12 +311,11 @@ def report_outcome(folder: Path) -> float:
     """
     path = folder / "evaluation.csv"
     with file_of_a_run(path, "remove the file, and evaluate again"):
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_TABLE), newline="")))
         means = [row for row in rows if (row["case"], row["actions"]) == ("mean", "deterministic")]
         last = [row for row in means if not row["advice"]][-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
-        page = (folder / "evaluation.md").read_text().rstrip()
+        page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
     print(page)
     share = "" if math.isnan(completed) else f", {completed:.0%} completed"
     print(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")

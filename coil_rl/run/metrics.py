@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import whole_file
+from coil_rl.files import LARGEST_TABLE, read_file, whole_file
 from coil_rl.report.runs import RETURN, read_curve
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
@@ -64,7 +64,8 @@ class Metrics:
         for number, values in results.items():
             self.rows[number] |= values
             self.log(values, int(self.rows[number]["frames"]))
-        text = pd.read_csv(self.path, dtype=str, keep_default_na=False)
+        file = io.BytesIO(read_file(self.path, LARGEST_TABLE))
+        text = pd.read_csv(file, dtype=str, keep_default_na=False)
         for number, values in results.items():
             text.loc[number, list(values)] = list(map(str, values.values()))
         with whole_file(self.path) as unfinished:
@@ -92,7 +93,10 @@ class Metrics:
         Raises:
             UserError: if there are fewer rows, or the file is damaged.
         """
-        lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
+        lines: list[bytes] = []
+        if self.path.exists():
+            with file_of_a_run(self.path, REMEDY):
+                lines = read_file(self.path, LARGEST_TABLE).splitlines(keepends=True)
         if len(lines) <= count and count:
             found = max(len(lines) - 1, 0)
             raise UserError(

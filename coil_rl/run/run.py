@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.compiled import compile_steps
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
-from coil_rl.files import write_text
+from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.measures import Measure
@@ -394,7 +394,7 @@ class Run:
         file = self.folder / "guide_return.json"
         if file.exists():
             with file_of_a_run(file, "remove it, and the run measures it again"):
-                numbers = json.loads(file.read_text())
+                numbers = json.loads(read_file(file, LARGEST_NUMBERS))
                 return {name: float(numbers[name]) for name in self.trial.guides}
         returns = guide_returns(self.make_env, self.make_env.guides())
         write_text(file, json.dumps(returns, indent=2))
