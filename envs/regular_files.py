@@ -9,6 +9,7 @@ import os
 import stat
 from typing import BinaryIO
 
+BLOCK = 65_536  # bytes
 _OPTIONS = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
@@ -48,8 +49,12 @@ def read_regular(path: str | os.PathLike[str], largest: int) -> bytes:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
+        blocks: list[bytes] = []
+        read = 0
         # Some files of the system have no size before they are read.
-        content = file.read(largest + 1) if size <= largest else b""
-    if max(size, len(content)) > largest:
+        while size <= largest and read <= largest and (block := file.read(max(size, BLOCK))):
+            blocks.append(block)
+            read += len(block)
+    if max(size, read) > largest:
         raise OSError(errno.EINVAL, f"it has more than {largest:,} bytes", os.fspath(path))
-    return content
+    return b"".join(blocks)
