@@ -3,7 +3,6 @@
 import hashlib
 import io
 import pickle
-import sys
 import zipfile
 from collections import OrderedDict
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 
 from coil_rl.errors import UserError
 from coil_rl.files import folder_to_disk, read_file, whole_file
+from coil_rl.output import say
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
 DIGITS = 64  # of a SHA-256
@@ -91,7 +91,7 @@ def load_newest(folder: Path) -> Any | None:
         except UserError:
             remedy = "put one of them back from a copy, or train again in another folder"
             raise UserError(f"both {newest} and {previous} are damaged; {remedy}") from error
-    print(f"{reason.split(';')[0]}; using {previous.name}", file=sys.stderr)
+    say(f"{reason.split(';')[0]}; using {previous.name}", error=True)
     # Otherwise the next checkpoint would replace the intact file by the damaged one.
     previous.replace(newest)
     folder_to_disk(folder)

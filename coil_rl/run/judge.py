@@ -15,12 +15,12 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coil_rl.compiled import compile_steps
 from coil_rl.errors import file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
 from coil_rl.guides.simple import FollowAdvice
+from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.measures import Measure, summarise
 from coil_rl.report.pictures import Picture
@@ -154,7 +154,8 @@ def judge(
     once with deterministic actions, `trial.repeats` times with sampled ones if it samples, once
     with each advice of `trial.advice` instead of its own, and once with a `fallback`.
 
-    The files are `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
+    The files are `episodes.csv`, `evaluation.md` (means) and `evaluation.csv`, with which a run is
+    finished, and then pictures. A picture that fails is a warning.
 
     Args:
         trial: cases, measures, pictures.
@@ -169,7 +170,7 @@ def judge(
             judgement.add(result, name)
     share = None
     torch.manual_seed(seed)
-    with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
+    with progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         if policy is not None:
             _evaluate(trial, policy, judgement, bar)
         if fallback is not None:
@@ -177,11 +178,12 @@ def judge(
             judgement.add(result, f"{trial.label} or guide")
             share = fallback.share(result)
     write_csv(judgement.episodes, folder / "episodes.csv")
-    for picture in trial.pictures:
-        picture.draw(judgement.shown, folder)
     page = _page(trial, judgement, has_policy=policy is not None, share=share)
     write_text(folder / "evaluation.md", page)
     write_csv(judgement.table, folder / "evaluation.csv")
+    for picture in trial.pictures:
+        with decoration(f"the picture {type(picture).__name__} in {folder}"):
+            picture.draw(judgement.shown, folder)
     return judgement
 
 
@@ -214,7 +216,7 @@ def _evaluate_with(
     env = trial.env(len(rows), advice)
     if trial.compiled:
         compile_steps(env)
-    watching = [] if advice else trial.pictures
+    watching = [] if advice else list(trial.pictures)
     if beside:
         policy = PolicyAndGuides(env, policy, own, len(beside))
     sampled = repeats > 0 and (rows >= count) & (rows < own)
@@ -298,10 +300,14 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> s
     )
 
 
-def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) -> None:
+def _tick(env: EnvBase, pictures: list[Picture], update: Callable[[], Any]) -> None:
+    """Show an env to pictures; one that fails is taken out of the list."""
     update()
-    for picture in pictures:
-        picture.watch(env)
+    for picture in list(pictures):
+        pictures.remove(picture)
+        with decoration(f"the picture {type(picture).__name__}"):
+            picture.watch(env)
+            pictures.append(picture)
 
 
 def report_outcome(folder: Path) -> float:
@@ -316,9 +322,9 @@ def report_outcome(folder: Path) -> float:
         last = [row for row in means if not row["advice"]][-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
         page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
-    print(page)
+    say(page)
     share = "" if math.isnan(completed) else f", {completed:.0%} completed"
-    print(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
+    say(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
     return reward
 
 
@@ -338,7 +344,7 @@ def evaluate_guides(
     """
     cases = len(evaluation.cases)
     env, policy = make_env.guided(cases, TEST, guides, count=count)
-    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+    with progress(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
         result = evaluation.run(env, policy, tick=bar.update)
     return dict(zip(guide_titles(guides), result.split(len(guides)), strict=True))
 

@@ -12,6 +12,7 @@ import pandas as pd
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import LARGEST_TABLE, read_file, whole_file
+from coil_rl.output import decoration
 from coil_rl.report.runs import RETURN, read_curve
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
@@ -49,12 +50,18 @@ class Metrics:
         self.log(row, int(row["frames"]))
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
-        """Log values with the TorchRL logger, if there is one; NaN is left out."""
+        """Log values with the TorchRL logger, if there is one; NaN is left out.
+
+        A logger that fails is left out from then on.
+        """
         if self.logger is None:
             return
-        for name, value in values.items():
-            if not math.isnan(value):
-                self.logger.log_scalar(name, value, step=frames)
+        logger, self.logger = self.logger, None
+        with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
+            for name, value in values.items():
+                if not math.isnan(value):
+                    logger.log_scalar(name, value, step=frames)
+            self.logger = logger
 
     def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Put values into rows that were logged before, by their numbers.
@@ -84,8 +91,9 @@ class Metrics:
         if self.path.exists():
             with self.path.open("a") as file:
                 os.fsync(file.fileno())
-        if self.tensorboard is not None:
-            self.tensorboard.flush()
+        if self.tensorboard is not None and self.logger is not None:
+            with decoration(f"the logger of {self.path.parent}"):
+                self.tensorboard.flush()
 
     def truncate(self, count: int) -> None:
         """Keep only the first rows, those that belong to a checkpoint.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ from coil_rl.compiled import compile_steps
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
 from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
+from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.measures import Measure
 from coil_rl.report.runs import EVALUATION, SELECTION
@@ -43,6 +43,7 @@ from coil_rl.run.folder import (
 from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
+from coil_rl.run.stopping import resume_command
 
 FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
 INIT = "init.pt"  # the policy that a run began from
@@ -240,10 +241,10 @@ class Run:
         write_config(self.folder, self.settings)
         for file in ("evaluation.csv", "evaluation.md", "training_time.json"):
             (self.folder / file).unlink(missing_ok=True)
-        print(
+        say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
             f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
-            file=sys.stderr,
+            error=True,
         )
 
     def finish_begun(self) -> float:
@@ -280,13 +281,13 @@ class Run:
             judge(self.trial, policy, self.folder, self.seed, fallback)
             return report_outcome(self.folder)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"continue with: coil-train resume={self.folder}") from None
+            raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
         except OSError as error:
             if error.errno not in NO_SPACE:
                 raise
             raise UserError(
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
-                f"and continue with coil-train resume={self.folder}"
+                f"and continue with {resume_command(self.folder)}"
             ) from error
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
@@ -305,7 +306,8 @@ class Run:
             seconds = {"seconds": time.monotonic() - start}
             write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
         learner = experiment.learner
-        self._draw(rows, learner, guide_returns)
+        with decoration(f"the learning curve in {self.folder}"):
+            self._draw(rows, learner, guide_returns)
         learner.export(self.folder)
         state = checkpoint.load(weights_file(self.folder, self.which), self.device)
         learner.policy.load_state_dict(state)
