@@ -43,6 +43,7 @@ from coil_rl import programs
 from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
+from coil_rl.files import FAILED_JOBS
 from coil_rl.output import SafeStream, say
 from coil_rl.run.stopping import STOP
 
@@ -55,8 +56,11 @@ HYDRA_FILES = (
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
 _sweep: list[str] = []  # folder of the sweep of this program, if it is one
-FAILED = "failed_jobs.txt"  # in the folder of a sweep
 MOST_PROCESSES = 4  # of joblib, for each processor
+
+
+class NoSweepError(UserError):
+    """A program that has no sweeps was started as one, so that none of its jobs is to be done."""
 
 
 class NewFolders(Callback):
@@ -70,9 +74,10 @@ class NewFolders(Callback):
         """Record the folder of a sweep, and say how it goes on if it is stopped."""
         _record(config, "hydra.sweep.dir")
         _sweep[:] = [str(config.hydra.sweep.dir)]
-        Path(_sweep[0], FAILED).unlink(missing_ok=True)
-        command = _sweep_command(sys.argv, _sweep[0])
-        say(f"if this sweep is stopped, go on with: {command}", error=True)
+        Path(_sweep[0], FAILED_JOBS).unlink(missing_ok=True)
+        if "existing" in config:  # the jobs are runs, which go on where they were stopped
+            command = _sweep_command(sys.argv, _sweep[0])
+            say(f"if this sweep is stopped, go on with: {command}", error=True)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Record the folder of a job of a sweep."""
@@ -160,7 +165,7 @@ def run(
                 raise KeyboardInterrupt(f"continue with: {jobs.command}") from error
             raise
         except Exception as error:
-            if jobs.is_sweep():
+            if jobs.is_sweep() and not isinstance(error, NoSweepError):
                 return jobs.fail(error)
             if is_no_bug(error):
                 # Here, because Hydra prints a line of its own for an error of the task.
@@ -286,13 +291,13 @@ class Jobs:
         say(f"{self.name}: {line}; the other jobs go on", error=True)
         with contextlib.suppress(OSError):  # it is empty
             Path(hydra_config.runtime.output_dir).rmdir()
-        with Path(hydra_config.sweep.dir, FAILED).open("a", encoding="utf-8") as file:
+        with Path(hydra_config.sweep.dir, FAILED_JOBS).open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
         return math.nan
 
     def report(self) -> None:
         """End the program with exit code 2 if jobs have failed."""
-        path = Path(_sweep[0], FAILED) if _sweep else None
+        path = Path(_sweep[0], FAILED_JOBS) if _sweep else None
         if path is None or not path.is_file():
             return
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -329,7 +334,7 @@ def refuse(name: str, error: Exception) -> NoReturn:
             if path.name == "hydra.yaml"
             for name in HYDRA_FILES
         }
-        of_sweep = ("multirun.yaml", FAILED)
+        of_sweep = ("multirun.yaml", FAILED_JOBS)
         if all(path.name in of_sweep or path in of_jobs for path in inside):
             shutil.rmtree(folder, ignore_errors=True)
     _new_folders.clear()

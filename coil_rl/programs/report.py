@@ -34,7 +34,8 @@ def report(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
-    from coil_rl.report.runs import read_runs
+    from coil_rl.report.configurations import distinguish
+    from coil_rl.report.runs import failed_jobs, read_runs
 
     folders = _folders(config)
     runs = read_runs(folders)
@@ -45,6 +46,7 @@ def report(config: DictConfig) -> None:
             f"continue one with coil-train resume={runs[0].folder}, "
             "or repeat the command that started them"
         )
+    finished, differences = distinguish(finished)
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}
@@ -55,7 +57,8 @@ def report(config: DictConfig) -> None:
     parts += [*page.training(finished), *page.guide_training(finished)]
     normalised = any(comparison.normalised for comparison in compared.values())
     parts.append(page.notes(against, normalised, "sampled" in compared))
-    parts.append(page.progress(len(finished), len(runs)))
+    parts += differences
+    parts.append(page.progress(len(finished), len(runs), failed_jobs(folders)))
     text = "\n\n".join(parts)
 
     folder = folders[0]
@@ -141,7 +144,7 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError(
+        raise app.NoSweepError(
             "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
         )
     first = _folders(config)[0]

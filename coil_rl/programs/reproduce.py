@@ -164,7 +164,7 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError(
+        raise app.NoSweepError(
             "results are made one after the other; "
             "leave out -m, and request several as in table=[1,4]"
         )

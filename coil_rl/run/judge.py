@@ -22,7 +22,13 @@ from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
-from coil_rl.report.measures import Measure, summarise
+from coil_rl.report.measures import (
+    Measure,
+    denominators,
+    summarise,
+    with_denominators,
+    with_shares,
+)
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
 from coil_rl.run.evaluation import EvaluationResult, evaluate_policy
@@ -123,6 +129,7 @@ class Judgement:
     def __init__(self, measures: Mapping[str, Measure]) -> None:
         self.measures = measures
         self.table: list[dict[str, Any]] = []  # means, for evaluation.csv
+        self.counts: list[dict[str, int]] = []  # episodes that each mean rests on
         self.episodes: list[dict[str, Any]] = []
         self.shown: dict[str, EvaluationResult] = {}  # deterministic episodes, by title
 
@@ -136,6 +143,7 @@ class Judgement:
         """Add the episodes of a policy or a guide."""
         label = {"driver": driver, "advice": advice, "actions": actions}
         self.table += [label | row for row in summarise(result.episodes, self.measures)]
+        self.counts += denominators(result.episodes, self.measures)
         self.episodes += [label | row for row in result.episodes]
         if actions == "deterministic":
             self.shown[f"{driver}, {advice}" if advice else driver] = result
@@ -180,7 +188,8 @@ def judge(
     write_csv(judgement.episodes, folder / "episodes.csv")
     page = _page(trial, judgement, has_policy=policy is not None, share=share)
     write_text(folder / "evaluation.md", page)
-    write_csv(judgement.table, folder / "evaluation.csv")
+    table = with_denominators(judgement.table, judgement.counts)
+    write_csv(table, folder / "evaluation.csv")
     for picture in trial.pictures:
         with decoration(f"the picture {type(picture).__name__} in {folder}"):
             picture.draw(judgement.shown, folder)
@@ -239,7 +248,7 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
         if measure.title:
             columns[name] = (measure.title, measure.format)
     count = len(trial.evaluation.cases)
-    rows = judgement.table
+    rows = with_shares(judgement.table, judgement.counts, columns)
     if count > MAX_CASES:
         rows = [row for row in rows if row["case"] == "mean"]
     page = [markdown_table(rows, columns)]
