@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import yaml
 
-from coil_rl.errors import UserError
+from coil_rl.errors import IN_THE_WAY, UserError
 from coil_rl.files import read_text
 
 LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
@@ -62,10 +62,13 @@ def read_yaml(path: Path) -> Any:
         UserError: for a file that cannot be read, is larger or deeper than any configuration of a
             run, or refers to parts of itself.
         yaml.YAMLError: for a file that is no YAML.
+        OSError: for a folder, or without the right to read.
     """
     try:
         text, depth = read_text(path, LARGEST_FILE), 0
     except OSError as error:
+        if error.errno in IN_THE_WAY:
+            raise
         raise UserError(
             f"{path} is not the configuration of a run ({error.strerror}); put the file back that "
             "coil-train wrote"

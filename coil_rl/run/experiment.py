@@ -223,10 +223,14 @@ class Experiment:
             raise
 
     def _show(self, bar: Any, row: Mapping[str, float], guide_return: float | None) -> None:
-        """Show the newest returns beside the progress bar."""
+        """Show the newest returns beside the progress bar.
+
+        `training` is with exploration; `curve` and `guide` are deterministic, in the cases of the
+        curve.
+        """
         returns = {
-            "return": row["train/return"],
-            "evaluation": self.metrics.newest(),
+            "training": row["train/return"],
+            "curve": self.metrics.newest(),
             "guide": guide_return,
         }
         shown = {name: f"{value:.0f}" for name, value in returns.items() if value is not None}
