@@ -28,8 +28,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.schema import TrainConfig
 from coil_rl.errors import UserError, did_you_mean
-from coil_rl.run.stopping import remember_trust
 from coil_rl.imitation.estimators import ESTIMATORS, TRUSTED
+from coil_rl.run.stopping import remember_trust
 
 ENTRY_POINTS = (
     "coil_rl.trusted"  # a package with an entry point of its name in this group is trusted

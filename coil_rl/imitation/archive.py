@@ -190,9 +190,10 @@ def _check_first_prediction(first: object) -> None:
         return
     _require(type(first) is DummyRegressor, "boosted trees begin with another regressor")
     state = vars(first)
-    one = np.shape(state.get("constant_")) == (1, 1) and state.get("n_outputs_") == 1
+    constant: Any = state.get("constant_")
+    one = np.shape(constant) == (1, 1) and state.get("n_outputs_") == 1
     _require(one, "boosted trees begin with a wrong number of predictions")
-    _check_numbers(state["constant_"], state["constant_"])
+    _check_numbers(constant, constant)
 
 
 def _check_histograms(

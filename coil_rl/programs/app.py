@@ -151,15 +151,8 @@ def run(
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
-        _listen()
         try:
-            if jobs.is_sweep() and "existing" in config:
-                config.existing = "resume"  # so that a sweep goes on by the same command
-            trust_packages(config.get("trust", []), config)
-            check(config)
-            if _interrupts:
-                raise KeyboardInterrupt
-            return task(config)
+            return _do(task, check, config)
         except KeyboardInterrupt as error:
             if jobs.is_sweep():
                 raise KeyboardInterrupt(f"continue with: {jobs.command}") from error
@@ -193,6 +186,20 @@ def run(
                 raise
             refuse(config_name, error)
         jobs.report()
+
+
+def _do(
+    task: Callable[[DictConfig], Any], check: Callable[[DictConfig], None], config: DictConfig
+) -> Any:
+    """Do a task after a check of its configuration, and return its result."""
+    _listen()
+    if Jobs.is_sweep() and "existing" in config:
+        config.existing = "resume"  # so that a sweep goes on by the same command
+    trust_packages(config.get("trust", []), config)
+    check(config)
+    if _interrupts:
+        raise KeyboardInterrupt
+    return task(config)
 
 
 @contextmanager

@@ -79,9 +79,8 @@ def _measure(
     evaluation: Evaluation,
 ) -> tuple[Survey, Mapping[Ablation, Sequence[Mapping[str, Any]]]]:
     """Return the measures with all guides, and the episodes without the advice of one guide."""
-    from coil_rl.output import progress
-
     from coil_rl.listening import survey as surveys
+    from coil_rl.output import progress
     from coil_rl.run.parts import TEST
 
     rows = len(evaluation.cases) * run.trial.repeats

@@ -30,11 +30,11 @@ def replay(config: DictConfig) -> None:
     The results of each recording are written, then `replay.md`.
     """
     import torch
-    from coil_rl.output import progress
 
     from coil_rl.config.nodes import build
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
+    from coil_rl.output import progress
     from coil_rl.replay.open_loop import open_loop
     from coil_rl.replay.report import caution, describe, outcome
     from coil_rl.report.table import TABLES

@@ -108,7 +108,16 @@ def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> Non
         draw_curve_grid(curves, path, guides=guides)
     elif curves:
         guide = {"guide": next(iter(guides.values()))} if guides else {}
-        draw_learning_curves(curves, path, guides=guide)
+        sizes = {_cases_of_curve(run) for run in runs if run.curve}
+        cases = sizes.pop() if len(sizes) == 1 else None
+        draw_learning_curves(curves, path, guides=guide, cases=cases)
+
+
+def _cases_of_curve(run: Run) -> int | None:
+    """Return the number of cases of the curve of a run; None if its configuration has none."""
+    curve = (run.settings.get("evaluation") or {}).get("curve") or {}
+    count = curve.get("num_envs")
+    return count if isinstance(count, int) else None
 
 
 def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:

@@ -219,7 +219,7 @@ class Comparison:
         return rows
 
     def _partial(self, group: Group) -> dict[str, int]:
-        """Return in how many results each measure is known, if not in all results of all policies."""
+        """Return in how many results each measure is known, unless it is in all results of all."""
         names = dict.fromkeys(
             name
             for each in self.groups

@@ -180,7 +180,9 @@ class _Animation:
 
     def frames(self) -> Iterator[Image.Image]:
         """Yield the frames."""
-        for time in progress(iterable=self.times, desc="animation", unit="frame", leave=False, disable=None):
+        for time in progress(
+            iterable=self.times, desc="animation", unit="frame", leave=False, disable=None
+        ):
             self.canvas.restore_region(self.background)
             now, start = round(time * self.rate), round((time - TAIL * self.speed) * self.rate)
             for car in self.cars:

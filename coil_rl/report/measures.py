@@ -144,9 +144,7 @@ def with_denominators(
         counts: of `denominators`.
     """
     names = [name for name in counts[0] if name != "episodes"] if counts else []
-    partial = [
-        name for name in names if any(count[name] < count["episodes"] for count in counts)
-    ]
+    partial = [name for name in names if any(count[name] < count["episodes"] for count in counts)]
     if not partial:
         return [dict(row) for row in rows]
     return [

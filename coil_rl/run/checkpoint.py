@@ -132,7 +132,7 @@ class _Outline(pickle.Unpickler):
 
 
 def _encoded(text: Any, encoding: Any) -> bytes:
-    """Return bytes that a pickle holds as a text; other codecs may return more than they are given."""
+    """Return bytes that a pickle holds as a text; other codecs may return more than they get."""
     if not isinstance(text, str) or encoding != "latin1":
         raise pickle.UnpicklingError("bytes are encoded in another way")
     return text.encode(encoding)

@@ -390,9 +390,7 @@ class Run:
             draw_phases(rows, list(learner.guides), path, title=label)
         else:
             cases = self.make_env.sizes.get(EVALUATION)
-            draw_learning_curves(
-                {label: [rows]}, path, guides=guide_returns, cases=cases
-            )
+            draw_learning_curves({label: [rows]}, path, guides=guide_returns, cases=cases)
 
     def _saved_guide_returns(self) -> dict[str, float]:
         """Return the mean return of each guide in the cases of the curve, measured once."""

@@ -344,7 +344,7 @@ def _records(
                 unpacked = _unpacked(record, left)
                 left -= len(unpacked.data)
                 parts = breakup_chunk(unpacked, validate_crc=True)
-        except _TooLarge:
+        except _TooLargeError:
             raise RecordingError(
                 f"{file} has {size:,} bytes, but unpacks to more than {UNPACKED_SHARE} times as "
                 "many; no recording of a robot does."
@@ -380,7 +380,7 @@ def _records(
         yield from parts
 
 
-class _TooLarge(Exception):
+class _TooLargeError(Exception):
     """A chunk that unpacks to more bytes than are left."""
 
 
@@ -389,7 +389,7 @@ def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
 
     Args:
         chunk: of a file.
-        left: number of bytes that it may unpack to; more are a `_TooLarge`.
+        left: number of bytes that it may unpack to; more are a `_TooLargeError`.
     """
     most = min(left, chunk.uncompressed_size) + 1
     if chunk.compression == "zstd":
@@ -400,7 +400,7 @@ def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
     else:
         data = chunk.data
     if len(data) > left:
-        raise _TooLarge
+        raise _TooLargeError
     if chunk.compression and len(data) != chunk.uncompressed_size:
         raise ValueError(f"a chunk does not unpack to {chunk.uncompressed_size} bytes")
     return replace(chunk, compression="", data=data)

@@ -149,7 +149,9 @@ def _simple_fields(text: str, parts: Collection[str]) -> list[str]:
         simple.append(f"{field[1]} {field[2]}")
         kind, _, size = field[1].partition("[")
         short = int(size.removesuffix("]") or 0) <= LARGEST_ARRAY
-        part = any(each.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) for each in parts)
+        part = any(
+            each.replace("/msg/", "/").endswith(kind.replace("/msg/", "/")) for each in parts
+        )
         if not (kind in NUMBERS and short) and not ((kind == "string" or part) and not size):
             raise ValueError(f"{line!r:.100} has another type than is read here")
     if len(simple) > MOST_FIELDS:

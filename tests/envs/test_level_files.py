@@ -91,7 +91,10 @@ def test_start_is_three_numbers_with_the_heading_in_degrees(tmp_path):
         (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
         (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
         (HEADER.encode(), "left side of track 'bad' has 0 cones"),
-        (f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6, "cannot be read (it has more than 10,000,000 bytes)"),
+        (
+            f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6,
+            "cannot be read (it has more than 10,000,000 bytes)",
+        ),
     ],
 )
 def test_invalid_files_are_rejected_with_a_message(tmp_path, content, words):

@@ -173,7 +173,9 @@ def test_estimator_that_refuses_its_data_is_named(estimator, words):
 
 @pytest.mark.parametrize("jobs", [100_000, -100_000, 2**40])
 def test_number_of_processes_is_limited(jobs):
-    regressor = SklearnRegressor(BaggingRegressor(RandomForestRegressor(2, n_jobs=jobs), n_jobs=jobs))
+    regressor = SklearnRegressor(
+        BaggingRegressor(RandomForestRegressor(2, n_jobs=jobs), n_jobs=jobs)
+    )
     most = os.cpu_count()
     parameters = regressor.estimator.get_params()
     assert abs(parameters["n_jobs"]) <= most

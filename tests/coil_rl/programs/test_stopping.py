@@ -37,7 +37,8 @@ def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number)
     log = folder / "metrics.csv"
     deadline = time.monotonic() + 120
     while not log.exists() or log.read_bytes().count(b"\n") < 4:
-        assert process.poll() is None and time.monotonic() < deadline
+        assert process.poll() is None
+        assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(number)
     _, error = process.communicate(timeout=60)

@@ -68,7 +68,7 @@ def test_runs_that_differ_in_their_seed_only_are_pooled(runs, one, two):
 
 
 def test_many_differences_are_numbered(runs):
-    one, two = ({name: seed for name in "abcde"} for seed in (5, 7))
+    one, two = (dict.fromkeys("abcde", seed) for seed in (5, 7))
     divided, sentences = distinguish(runs(one, two))
     assert [run.label for run in divided] == [
         "coil (1: a=5, b=5, c=5, ...)",

@@ -122,7 +122,9 @@ def test_stored_archive_of_another_program_is_read(tmp_path):
 
 
 def test_states_of_all_kinds_are_read(tmp_path):
-    state = OrderedDict(a=torch.nn.Parameter(torch.ones(2)), b=torch.Size([1]), c=(1, {2.0}, b"x", 2j))
+    state = OrderedDict(
+        a=torch.nn.Parameter(torch.ones(2)), b=torch.Size([1]), c=(1, {2.0}, b"x", 2j)
+    )
     state |= {"d": torch.zeros(2, 3).T, "e": torch.ones(2, dtype=torch.bfloat16), "f": None}
     checkpoint.save(state, tmp_path / "a.pt")
     assert str(checkpoint.load(tmp_path / "a.pt")) == str(state)
