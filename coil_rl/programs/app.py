@@ -56,7 +56,7 @@ HYDRA_FILES = (
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
 _sweep: list[str] = []  # folder of the sweep of this program, if it is one
-MOST_PROCESSES = 4  # of joblib, for each processor
+MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
 
 
 class NoSweepError(UserError):
@@ -364,6 +364,6 @@ def _check_options(config_name: str) -> None:
         if override.startswith("="):
             error(f"{override!r} has no key, write KEY=VALUE")
         jobs = re.fullmatch(r"\+*hydra\.launcher\.n_jobs=(-?\d+)", override)
-        most = MOST_PROCESSES * (os.cpu_count() or 1)
+        most = max(MOST_PROCESSES, 4 * (os.cpu_count() or 1))
         if jobs and abs(int(jobs[1])) > most:
             error(f"{override} must be at most {most} on this machine")
