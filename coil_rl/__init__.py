@@ -52,6 +52,7 @@ if TYPE_CHECKING:
     from coil_rl.learners import DynamicCoil as DynamicCoil
     from coil_rl.learners import Reinforce as Reinforce
     from coil_rl.measures import Measure as Measure
+    from coil_rl.programs.app import NoSweepError as NoSweepError
     from coil_rl.programs.app import run_program as run_program
     from coil_rl.run.controller import Controller as Controller
     from coil_rl.run.evaluation import EvaluationResult as EvaluationResult
@@ -96,7 +97,7 @@ _NAMES = {
     "coil_rl.config.python": "compose_train prepare train",
     "coil_rl.config.schema": "NodeConfig ProgramConfig",
     "coil_rl.config.values": "check_values",
-    "coil_rl.programs.app": "run_program",
+    "coil_rl.programs.app": "NoSweepError run_program",
     "coil_rl.run.folder": "versions",
     "coil_rl.measures": "Measure",
     "coil_rl.run.rollout": "Rollout",

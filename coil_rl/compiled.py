@@ -10,7 +10,6 @@ import hashlib
 import os
 import platform
 import shutil
-import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -21,10 +20,10 @@ from unittest.mock import patch
 import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule
-from tqdm import tqdm
 
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
+from coil_rl.output import say
 
 # Random numbers come from PyTorch's generators, as without compilation; tanh from exp, which is
 # twice as fast.
@@ -210,7 +209,7 @@ def compile_graph(graph: GraphModule, arguments: Sequence[Tensor], path: Path) -
             f"{path.parent} cannot be made for compiled code ({error.strerror}); "
             "set XDG_CACHE_HOME to another folder, or take compile=false"
         ) from error
-    tqdm.write("compiling, once for these sizes and this machine (20 to 60 s) ...", file=sys.stderr)
+    say("compiling, once for these sizes and this machine (20 to 60 s) ...", error=True)
     examples = tuple(argument.detach() for argument in arguments)
     try:
         with warnings.catch_warnings():

@@ -1,4 +1,7 @@
-"""Atomic writes: files appear complete or not at all, also if the process is killed."""
+"""Files of a run: read with a limit, and written complete or not at all.
+
+A folder of a run may come from anybody, and a process may be killed while it writes one.
+"""
 
 import os
 import re
@@ -8,6 +11,35 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from coil_rl.errors import UserError
+
+FAILED_JOBS = "failed_jobs.txt"  # in the folder of a sweep, a line for each
+LARGEST_NUMBERS = 1_000_000  # bytes of a small file, such as guide_return.json
+LARGEST_TABLE = 200_000_000  # bytes of a table, such as metrics.csv
+
+
+def read_file(path: str | os.PathLike[str], largest: int) -> bytes:
+    """Return the bytes of a file that somebody else may have made.
+
+    Args:
+        path: of the file.
+        largest: allowed size, in bytes.
+
+    Raises:
+        OSError: for anything but a file of at most this size, such as a pipe or a device.
+    """
+    from coil_rl.envs.regular_files import read_regular  # imports torch
+
+    return read_regular(path, largest)
+
+
+def read_text(path: str | os.PathLike[str], largest: int) -> str:
+    """Return the text of a file in UTF-8, as `read_file`.
+
+    Args:
+        path: of the file.
+        largest: allowed size, in bytes.
+    """
+    return read_file(path, largest).decode("utf-8-sig")
 
 
 @contextmanager

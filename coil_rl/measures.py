@@ -58,9 +58,12 @@ class Measure:
         return cls(_key(entry), where=None if where is None else _key(where), **options)
 
     def pool(self, values: Sequence[float]) -> float:
-        """Return the mean of several episodes without NaN.
+        """Return the mean of the episodes that have a number, see `denominators`.
 
-        Of numbers, return the minimum of minima, and the maximum of maxima.
+        Of numbers it is the minimum of minima, and the maximum of maxima.
+
+        Args:
+            values: of the episodes; NaN for one without a number.
         """
         numbers = [float(value) for value in values if not math.isnan(value)]
         is_flag = self.at_least is not None or self.at_most is not None
@@ -97,17 +100,93 @@ def summarise(
 ) -> list[dict[str, Any]]:
     """Return the means of each case, then their mean as the case `mean`.
 
-    The cases are in the order of the episodes.
+    The cases are in the order of the episodes. A measure is pooled over the episodes that have it,
+    see `denominators`. The mean of the return is NaN if that of an episode is.
+
+    Args:
+        episodes: `case`, `reward` and the measures of each.
+        measures: by name.
     """
-    reward = {"reward": Measure("reward"), **measures}
     cases: dict[str, list[Mapping[str, Any]]] = {}
     for episode in episodes:
         cases.setdefault(episode["case"], []).append(episode)
 
     def pool(case: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-        return {"case": case} | {
-            name: measure.pool([row[name] for row in rows]) for name, measure in reward.items()
+        means = {"case": case, "reward": fmean(float(row["reward"]) for row in rows)}
+        return means | {
+            name: measure.pool([row[name] for row in rows]) for name, measure in measures.items()
         }
 
     rows = [pool(case, group) for case, group in cases.items()]
     return [*rows, pool("mean", rows)]
+
+
+def denominators(
+    episodes: Sequence[Mapping[str, Any]], measures: Mapping[str, Measure]
+) -> list[dict[str, int]]:
+    """Return how many episodes each number of `summarise` rests on.
+
+    Args:
+        episodes: `case`, `reward` and the measures of each.
+        measures: by name.
+
+    Returns:
+        A row for each of `summarise`: `episodes`, and by name the number of those with a number.
+    """
+    names = ("reward", *measures)
+    cases: dict[str, list[Mapping[str, Any]]] = {}
+    for episode in episodes:
+        cases.setdefault(episode["case"], []).append(episode)
+    counts = []
+    for group in (*cases.values(), episodes):
+        known = {name: sum(not math.isnan(row[name]) for row in group) for name in names}
+        counts.append({"episodes": len(group)} | known)
+    return counts
+
+
+def with_denominators(
+    rows: Sequence[Mapping[str, Any]], counts: Sequence[Mapping[str, int]]
+) -> list[dict[str, Any]]:
+    """Return rows with a column `NAME_episodes` for each mean that leaves episodes out in any row.
+
+    The number of all episodes is then the column `episodes`.
+
+    Args:
+        rows: of `summarise`.
+        counts: of `denominators`.
+    """
+    names = [name for name in counts[0] if name != "episodes"] if counts else []
+    partial = [name for name in names if any(count[name] < count["episodes"] for count in counts)]
+    if not partial:
+        return [dict(row) for row in rows]
+    return [
+        dict(row)
+        | {"episodes": count["episodes"]}
+        | {f"{name}_episodes": count[name] for name in partial}
+        for row, count in zip(rows, counts, strict=True)
+    ]
+
+
+def with_shares(
+    rows: Sequence[Mapping[str, Any]],
+    counts: Sequence[Mapping[str, int]],
+    columns: Mapping[str, Sequence[str]],
+) -> list[dict[str, Any]]:
+    """Return rows whose means over fewer episodes than ran say so, as `12.3 (4 of 8)`.
+
+    Args:
+        rows: of `summarise`.
+        counts: of `denominators`.
+        columns: heading and number format by name.
+    """
+    shown = []
+    for row, count in zip(rows, counts, strict=True):
+        cells = dict(row)
+        for name, (_, spec) in columns.items():
+            known, episodes = count.get(name, 0), count["episodes"]
+            if not 0 < known < episodes:
+                continue
+            number = "-" if math.isnan(row[name]) else format(row[name], spec)
+            cells[name] = f"{number} ({known} of {episodes})"
+        shown.append(cells)
+    return shown

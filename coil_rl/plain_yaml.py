@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 
 import yaml
 
-from coil_rl.errors import UserError
+from coil_rl.errors import IN_THE_WAY, UserError
+from coil_rl.files import read_text
 
 LARGEST_FILE = 200_000  # bytes; the configuration of a run has about 5,000
 DEEPEST = 32  # levels
@@ -58,17 +59,20 @@ def read_yaml(path: Path) -> Any:
     """Return the values of a file.
 
     Raises:
-        UserError: for a file that is larger or deeper than any configuration of a run, or refers to
-            parts of itself.
+        UserError: for a file that cannot be read, is larger or deeper than any configuration of a
+            run, or refers to parts of itself.
         yaml.YAMLError: for a file that is no YAML.
-        OSError: for a file that cannot be read.
+        OSError: for a folder, or without the right to read.
     """
-    size = path.stat().st_size
-    if size > LARGEST_FILE:
+    try:
+        text, depth = read_text(path, LARGEST_FILE), 0
+    except OSError as error:
+        if error.errno in IN_THE_WAY:
+            raise
         raise UserError(
-            f"{path} has {size} bytes, but the configuration of a run has at most {LARGEST_FILE}"
-        )
-    text, depth = path.read_text(encoding="utf-8"), 0
+            f"{path} is not the configuration of a run ({error.strerror}); put the file back that "
+            "coil-train wrote"
+        ) from error
     for event in yaml.parse(text, Loader=yaml.SafeLoader):
         if isinstance(event, yaml.CollectionStartEvent):
             depth += 1

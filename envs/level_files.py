@@ -5,7 +5,6 @@ import io
 import math
 import os
 import re
-import stat
 from collections.abc import Iterator, Sequence
 from functools import cache
 from importlib import resources
@@ -14,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 
+from coil_rl.envs.regular_files import read_regular
 from coil_rl.envs.track import Track, TrackError
 
 Split = Literal["train", "test", "all"]
@@ -190,10 +190,7 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _read(path: Path) -> str:
     """Return the text of a level file; a `TrackError` says why it cannot be read."""
     try:
-        status = path.stat()
-        # Pipes and devices may never end.
-        usable = stat.S_ISREG(status.st_mode) and status.st_size <= MAX_BYTES
-        text = path.read_text(encoding="utf-8-sig") if usable else None
+        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError:
         raise TrackError(f"{path} is not a text file; save the level as CSV in UTF-8.") from None
     except (OSError, ValueError) as error:
@@ -201,10 +198,6 @@ def _read(path: Path) -> str:
         raise TrackError(
             f"{path} cannot be read ({reason}); give the path of a level file."
         ) from None
-    if text is None:
-        raise TrackError(
-            f"{path} is no file of at most {MAX_BYTES} bytes; give the path of a level file."
-        )
     if not text.strip():
         raise TrackError(
             f"{path} is empty; give a level file with the columns {', '.join(COLUMNS)}."

@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig
 
 import coil_paper.schema  # noqa: F401  registers the root configuration with Hydra
-from coil_rl import UserError, did_you_mean, run_program
+from coil_rl import NoSweepError, UserError, did_you_mean, run_program
 
 if TYPE_CHECKING:
     from coil_paper.reproduce.result import Result, Runs
@@ -162,7 +162,7 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError(
+        raise NoSweepError(
             "results are made one after the other; "
             "leave out -m, and request several as in table=[1,4]"
         )

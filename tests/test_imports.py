@@ -35,7 +35,8 @@ PUBLIC = [
 # Folder -> allowed imports besides the standard library and the folder itself.
 ALLOWED = {
     "transforms": TENSOR_LIBRARIES,
-    "envs": TENSOR_LIBRARIES | {"numpy", "scipy", "mcap", "rosbags", "gymnasium"},
+    "envs": TENSOR_LIBRARIES
+    | {"numpy", "scipy", "mcap", "lz4", "zstandard", "rosbags", "gymnasium"},
     "conf": set(),
 }
 

@@ -19,6 +19,8 @@ from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested
 from coil_rl.transforms.guide_transform import SeededGenerator
 from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
+LONGEST_DELAY = 10_000  # steps, each of which is kept for every row
+
 
 class DegradedAdvice(Transform):
     """Base class: applies `degrade` to the advice of all guides.
@@ -327,7 +329,7 @@ class DelayedAdvice(DegradedAdvice):
     """Advice of an earlier step; at first the first advice of the episode.
 
     Args:
-        steps: the delay, 0 for none; less is a `ValueError`.
+        steps: the delay, 0 for none, at most 10,000; else a `ValueError`.
         key: entry of the advice, [*batch, n_guides, A].
         memory_key: entry for the advice of the last steps, [*batch, steps, n_guides, A], oldest
             first.
@@ -341,8 +343,8 @@ class DelayedAdvice(DegradedAdvice):
         key: NestedKey = "guide_action",
         memory_key: NestedKey = "delayed_advice",
     ) -> None:
-        if steps < 0:
-            raise ValueError(f"steps={steps} must be at least 0")
+        if not 0 <= steps <= LONGEST_DELAY:
+            raise ValueError(f"steps={steps} must be at least 0 and at most {LONGEST_DELAY}")
         super().__init__(key, memory_key, steps)
 
     def _reset(

@@ -18,6 +18,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report import Returns
 from coil_rl.report.pictures import Picture
+from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
 from coil_rl.run.parts import TEST, TRAIN, EnvMaker
@@ -94,6 +95,8 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         f"guide.{name} sees: {what}; it may know more than the agent."
         for name, what in what_guides_see(config).items()
     ]
+    if has_agent:
+        notes += about_returns(make_env.sizes)
     return Trial(
         OmegaConf.select(config, "label") or "",  # the programs without an agent have none
         build_evaluation(config, recorded(pictures)),
@@ -108,6 +111,27 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         device=config.device,
         notes=notes,
     )
+
+
+def about_returns(sizes: Mapping[str, int]) -> list[str]:
+    """Return what the return of the progress bar, of the curve and of the table counts.
+
+    Args:
+        sizes: number of cases of each set.
+    """
+    sentences = [
+        "All returns are sums of the env's own rewards: `training` beside the progress bar is the "
+        "mean of the last 100 episodes, with exploration; `curve` and learning_curve.png are means "
+        "of deterministic episodes in the cases of the curve; the table has those of the test."
+    ]
+    if EVALUATION in sizes:
+        chosen = ""
+        if SELECTION in sizes:
+            chosen = f", and policy_best was chosen in {sizes[SELECTION]} others"
+        sentences.append(
+            f"The curve rests on {sizes[EVALUATION]} cases{chosen}; none of them is in the table."
+        )
+    return sentences
 
 
 def build_evaluation(

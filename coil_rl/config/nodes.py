@@ -14,6 +14,20 @@ from torchrl.envs import Transform
 from coil_rl.config.arguments import check_arguments, yaml_text
 from coil_rl.errors import UserError
 
+# Largest numbers of arguments of other libraries, by class: memory grows with them, and the
+# libraries do not check them.
+LARGEST_ARGUMENTS = {
+    ("CatFrames", "N"): 1000,
+    ("TimeMaxPool", "T"): 1000,
+    ("PolynomialFeatures", "degree"): 10,
+    ("SplineTransformer", "n_knots"): 1000,
+    ("SplineTransformer", "degree"): 10,
+    ("MLPRegressor", "hidden_layer_sizes"): 4096,
+    ("HistGradientBoostingRegressor", "max_iter"): 10_000,
+    ("TheilSenRegressor", "max_subpopulation"): 1_000_000,
+}
+MOST_ESTIMATORS = 10_000  # in an ensemble
+
 
 def build(node: Any, name: str, expected: type | None = None, **arguments: Any) -> Any:
     """Instantiate a node of the configuration, and the nodes inside it.
@@ -77,10 +91,27 @@ def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
         for key, value in node.items():
             _check(value, f"{name}.{key}")
         if "_target_" in node:
-            check_arguments(find_target(node["_target_"], name), node, name, program)
+            target = find_target(node["_target_"], name)
+            check_arguments(target, node, name, program)
+            _check_size(target, node, name)
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(value, f"{name}[{index}]")
+
+
+def _check_size(target: Callable[..., Any], node: Mapping[str, Any], name: str) -> None:
+    """Raise a `UserError` for an argument of another library that memory cannot hold."""
+    for key, value in node.items():
+        largest = LARGEST_ARGUMENTS.get((getattr(target, "__name__", ""), key))
+        if key == "n_estimators":
+            largest = MOST_ESTIMATORS
+        numbers = value if isinstance(value, (list, tuple)) else [value]
+        for number in numbers:
+            if largest is not None and isinstance(number, int) and number > largest:
+                raise UserError(
+                    f"{name}.{key}={yaml_text(value)} must be at most {largest}: memory grows "
+                    "with it"
+                )
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:

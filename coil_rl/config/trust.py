@@ -30,6 +30,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.schema import TrainConfig
 from coil_rl.errors import UserError, did_you_mean
+from coil_rl.run.stopping import remember_trust
 from coil_rl.trusted import ESTIMATORS, TRUSTED
 
 ENTRY_POINTS = (
@@ -87,6 +88,7 @@ def trust_packages(packages: Iterable[str], command: DictConfig | None = None) -
                 f"trust=[{name}] cannot be: functions of {name} run any code; name the package of "
                 "the part"
             )
+    remember_trust(names)
     _packages = frozenset(names)
     _own = frozenset() if command is None else _targets(command)
 

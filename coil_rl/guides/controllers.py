@@ -25,6 +25,7 @@ from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
 from coil_rl.errors import did_you_mean
+from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
 from coil_rl.transforms.action_space import nested_key
 
@@ -322,8 +323,8 @@ def _check_call(
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
     """Return the actions of a CSV file, [T, A]."""
     try:
-        with open(file, encoding="utf-8") as text:
-            rows = [line.strip().split(",") for line in text if line.strip()]
+        text = read_text(file, LARGEST_TABLE)
+        rows = [line.strip().split(",") for line in text.splitlines() if line.strip()]
         try:
             np.array(rows[:1], dtype=np.float32)
         except ValueError:

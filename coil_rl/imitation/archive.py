@@ -15,6 +15,7 @@ import numpy as np
 import skops.io
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, is_regressor
+from sklearn.dummy import DummyRegressor
 from sklearn.ensemble import (
     ExtraTreesRegressor,
     GradientBoostingRegressor,
@@ -23,6 +24,7 @@ from sklearn.ensemble import (
 )
 from sklearn.ensemble._hist_gradient_boosting.predictor import TreePredictor
 from sklearn.neighbors import KNeighborsRegressor, RadiusNeighborsRegressor
+from sklearn.preprocessing import PolynomialFeatures
 from sklearn.svm import SVR, NuSVR
 from sklearn.tree import DecisionTreeRegressor
 from sklearn.tree._tree import Tree
@@ -37,6 +39,7 @@ CLASSES = {
     "_BinMapper",
 }
 FORESTS = (RandomForestRegressor, ExtraTreesRegressor, GradientBoostingRegressor)
+LARGEST_WIDTH = 10_000  # features that are made of those of a row
 FUNCTIONS = (types.FunctionType, types.BuiltinFunctionType, types.MethodType, partial)
 
 
@@ -48,7 +51,12 @@ def dump(model: BaseEstimator) -> bytes:
     """
     content: bytes = skops.io.dumps(model)
     _types(content)
-    _check(model)
+    try:
+        _check(model)
+    except ValueError as error:
+        raise UserError(
+            f"a {type(model).__name__} like this cannot be saved ({error}); use another regressor"
+        ) from error
     return content
 
 
@@ -141,6 +149,9 @@ def _check_estimator(part: BaseEstimator, state: Mapping[str, Any]) -> None:
     elif isinstance(part, (KNeighborsRegressor, RadiusNeighborsRegressor)) and "_fit_X" in state:
         # Finds the neighbours by a tree of its own, made from the points.
         part.fit(part._fit_X, part._y)
+    elif isinstance(part, PolynomialFeatures) and "n_output_features_" in state:
+        usual = 0 < state["n_output_features_"] <= LARGEST_WIDTH
+        _require(usual, f"there are more than {LARGEST_WIDTH} polynomial features")
 
 
 def _check_tree(part: DecisionTreeRegressor, inputs: int | None) -> None:
@@ -169,6 +180,20 @@ def _check_forest(part: Any, inputs: int | None) -> None:
     if isinstance(part, GradientBoostingRegressor):
         one_output = np.shape(part.estimators_) == (len(trees), 1)
         _require(one_output, "boosted trees have a wrong shape")
+        _check_first_prediction(vars(part).get("init_"))
+
+
+def _check_first_prediction(first: object) -> None:
+    """Check what boosted trees add to: the trees write beyond its end if it has too few rows."""
+    if isinstance(first, str):
+        _require(first == "zero", "boosted trees begin with something unknown")
+        return
+    _require(type(first) is DummyRegressor, "boosted trees begin with another regressor")
+    state = vars(first)
+    constant: Any = state.get("constant_")
+    one = np.shape(constant) == (1, 1) and state.get("n_outputs_") == 1
+    _require(one, "boosted trees begin with a wrong number of predictions")
+    _check_numbers(constant, constant)
 
 
 def _check_histograms(

@@ -6,6 +6,7 @@ its fitted state can be saved. So the learner is the same for a network, a fores
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Self
@@ -14,7 +15,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator, clone, is_regressor
-from sklearn.ensemble import ExtraTreesRegressor, RandomForestRegressor
+from sklearn.ensemble import (
+    ExtraTreesRegressor,
+    GradientBoostingRegressor,
+    RandomForestRegressor,
+)
 from sklearn.utils import get_tags
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -136,7 +141,8 @@ class SklearnRegressor(Regressor):
 
     Args:
         estimator: the regressor, of which only the parameters are used; a `random_state` that is
-            None is set to 0. Anything else is a `ValueError`.
+            None is set to 0, and `n_jobs` to at most the number of processors. Anything else is a
+            `ValueError`, and so are boosted trees that begin with another regressor.
 
     Example:
         >>> from sklearn.linear_model import LinearRegression
@@ -157,6 +163,8 @@ class SklearnRegressor(Regressor):
         self.estimator = _with_parameter(
             clone(estimator), "random_state", lambda value: 0 if value is None else value
         )
+        self.estimator = _with_parameter(self.estimator, "n_jobs", _possible_jobs)
+        _check_boosted(self.estimator)
         self.inputs, self.outputs = 0, 1
         self.model: BaseEstimator | None = None
         self._archive: Tensor | None = torch.empty(0, dtype=torch.uint8)
@@ -179,10 +187,21 @@ class SklearnRegressor(Regressor):
         return fresh
 
     def fit(self, x: Tensor, y: Tensor) -> None:
-        """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision."""
+        """Fit y [N, outputs] to x [N, inputs] from scratch, in double precision.
+
+        Data that the estimator refuses are a `UserError`.
+        """
         if self.outputs == 1 and get_tags(self.estimator).target_tags.single_output:
             y = y.squeeze(-1)
-        fitted = clone(self.estimator).fit(x.cpu().double().numpy(), y.cpu().double().numpy())
+        try:
+            fitted = clone(self.estimator).fit(x.cpu().double().numpy(), y.cpu().double().numpy())
+        except Exception as error:  # whatever a library raises
+            name = type(self.estimator).__name__
+            raise UserError(
+                f"{name} cannot be fitted to {len(x)} samples of {x.shape[-1]} inputs "
+                f"({type(error).__name__}: {error!s:.300}); change its parameters, or use another "
+                "regressor"
+            ) from error
         # For small batches threads cost more than they save, and they sum in random order.
         self.model = _with_parameter(fitted, "n_jobs", lambda _: 1)
         self._archive = None
@@ -191,7 +210,13 @@ class SklearnRegressor(Regressor):
         """Predict y [*batch, outputs] for x [*batch, inputs]."""
         if self.model is None:
             return x.new_zeros(*x.shape[:-1], self.outputs)
-        y = _predict(self.model, x.detach().reshape(-1, x.shape[-1]).cpu().numpy())
+        rows = x.detach().reshape(-1, x.shape[-1]).cpu().numpy()
+        y = _predict(self.model, rows)
+        if np.size(y) != len(rows) * self.outputs:
+            raise UserError(
+                f"{type(self.model).__name__} predicts {np.shape(y)} for {len(rows)} rows and "
+                f"{self.outputs} outputs; use another regressor"
+            )
         prediction = torch.from_numpy(np.asarray(y, np.float32)).to(x)
         return prediction.reshape(*x.shape[:-1], self.outputs)
 
@@ -215,8 +240,8 @@ class SklearnRegressor(Regressor):
             )
         if model is not None:
             try:
-                prediction = _predict(model, np.zeros((1, self.inputs), np.float32))
-                usable = np.size(prediction) == self.outputs and np.isfinite(prediction).all()
+                prediction = _predict(model, np.zeros((3, self.inputs), np.float32))
+                usable = np.size(prediction) == 3 * self.outputs and np.isfinite(prediction).all()
             except Exception as error:
                 raise UserError(
                     f"the state holds a regressor that cannot predict ({type(error).__name__})"
@@ -239,6 +264,27 @@ def _predict(model: BaseEstimator, x: NDArray[np.float32]) -> NDArray[np.floatin
         trees = model.estimators_
         return sum(tree.tree_.predict(x.astype(np.float32)) for tree in trees) / len(trees)
     return model.predict(x)
+
+
+def _possible_jobs(jobs: object) -> object:
+    """Return a number of processes that is at most that of the processors."""
+    most = os.cpu_count() or 1
+    return max(-most, min(jobs, most)) if isinstance(jobs, int) else jobs
+
+
+def _check_boosted(estimator: BaseEstimator) -> None:
+    """Raise a `ValueError` for boosted trees that could not be saved.
+
+    Args:
+        estimator: the estimator, which may hold others.
+    """
+    for part in (estimator, *estimator.get_params().values()):
+        if not isinstance(part, GradientBoostingRegressor) or part.init in (None, "zero"):
+            continue
+        raise ValueError(
+            f"{part!r:.200} begins with another regressor, which cannot be checked when it is "
+            "loaded; leave init out, or set it to zero"
+        )
 
 
 def _with_parameter(

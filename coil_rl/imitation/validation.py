@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from sklearn.metrics import mean_squared_error, r2_score
 from sklearn.model_selection import GroupKFold, train_test_split
 from torch import Tensor
-from tqdm import tqdm
 
 from coil_rl.errors import UserError
 from coil_rl.imitation.regressors import Regressor
+from coil_rl.output import progress
 
 MAX_FOLDS = 10
 TEST_SHARE = 0.2  # of the random split
@@ -52,7 +52,7 @@ def cross_validate(
         splits["by_track"] = group_splits(groups)
     metrics: dict[str, float] = {}
     fits = sum(len(folds) for folds in splits.values())
-    with tqdm(total=fits, unit="fit", desc="validate", leave=False) as bar:
+    with progress(total=fits, unit="fit", desc="validate", leave=False) as bar:
         for name, folds in splits.items():
             predictions, targets = [], []
             for fold in folds:

@@ -165,10 +165,16 @@ class PhaseSchedule:
         return position | {"phase": astuple(self.phase), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from `state_dict`."""
-        self.number, self.frames = state["number"], state["frames"]
-        self.rewards = list(state["rewards"])
-        self.phase = Phase(*state["phase"])
+        """Restore a state from `state_dict`; one with other guides is a `ValueError`."""
+        self.number, self.frames = int(state["number"]), int(state["frames"])
+        self.rewards = [float(reward) for reward in state["rewards"]]
+        agent, guides, earlier = state["phase"]
+        if not set(guides) <= set(range(self.guides)):
+            raise ValueError(
+                f"the guides {list(guides)} learn in it, but the numbers of guides here are below "
+                f"{self.guides}"
+            )
+        self.phase = Phase(bool(agent), tuple(guides), int(earlier))
         self.generator.set_state(state["generator"])
 
 

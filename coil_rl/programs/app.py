@@ -11,15 +11,20 @@ overrides then take a second:
         return run(config)
 """
 
+import contextlib
 import functools
 import logging
+import math
 import os
 import re
+import shlex
 import shutil
 import signal
 import sys
+import threading
+import traceback
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -31,6 +36,7 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.experimental.callback import Callback
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -40,6 +46,9 @@ from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.config.written import keep_written, key_of
 from coil_rl.errors import UserError
+from coil_rl.files import FAILED_JOBS
+from coil_rl.output import SafeStream, say
+from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
 HYDRA_FILES = (
@@ -49,6 +58,12 @@ HYDRA_FILES = (
 )  # in the subfolder hydra.output_subdir of a job
 _new_folders: list[Path] = []  # made by Hydra for this run or sweep, the innermost first
 _interrupts: list[int] = []  # signals of this program
+_sweep: list[str] = []  # folder of the sweep of this program, if it is one
+MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
+
+
+class NoSweepError(UserError):
+    """A program that has no sweeps was started as one, so that none of its jobs is to be done."""
 
 
 class NewFolders(Callback):
@@ -62,8 +77,13 @@ class NewFolders(Callback):
         _record(config, "hydra.run.dir")
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """Record the folder of a sweep."""
+        """Record the folder of a sweep, and say how it goes on if it is stopped."""
         _record(config, "hydra.sweep.dir")
+        _sweep[:] = [str(config.hydra.sweep.dir)]
+        Path(_sweep[0], FAILED_JOBS).unlink(missing_ok=True)
+        if "existing" in config:  # the jobs are runs, which go on where they were stopped
+            command = _sweep_command(sys.argv, _sweep[0])
+            say(f"if this sweep is stopped, go on with: {command}", error=True)
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Record the folder of a job of a sweep."""
@@ -149,23 +169,24 @@ def run_program(
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)  # it logs the errors that it raises
     _new_folders.clear()
     _interrupts.clear()
+    _sweep.clear()
     bugs: list[Exception] = []
+    jobs = Jobs(config_name)
 
     @functools.wraps(task)
     def checked(config: DictConfig) -> Any:
         try:
-            given = HydraConfig.get().overrides
-            keep_written(config, config_name, given.task, given.hydra)
-            trust_packages(config.get("trust", []), config)
-            check(config)
-            if _interrupts:
-                raise KeyboardInterrupt
-            return task(config)
+            return _do(task, check, config)
+        except KeyboardInterrupt as error:
+            if jobs.is_sweep():
+                raise KeyboardInterrupt(f"continue with: {jobs.command}") from error
+            raise
         except Exception as error:
+            if jobs.is_sweep() and not isinstance(error, NoSweepError):
+                return jobs.fail(error)
             if is_no_bug(error):
-                refuse(
-                    config_name, error
-                )  # here, because Hydra prints a line of its own for an error of the task
+                # Here, because Hydra prints a line of its own for an error of the task.
+                refuse(config_name, error)
             bugs.append(error)
             raise
 
@@ -188,19 +209,36 @@ def run_program(
             if error in bugs:
                 raise
             refuse(config_name, error)
+        jobs.report()
+
+
+def _do(
+    task: Callable[[DictConfig], Any], check: Callable[[DictConfig], None], config: DictConfig
+) -> Any:
+    """Do a task after a check of its configuration, and return its result."""
+    _listen()
+    if Jobs.is_sweep() and "existing" in config:
+        config.existing = "resume"  # so that a sweep goes on by the same command
+    given = HydraConfig.get()
+    keep_written(config, str(given.job.config_name), given.overrides.task, given.overrides.hydra)
+    trust_packages(config.get("trust", []), config)
+    check(config)
+    if _interrupts:
+        raise KeyboardInterrupt
+    return task(config)
 
 
 @contextmanager
 def program(name: str) -> Iterator[None]:
     """End the process with one sentence on standard error instead of a traceback.
 
-    The exit code is 2 for a mistake of the user, and 130 for Ctrl-C and SIGTERM.
+    The exit code is 2 for a mistake of the user, and 130 for Ctrl-C, SIGTERM, SIGHUP and SIGUSR1.
+    After one of the last three a training first ends its update and saves its state.
     """
-    if signal.getsignal(signal.SIGINT) is programs.interrupted:
-        signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _interrupt)
+    _listen()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
+    sys.stdout, sys.stderr = SafeStream(sys.stdout), SafeStream(sys.stderr)
     try:
         yield
     except (Exception, KeyboardInterrupt) as error:
@@ -212,15 +250,113 @@ def program(name: str) -> Iterator[None]:
         if not is_no_bug(error):
             raise
         refuse(name, error)
+    finally:
+        sys.stdout, sys.stderr = _end(sys.stdout), _end(sys.stderr)
 
 
-def _interrupt(signum: int, frame: FrameType | None) -> NoReturn:
-    """Raise a `KeyboardInterrupt`, and remember it.
+def _end(stream: Any) -> Any:
+    """Return the stream in a `SafeStream`; one that is broken would change the exit code."""
+    if not isinstance(stream, SafeStream):
+        return stream
+    stream.flush()
+    return open(os.devnull, "w", encoding="utf-8") if stream.broken else stream.stream
 
-    A module that is being imported may swallow it.
+
+def _listen() -> None:
+    """Handle signals, in this process or in that of a job of a sweep."""
+    if threading.current_thread() is not threading.main_thread():
+        return  # other threads cannot
+    if signal.getsignal(signal.SIGINT) is programs.interrupted:
+        signal.signal(signal.SIGINT, _interrupt)
+    for name in ("SIGTERM", "SIGHUP", "SIGUSR1"):  # the last two are missing on Windows
+        number = getattr(signal, name, None)
+        # A program under nohup ignores SIGHUP.
+        if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+
+
+def _interrupt(signum: int, frame: FrameType | None) -> None:
+    """Raise a `KeyboardInterrupt`, unless a training ends its update first.
+
+    It is remembered, because a module that is being imported may swallow it.
     """
     _interrupts.append(signum)
-    raise KeyboardInterrupt
+    if signum == signal.SIGINT or not STOP.ask():
+        raise KeyboardInterrupt
+
+
+class Jobs:
+    """The jobs of a sweep, which may run in other processes.
+
+    One that fails leaves the others alone.
+
+    A job that fails writes a line into a file in the folder of the sweep.
+
+    Args:
+        name: of the program.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.arguments = list(sys.argv)  # those of a process of its own are others
+
+    @staticmethod
+    def is_sweep() -> bool:
+        """Return whether this is a job of a sweep."""
+        return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+    @property
+    def command(self) -> str:
+        """The command that continues the sweep, as a shell reads it."""
+        return _sweep_command(self.arguments, HydraConfig.get().sweep.dir)
+
+    def fail(self, error: Exception) -> float:
+        """Note that a job failed, and return NaN, its result.
+
+        Args:
+            error: a mistake of the user, or a bug, whose traceback is printed.
+        """
+        hydra_config = HydraConfig.get()
+        overrides = " ".join(hydra_config.overrides.task)
+        reason = sentence(error)
+        if not is_no_bug(error):
+            traceback.print_exception(error)
+            reason = f"{type(error).__name__}: {reason}"
+        line = f"job {hydra_config.job.num} ({overrides}): {reason}"
+        say(f"{self.name}: {line}; the other jobs go on", error=True)
+        with contextlib.suppress(OSError):  # it is empty
+            Path(hydra_config.runtime.output_dir).rmdir()
+        with Path(hydra_config.sweep.dir, FAILED_JOBS).open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")
+        return math.nan
+
+    def report(self) -> None:
+        """End the program with exit code 2 if jobs have failed."""
+        path = Path(_sweep[0], FAILED_JOBS) if _sweep else None
+        if path is None or not path.is_file():
+            return
+        lines = path.read_text(encoding="utf-8").splitlines()
+        count = "1 job" if len(lines) == 1 else f"{len(lines)} jobs"
+        refuse(
+            self.name,
+            UserError(
+                f"{count} of this sweep failed: {'; '.join(lines)}; correct the cause, and do what "
+                f"is missing by {_sweep_command(self.arguments, _sweep[0])}"
+            ),
+        )
+
+
+def _sweep_command(arguments: Sequence[str], folder: str) -> str:
+    """Return the command that continues a sweep, as a shell reads it.
+
+    Args:
+        arguments: of the program that began it, its own path first.
+        folder: of the sweep.
+    """
+    program, *others = arguments
+    if not any(argument.startswith("hydra.sweep.dir=") for argument in others):
+        others.append(f"hydra.sweep.dir={folder}")
+    return shlex.join([f"coil-{Path(program).stem.removeprefix('coil-')}", *others])
 
 
 def refuse(name: str, error: Exception) -> NoReturn:
@@ -234,7 +370,8 @@ def refuse(name: str, error: Exception) -> NoReturn:
         for path in inside:
             if path.name == "hydra.yaml":
                 of_jobs |= {path.with_name(file) for file in HYDRA_FILES}
-        if all(path.name == "multirun.yaml" or path in of_jobs for path in inside):
+        of_sweep = ("multirun.yaml", FAILED_JOBS)
+        if all(path.name in of_sweep or path in of_jobs for path in inside):
             shutil.rmtree(folder, ignore_errors=True)
     _new_folders.clear()
     print(f"{name}: {sentence(error)}", file=sys.stderr)
@@ -255,3 +392,7 @@ def _check_options(config_name: str) -> None:
     for override in parser.parse_args().overrides:
         if override.startswith("="):
             error(f"{override!r} has no key, write KEY=VALUE")
+        jobs = re.fullmatch(r"\+*hydra\.launcher\.n_jobs=(-?\d+)", override)
+        most = max(MOST_PROCESSES, 4 * (os.cpu_count() or 1))
+        if jobs and abs(int(jobs[1])) > most:
+            error(f"{override} must be at most {most} on this machine")

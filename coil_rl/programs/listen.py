@@ -79,13 +79,12 @@ def _measure(
     evaluation: Evaluation,
 ) -> tuple[Survey, Mapping[Ablation, Sequence[Mapping[str, Any]]]]:
     """Return the measures with all guides, and the episodes without the advice of one guide."""
-    from tqdm import tqdm
-
     from coil_rl.listening import survey as surveys
+    from coil_rl.output import progress
     from coil_rl.run.parts import TEST
 
     rows = len(evaluation.cases) * run.trial.repeats
-    with tqdm(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
+    with progress(unit="step", desc="listen", leave=False, mininterval=0.5) as bar:
         bar.set_postfix_str("all guides")
         env = run.make_env(rows, TEST)
         data = surveys.survey(

@@ -30,11 +30,11 @@ def replay(config: DictConfig) -> None:
     The results of each recording are written, then `replay.md`.
     """
     import torch
-    from tqdm import tqdm
 
     from coil_rl.config.nodes import build
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
+    from coil_rl.output import progress
     from coil_rl.replay.open_loop import open_loop
     from coil_rl.replay.report import caution, describe, outcome
     from coil_rl.report.table import TABLES
@@ -46,7 +46,7 @@ def replay(config: DictConfig) -> None:
     _check_unique("recording", [recording.path for recording in env.recordings])
     runs, policies = _load_policies(config, env)
     scans = int(env.length.max()) * len(policies)
-    with tqdm(total=scans, unit="scan", desc="replay", leave=False) as bar:
+    with progress(total=scans, unit="scan", desc="replay", leave=False) as bar:
 
         def tick(name: str) -> None:
             bar.set_postfix_str(name, refresh=False)
@@ -56,7 +56,7 @@ def replay(config: DictConfig) -> None:
     folder = Path(config.run_dir)
     names = _numbered([result.recording.path.name.removesuffix(".mcap") for result in results])
     folders = [folder / name for name in names] if len(names) > 1 else [folder]
-    destinations = tqdm(folders, unit="recording", desc="write", leave=False)
+    destinations = progress(iterable=folders, unit="recording", desc="write", leave=False)
     for destination, result in zip(destinations, results, strict=True):
         _write(config, result, runs, destination)
     parts = [describe(result) for result in results]

@@ -34,7 +34,8 @@ def report(config: DictConfig) -> None:
     from coil_rl.files import write_text
     from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
-    from coil_rl.report.runs import read_runs
+    from coil_rl.report.configurations import distinguish
+    from coil_rl.report.runs import failed_jobs, read_runs
 
     folders = _folders(config)
     runs = read_runs(folders)
@@ -45,6 +46,7 @@ def report(config: DictConfig) -> None:
             f"continue one with coil-train resume={runs[0].folder}, "
             "or repeat the command that started them"
         )
+    finished, differences = distinguish(finished)
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}
@@ -55,7 +57,8 @@ def report(config: DictConfig) -> None:
     parts += [*page.training(finished), *page.guide_training(finished)]
     normalised = any(comparison.normalised for comparison in compared.values())
     parts.append(page.notes(against, normalised, "sampled" in compared))
-    parts.append(page.progress(len(finished), len(runs)))
+    parts += differences
+    parts.append(page.progress(len(finished), len(runs), failed_jobs(folders)))
     text = "\n\n".join(parts)
 
     folder = folders[0]
@@ -105,7 +108,16 @@ def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> Non
         draw_curve_grid(curves, path, guides=guides)
     elif curves:
         guide = {"guide": next(iter(guides.values()))} if guides else {}
-        draw_learning_curves(curves, path, guides=guide)
+        sizes = {_cases_of_curve(run) for run in runs if run.curve}
+        cases = sizes.pop() if len(sizes) == 1 else None
+        draw_learning_curves(curves, path, guides=guide, cases=cases)
+
+
+def _cases_of_curve(run: Run) -> int | None:
+    """Return the number of cases of the curve of a run; None if its configuration has none."""
+    curve = (run.settings.get("evaluation") or {}).get("curve") or {}
+    count = curve.get("num_envs")
+    return count if isinstance(count, int) else None
 
 
 def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:
@@ -141,7 +153,7 @@ def check(config: DictConfig) -> None:
 
     check_values(config)
     if HydraConfig.get().mode == RunMode.MULTIRUN:
-        raise UserError(
+        raise app.NoSweepError(
             "a report covers several folders at once; leave out -m and write folder=[ONE,OTHER]"
         )
     first = _folders(config)[0]

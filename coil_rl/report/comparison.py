@@ -83,6 +83,19 @@ class Group:
         """Mean score."""
         return estimate(self.scores.mean(axis=1))
 
+    @cached_property
+    def score_of_cases(self) -> Estimate:
+        """Mean score, with the interval over the cases: of the means over seeds in each case."""
+        return estimate(self.scores.mean(axis=0))
+
+    def known(self, measure: str) -> int:
+        """Return in how many of the results, one for each seed and case, a measure is known.
+
+        Args:
+            measure: name of the measure.
+        """
+        return int(self.table[measure].notna().sum()) if measure in self.table else 0
+
     @property
     def rank(self) -> tuple[float, float]:
         """Sort key: the completed share, then the mean score, the best first."""
@@ -93,14 +106,16 @@ class Group:
     def crashes(self) -> str | None:
         """Number of seeds that crashed in any case, with the interval of its share.
 
-        For a guide with a single evaluation it is the number of cases. It is None if crashes are
-        not measured.
+        For a guide with a single evaluation it is the number of cases, with the interval of its
+        share. It is None if crashes are not measured.
         """
         if not self.has("crashed"):
             return None
         crashed = self.by_seed("crashed")
         if self.seeds is None:
-            return f"{int((crashed > 0).to_numpy().sum())} of {len(self.cases)} cases"
+            count = int((crashed > 0).to_numpy().sum())
+            share, _, interval = count_of_seeds(count, len(self.cases)).partition(" (")
+            return f"{share} cases ({interval}"
         return count_of_seeds(int((crashed > 0).any(axis=1).sum()), self.seeds)
 
     def has(self, measure: str) -> bool:
@@ -118,7 +133,7 @@ class Group:
             case: index of the only case to count; None for all of them.
         """
         rows = self.table if case is None else self.table.xs(self.cases[case], level="case")
-        means = {"reward": float(rows["reward"].mean())}
+        means = {"reward": float(rows["reward"].mean(skipna=False))}
         for name, each in self.measures.items():
             if name in rows:
                 means[name] = each.pool(rows[name].tolist())
@@ -181,12 +196,16 @@ class Comparison:
                     "advice": group.advice,
                     "guide": group.guide.name if group.guide else None,
                     "seeds": group.seeds,
+                    "cases": len(group.cases),
                     "completed": means.pop("completed", None),
                     "crashes": group.crashes,
                     "score": group.score.mean,
                     "low": group.score.low,
                     "high": group.score.high,
+                    "low_of_cases": group.score_of_cases.low,
+                    "high_of_cases": group.score_of_cases.high,
                     **means,
+                    **self._partial(group),
                     "difference": difference.mean,
                     "difference_low": difference.low,
                     "difference_high": difference.high,
@@ -198,6 +217,16 @@ class Comparison:
         for row, p in zip(rows, holm([row["p"] for row in rows]), strict=True):
             row["p"] = float(p)
         return rows
+
+    def _partial(self, group: Group) -> dict[str, int]:
+        """Return in how many results each measure is known, unless it is in all results of all."""
+        names = dict.fromkeys(
+            name
+            for each in self.groups
+            for name in each.measures
+            if 0 < each.known(name) < len(each.table)
+        )
+        return {f"{name}_results": group.known(name) for name in names}
 
     def case_table(self) -> list[dict[str, Any]]:
         """Return one row per policy and case."""

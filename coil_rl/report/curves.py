@@ -36,6 +36,7 @@ def draw_learning_curves(
     *,
     guides: Mapping[str, float] | None = None,
     title: str | None = None,
+    cases: int | None = None,
 ) -> None:
     """Draw the return of the kept policies against frames, one curve per label.
 
@@ -49,7 +50,9 @@ def draw_learning_curves(
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
+        cases: number of cases that each return is the mean of; None if it is not known.
     """
+    returns = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
     strokes = style.strong_strokes(runs)
     handles: list[Artist] = []
@@ -59,7 +62,7 @@ def draw_learning_curves(
     if any(len(seeds) > 1 for seeds in runs.values()):
         handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
     with style.picture(path, title, handles, 4.2) as figure:
-        axes = figure.add_subplot(xlabel="frames", ylabel=RETURNS)
+        axes = figure.add_subplot(xlabel="frames", ylabel=returns)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         style.lighten(axes)
         for label, stroke in strokes.items():

@@ -21,9 +21,9 @@ from matplotlib.patheffects import Normal
 from matplotlib.patheffects import Stroke as StrokeEffect
 from numpy.typing import ArrayLike
 from PIL import Image
-from tqdm import tqdm
 
 from coil_rl.files import whole_file
+from coil_rl.output import progress
 from coil_rl.report import style
 from coil_rl.report.track_plot import Array, TrackPlot
 
@@ -180,7 +180,9 @@ class _Animation:
 
     def frames(self) -> Iterator[Image.Image]:
         """Yield the frames."""
-        for time in tqdm(self.times, desc="animation", unit="frame", leave=False, disable=None):
+        for time in progress(
+            iterable=self.times, desc="animation", unit="frame", leave=False, disable=None
+        ):
             self.canvas.restore_region(self.background)
             now, start = round(time * self.rate), round((time - TAIL * self.speed) * self.rate)
             for car in self.cars:

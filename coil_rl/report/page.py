@@ -31,13 +31,33 @@ def section(
         rows: `comparison.table(against)`.
         against: what the policies are compared with, see `Comparison.table`.
     """
-    table = markdown_table(
-        with_cells(rows, comparison.score[1]), _columns(comparison, rows, against)
-    )
+    columns = _columns(comparison, rows, against)
+    shown = with_cells(rows, comparison.score[1])
+    for row, group in zip(shown, comparison.groups, strict=True):
+        row |= _shares(row, group, columns)
+    table = markdown_table(shown, columns)
     parts = _parts(comparison, TERM, "term of the reward", ".1f")
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
     return "\n\n".join([f"## {heading}", table, *parts, cases])
+
+
+def _shares(
+    row: Mapping[str, Any], group: Group, columns: Mapping[str, tuple[str, str]]
+) -> dict[str, str]:
+    """Return the cells of a policy whose means leave results out, as `12.3 (4 of 8)`.
+
+    Args:
+        row: of the table.
+        group: the policy.
+        columns: heading and number format by name.
+    """
+    cells = {}
+    for name in group.measures:
+        known, results = group.known(name), len(group.table)
+        if name in columns and 0 < known < results:
+            cells[name] = f"{row[name]:{columns[name][1]}} ({known} of {results})"
+    return cells
 
 
 def _columns(
@@ -76,7 +96,7 @@ def _hidden(
 
 
 def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, Any]]:
-    """Return rows of `Comparison.table` with `score cell` and `difference cell`.
+    """Return rows of `Comparison.table` with `score cell`, `cases cell` and `difference cell`.
 
     These cells show the intervals too.
 
@@ -89,6 +109,8 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
         score = Estimate(row["score"], row["low"], row["high"])
         difference = Estimate(row["difference"], row["difference_low"], row["difference_high"])
         cells = {"score cell": score.cell(spec), "difference cell": difference.cell(f"+{spec}")}
+        low, high = row["low_of_cases"], row["high_of_cases"]
+        cells["cases cell"] = None if math.isnan(low) else f"{low:{spec}} to {high:{spec}}"
         shown.append({**row, **cells})
     return shown
 
@@ -172,18 +194,22 @@ def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
 
 
-def progress(finished: int, started: int) -> str:
-    """Return a sentence on unfinished runs.
+def progress(finished: int, started: int, refused: int = 0) -> str:
+    """Return a sentence on the runs that the tables leave out.
 
     Args:
         finished: number of finished runs.
         started: number of all runs.
+        refused: number of jobs of sweeps that were refused or failed.
     """
+    jobs = ""
+    if refused:
+        jobs = f" {refused} jobs of the sweeps were refused or failed, see failed_jobs.txt."
     if finished == started:
-        return f"All {started} runs that were started are finished."
+        return f"All {started} runs that were started are finished.{jobs}"
     return (
         f"{finished} of {started} runs that were started are finished; "
-        "repeat their command to finish the others."
+        f"repeat their command to finish the others.{jobs}"
     )
 
 

@@ -1,16 +1,18 @@
 """Configuration, evaluation and learning curve of finished runs, read from their folders."""
 
+import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pandas as pd
 import yaml
 
 from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, LARGEST_TABLE, read_file, read_text
 from coil_rl.measures import Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
 
@@ -41,6 +43,7 @@ class Run:
         curve: rows of metrics.csv; empty without training.
         guide_returns: mean return of each guide in the evaluation, if known.
         seconds: duration of the training; None if unknown, as for an interrupted run.
+        settings: its configuration.
     """
 
     folder: Path
@@ -52,6 +55,7 @@ class Run:
     curve: Sequence[dict[str, float]] = field(default=(), repr=False)
     guide_returns: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
     def finished(self) -> bool:
@@ -86,6 +90,20 @@ def read_runs(folders: Sequence[Path]) -> list[Run]:
             if path.resolve() not in runs:
                 runs[path.resolve()] = _read_run(path)
     return list(runs.values())
+
+
+def failed_jobs(folders: Iterable[Path]) -> int:
+    """Return the number of jobs that sweeps in some folders have refused, or that failed.
+
+    Args:
+        folders: the folders, and all in them.
+    """
+    files = {path.resolve() for folder in folders for path in folder.rglob(FAILED_JOBS)}
+    count = 0
+    for path in sorted(files):
+        with file_of_a_run(path, "remove it"):
+            count += len(read_text(path, LARGEST_NUMBERS).splitlines())
+    return count
 
 
 def _is_run(config: Path, folder: Path) -> bool:
@@ -129,7 +147,7 @@ def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
         if not isinstance(config, dict):
             raise ValueError("a list")
         label, seed = str(config["label"]), int(config["seed"])
-        run = Run(path.parent, label, seed, config["method"]["needs_guide"])
+        run = Run(path.parent, label, seed, config["method"]["needs_guide"], settings=config)
         measures = measures_of((config.get("evaluation") or {}).get("measures") or {})
     except (yaml.YAMLError, AttributeError, ValueError, TypeError, KeyError) as error:
         problem = " ".join(str(error).split())
@@ -145,7 +163,7 @@ def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:
 def _read_numbers(path: Path) -> dict[str, float]:
     """Return the numbers in a JSON file by name; none without the file."""
     with file_of_a_run(path, RESTORE):
-        saved = json.loads(path.read_text()) if path.exists() else {}
+        saved = json.loads(read_file(path, LARGEST_NUMBERS)) if path.exists() else {}
         return {key: float(value) for key, value in saved.items()}
 
 
@@ -190,7 +208,8 @@ def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:
 
     So numbers keep every digit, and an empty cell is an error where a number is expected.
     """
-    frame = pd.read_csv(path, dtype=str, keep_default_na=False)
+    file = io.BytesIO(read_file(path, LARGEST_TABLE)) if isinstance(path, Path) else path
+    frame = pd.read_csv(file, dtype=str, keep_default_na=False)
     if not isinstance(frame.index, pd.RangeIndex):
         raise ValueError("a row with more values than columns")
     return frame

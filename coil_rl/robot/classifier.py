@@ -32,7 +32,7 @@ from coil_rl.envs.robot.drives import SimulatedDrive
 from coil_rl.envs.robot.lidar import RANGE_MIN
 from coil_rl.envs.robot.perception import ConeClassifier
 from coil_rl.errors import UserError
-from coil_rl.files import write_text
+from coil_rl.files import LARGEST_NUMBERS, read_text, write_text
 
 Flags = NDArray[np.bool_]
 # Ranges [N, P] m, and their bearings, [P] or [N, P] radians.
@@ -226,7 +226,7 @@ def load_classifier(path: str | os.PathLike[str]) -> ConeClassifier:
         UserError: if the file is missing, or not a cone classifier.
     """
     try:
-        classifier = ConeClassifier(**json.loads(Path(path).read_text(encoding="utf-8")))
+        classifier = ConeClassifier(**json.loads(read_text(path, LARGEST_NUMBERS)))
     except OSError as error:
         raise UserError(
             f"{path} cannot be read ({error.strerror}); give a classifier of coil_rl.robot"

@@ -10,10 +10,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coil_rl.learners.learner import CaseResults
 from coil_rl.measures import Measure
+from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.policy_batch import policy_batch
 from coil_rl.transforms.action_space import random_action
@@ -68,7 +68,7 @@ class SelectionCases:
         """Return return and failure of an episode of each row of an env, by name."""
         failure = {} if self.failure is None else {"failure": self.failure}
         totals = Totals({"return": Measure("episode_reward", "last")} | failure)
-        with tqdm(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
+        with progress(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
             for after, running in episodes(env, policy, tick=bar.update):
                 totals.add(after, running)
         return totals.results()

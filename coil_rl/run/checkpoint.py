@@ -2,17 +2,28 @@
 
 import hashlib
 import io
-import sys
+import pickle
+import zipfile
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from coil_rl.errors import UserError
-from coil_rl.files import folder_to_disk, whole_file
+from coil_rl.files import folder_to_disk, read_file, whole_file
+from coil_rl.output import say
 
 NEWEST, PREVIOUS = "checkpoint.pt", "checkpoint_previous.pt"
 DIGITS = 64  # of a SHA-256
+LARGEST_FILE = 16 * 2**30  # bytes
+# What the states of this project consist of, besides plain values and the storages of tensors.
+PARTS = {
+    ("torch._utils", "_rebuild_tensor_v2"),
+    ("torch._utils", "_rebuild_parameter"),
+    ("torch", "Size"),
+    ("torch", "device"),
+}
 
 
 def save(state: Any, path: Path) -> None:
@@ -27,18 +38,25 @@ def save(state: Any, path: Path) -> None:
 
 
 def load(path: Path, device: str = "cpu") -> Any:
-    """Read a state without running code.
+    """Read a state without running code, and with no more memory than its size.
 
-    A file that is not exactly what `save` wrote is a `UserError`.
+    Raises:
+        UserError: for a file that is not exactly what `save` wrote.
     """
     if not path.is_file():
         raise UserError(
             f"there is no file {path}; give the folder of a run that coil-train has finished"
         )
-    content = path.read_bytes()
+    try:
+        content = read_file(path, LARGEST_FILE)
+    except OSError as error:
+        raise UserError(
+            f"{path} cannot be read ({error.strerror}); give a file that coil-train wrote"
+        ) from error
     if _checksum(content[:-DIGITS]) != content[-DIGITS:]:
         raise UserError(f"{path} is damaged: its checksum is wrong; train again or use another")
     try:
+        _check_archive(content)
         return torch.load(io.BytesIO(content), map_location=device, weights_only=True)
     except Exception as error:
         raise UserError(
@@ -80,11 +98,66 @@ def load_newest(folder: Path) -> Any | None:
                 f"both {newest} and {previous} are damaged; put one of them back from a copy, or "
                 "train again in another folder"
             ) from error
-    print(f"{reason.split(';')[0]}; using {previous.name}", file=sys.stderr)
+    say(f"{reason.split(';')[0]}; using {previous.name}", error=True)
     # Otherwise the next checkpoint would replace the intact file by the damaged one.
     previous.replace(newest)
     folder_to_disk(folder)
     return state
+
+
+def _check_archive(content: bytes) -> None:
+    """Raise an error for an archive that takes more memory than its size, before that is taken.
+
+    Deflated entries may unpack to a thousand times their size, entries may share their bytes, and
+    a pickle may call a type that takes any amount of memory, such as `bytearray`.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = archive.infolist()
+        if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
+            raise ValueError("an entry is compressed")
+        if sum(entry.file_size for entry in entries) > len(content):
+            raise ValueError("its entries are larger than the file")
+        for entry in entries:
+            if entry.filename.endswith(".pkl"):
+                _Outline(io.BytesIO(archive.read(entry))).load()
+
+
+class _Outline(pickle.Unpickler):
+    """Reads a pickle without making a tensor; parts that no state of a run has are refused."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        """Return a stand-in for a part."""
+        if (module, name) in MADE:
+            return MADE[module, name]
+        storage = module == "torch" and name.endswith("Storage")
+        if not storage and (module, name) not in PARTS:
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of a state")
+        return _stand_in
+
+    def persistent_load(self, key: Any) -> None:
+        """Return nothing for the storage of a tensor."""
+
+
+def _encoded(text: Any, encoding: Any) -> bytes:
+    """Return bytes that a pickle holds as a text; other codecs may return more than they get."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise pickle.UnpicklingError("bytes are encoded in another way")
+    return text.encode(encoding)
+
+
+# Plain values that a pickle makes by a call.
+MADE = {
+    ("collections", "OrderedDict"): OrderedDict,
+    ("__builtin__", "set"): set,
+    ("builtins", "set"): set,
+    ("__builtin__", "complex"): complex,
+    ("builtins", "complex"): complex,
+    ("_codecs", "encode"): _encoded,
+}
+
+
+def _stand_in(*arguments: Any) -> None:
+    """Take the place of what makes a tensor, a size or a device."""
 
 
 def _content(state: Any) -> bytes:

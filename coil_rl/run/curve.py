@@ -18,10 +18,10 @@ import torch
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coil_rl.files import whole_file
 from coil_rl.measures import Measure
+from coil_rl.output import progress
 from coil_rl.report.runs import CHOICE, RETURN
 from coil_rl.run import checkpoint
 from coil_rl.run.evaluation import Totals, episodes
@@ -125,7 +125,7 @@ class EvaluationCurve:
         # The training's random numbers are left alone.
         with (
             torch.random.fork_rng(),
-            tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
+            progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
         ):
             for cases, make_env in self.envs.items():
                 results = measures(make_env(len(frames)), policies, self.watch, bar.update)

@@ -1,7 +1,6 @@
 """The training loop: collect a batch, learn from it, log, and let the callbacks act."""
 
 import math
-import sys
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,15 +11,16 @@ from typing import Any, ClassVar
 import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.learners.learner import Callback, Learner
+from coil_rl.output import decoration, progress, say
 from coil_rl.run import checkpoint
 from coil_rl.run.curve import EvaluationCurve, Watch
 from coil_rl.run.folder import check_same
 from coil_rl.run.metrics import Metrics
 from coil_rl.run.rollout import Rollout
+from coil_rl.run.stopping import STOP, resume_command
 
 PUT_BACK = "put the files of the run back, or train again in another folder"
 
@@ -108,7 +108,7 @@ class Experiment:
         where = f"after update {self.updates}"
         if not self.updates:
             where = "from the beginning: there is no checkpoint yet"
-        print(f"{self.folder} continues {where}", file=sys.stderr)
+        say(f"{self.folder} continues {where}", error=True)
 
     def check_identity(self, saved: Mapping[str, Any], file: Path) -> None:
         """Raise a `UserError` if a checkpoint belongs to a run with another configuration.
@@ -136,7 +136,7 @@ class Experiment:
             UserError: for a NaN from the env, in the losses or in the weights.
         """
         updates, frames = self.all_updates, self.rollout.frames
-        with tqdm(
+        with progress(
             total=updates * frames,
             initial=self.updates * frames,
             unit="frame",
@@ -145,15 +145,15 @@ class Experiment:
         ) as bar:
             first = self._measure({}) if self.updates == 0 else {}
             self._act({})
-            while self.updates < updates:
-                row = self.update(self.updates / updates)
-                row |= self._measure(row)
-                if not self.metrics.rows:
-                    self.metrics.append({**dict.fromkeys(row, math.nan), "frames": 0, **first})
-                self.metrics.append(row)
-                bar.update(frames)
-                self._show(bar, row, guide_return)
-                self._act(row)
+            with STOP.after_update():
+                while self.updates < updates:
+                    row = self.update(self.updates / updates)
+                    row |= self._measure(row)
+                    self._log(row, first)
+                    bar.update(frames)
+                    with decoration("the progress bar"):
+                        self._show(bar, row, guide_return)
+                    self._act(row)
         policy = self.learner.policy.state_dict()
         checkpoint.save(policy, self.folder / "policy_last.pt")
         if self.curve is None:
@@ -180,6 +180,17 @@ class Experiment:
                     raise UserError(f"{name} is {value} in update {self.updates}")
         return {"frames": self.updates * self.rollout.frames, **row, **learned}
 
+    def _log(self, row: dict[str, float], first: Mapping[str, float]) -> None:
+        """Log an update.
+
+        Args:
+            row: of the update.
+            first: numbers of the state before the first update.
+        """
+        if not self.metrics.rows:
+            self.metrics.append({**dict.fromkeys(row, math.nan), "frames": 0, **first})
+        self.metrics.append(row)
+
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers of the callbacks that measure, NaN where they are not due."""
         numbers: dict[str, float] = {}
@@ -192,14 +203,36 @@ class Experiment:
 
     def _act(self, row: Mapping[str, float]) -> None:
         for callback in self.acting:
-            if callback.due(self.updates, self.all_updates, row):
+            if not callback.due(self.updates, self.all_updates, row):
+                continue
+            if callback is self.curve:
+                self._evaluate(callback)
+            else:
                 callback.after_update(self.updates)
 
+    def _evaluate(self, curve: Callback) -> None:
+        """Evaluate the kept policies; a training that is stopped meanwhile saves its state first.
+
+        The evaluation takes long and changes nothing of the state, so that it is done again by the
+        run that goes on.
+        """
+        try:
+            with STOP.at_once():
+                curve.after_update(self.updates)
+        except KeyboardInterrupt:
+            if self.updates:
+                self.save()
+            raise
+
     def _show(self, bar: Any, row: Mapping[str, float], guide_return: float | None) -> None:
-        """Show the newest returns beside the progress bar."""
+        """Show the newest returns beside the progress bar.
+
+        `training` is with exploration; `curve` and `guide` are deterministic, in the cases of the
+        curve.
+        """
         returns = {
-            "return": row["train/return"],
-            "evaluation": self.metrics.newest(),
+            "training": row["train/return"],
+            "curve": self.metrics.newest(),
             "guide": guide_return,
         }
         shown = {name: f"{value:.0f}" for name, value in returns.items() if value is not None}
@@ -213,7 +246,7 @@ class Experiment:
         except UserError as error:
             raise UserError(
                 f"{error}; the last good checkpoint is kept: correct the cause and continue with "
-                f"coil-train resume={self.folder}, or train again with other values"
+                f"{resume_command(self.folder)}, or train again with other values"
             ) from error
 
     def _describe(self, batch: TensorDictBase) -> dict[str, float]:
@@ -233,6 +266,14 @@ class Experiment:
         for name, key in self.watch.get("step", {}).items():
             row[f"train/{name}"] = float(after[tuple(key)].float().mean())
         return row
+
+    def save(self) -> None:
+        """Write the checkpoint; a NaN in it is a `UserError`."""
+        state = self.state_dict()
+        with self.resume_hint():
+            check_parameters(state["learner"], self.updates)
+        self.metrics.flush()
+        checkpoint.save_newest(state, self.folder)
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
@@ -271,16 +312,22 @@ class Checkpoints:
         self.experiment, self.every = experiment, every
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether to write a checkpoint after an update; not before the first one."""
-        return bool(row) and (update % self.every == 0 or update == updates)
+        """Return whether to write a checkpoint after an update; not before the first one.
+
+        It is due every few updates, at the end, and if the training is asked to stop.
+        """
+        return bool(row) and (update % self.every == 0 or update == updates or STOP.requested)
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Write the checkpoint; a NaN in it is a `UserError`."""
-        state = self.experiment.state_dict()
-        with self.experiment.resume_hint():
-            check_parameters(state["learner"], update)
-        self.experiment.metrics.flush()
-        checkpoint.save_newest(state, self.experiment.folder)
+        """Write the checkpoint, and stop the training if it is asked to.
+
+        Raises:
+            UserError: for a NaN in the state.
+            KeyboardInterrupt: if the training is asked to stop.
+        """
+        self.experiment.save()
+        if STOP.requested:
+            raise KeyboardInterrupt
         return {}
 
 

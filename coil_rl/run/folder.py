@@ -5,7 +5,6 @@ import os
 import platform
 import shlex
 import subprocess
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import metadata
@@ -15,8 +14,10 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from coil_rl.errors import UserError
-from coil_rl.files import remove_unfinished, write_text
+from coil_rl.files import LARGEST_NUMBERS, read_file, remove_unfinished, write_text
+from coil_rl.output import say
 from coil_rl.plain_yaml import yaml_of
+from coil_rl.run.stopping import resume_command
 
 CONFIG, COMMAND = "config.yaml", "command.txt"
 ROOT = Path(__file__).resolve().parents[2]
@@ -67,7 +68,7 @@ def begin(folder: Path, saved: Mapping[str, Any], command: Sequence[str] = ()) -
     """
     if (folder / CONFIG).exists():
         raise UserError(
-            f"{folder} already holds a run; resume it with coil-train resume={folder}, or choose "
+            f"{folder} already holds a run; resume it with {resume_command(folder)}, or choose "
             "another folder with hydra.run.dir=FOLDER"
         )
     write_text(folder / "versions.json", json.dumps(versions(), indent=2))
@@ -116,8 +117,8 @@ def report_changed_versions(folder: Path) -> None:
     They are the versions of Python and of the packages.
     """
     try:
-        begun = dict(json.loads((folder / "versions.json").read_text()))
-    except (OSError, TypeError, ValueError):
+        begun = dict(json.loads(read_file(folder / "versions.json", LARGEST_NUMBERS)))
+    except (OSError, RecursionError, TypeError, ValueError):
         begun = {}
     present = versions()
     names = [name for name in ("python", *PACKAGES) if begun.get(name) != present[name]]
@@ -125,9 +126,9 @@ def report_changed_versions(folder: Path) -> None:
         changes = ", ".join(
             f"{name} {begun.get(name, 'unknown')} (here {present[name]})" for name in names
         )
-        print(
+        say(
             f"{folder} was begun with {changes}; its numbers may differ from now on",
-            file=sys.stderr,
+            error=True,
         )
 
 

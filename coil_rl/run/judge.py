@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
@@ -14,13 +15,19 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
-from tqdm import tqdm
 
 from coil_rl.compiled import compile_steps
 from coil_rl.errors import file_of_a_run
-from coil_rl.files import write_text
+from coil_rl.files import LARGEST_NUMBERS, LARGEST_TABLE, read_text, write_text
 from coil_rl.guides.simple import FollowAdvice
-from coil_rl.measures import Measure, summarise
+from coil_rl.measures import (
+    Measure,
+    denominators,
+    summarise,
+    with_denominators,
+    with_shares,
+)
+from coil_rl.output import decoration, progress, say
 from coil_rl.report import Returns, markdown_table, write_csv
 from coil_rl.report.pictures import Picture
 from coil_rl.report.statistics import mean_interval
@@ -122,6 +129,7 @@ class Judgement:
     def __init__(self, measures: Mapping[str, Measure]) -> None:
         self.measures = measures
         self.table: list[dict[str, Any]] = []  # means, for evaluation.csv
+        self.counts: list[dict[str, int]] = []  # episodes that each mean rests on
         self.episodes: list[dict[str, Any]] = []
         self.shown: dict[str, EvaluationResult] = {}  # deterministic episodes, by title
 
@@ -135,6 +143,7 @@ class Judgement:
         """Add the episodes of a policy or a guide."""
         label = {"driver": driver, "advice": advice, "actions": actions}
         self.table += [label | row for row in summarise(result.episodes, self.measures)]
+        self.counts += denominators(result.episodes, self.measures)
         self.episodes += [label | row for row in result.episodes]
         if actions == "deterministic":
             self.shown[f"{driver}, {advice}" if advice else driver] = result
@@ -153,7 +162,8 @@ def judge(
     once with deterministic actions, `trial.repeats` times with sampled ones if it samples, once
     with each advice of `trial.advice` instead of its own, and once with a `fallback`.
 
-    The files are `episodes.csv`, pictures, `evaluation.md` (means) and, last, `evaluation.csv`.
+    The files are `episodes.csv`, `evaluation.md` (means) and `evaluation.csv`, with which a run is
+    finished, and then pictures. A picture that fails is a warning.
 
     Args:
         trial: cases, measures, pictures.
@@ -168,7 +178,7 @@ def judge(
             judgement.add(result, name)
     share = None
     torch.manual_seed(seed)
-    with tqdm(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
+    with progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar:
         if policy is not None:
             _evaluate(trial, policy, judgement, bar)
         if fallback is not None:
@@ -176,11 +186,13 @@ def judge(
             judgement.add(result, f"{trial.label} or guide")
             share = fallback.share(result)
     write_csv(judgement.episodes, folder / "episodes.csv")
-    for picture in trial.pictures:
-        picture.draw(judgement.shown, folder)
     page = _page(trial, judgement, has_policy=policy is not None, share=share)
     write_text(folder / "evaluation.md", page)
-    write_csv(judgement.table, folder / "evaluation.csv")
+    table = with_denominators(judgement.table, judgement.counts)
+    write_csv(table, folder / "evaluation.csv")
+    for picture in trial.pictures:
+        with decoration(f"the picture {type(picture).__name__} in {folder}"):
+            picture.draw(judgement.shown, folder)
     return judgement
 
 
@@ -213,7 +225,7 @@ def _evaluate_with(
     env = trial.env(len(rows), advice)
     if trial.compiled:
         compile_steps(env)
-    watching = [] if advice else trial.pictures
+    watching = [] if advice else list(trial.pictures)
     if beside:
         policy = PolicyAndGuides(env, policy, own, len(beside))
     sampled = repeats > 0 and (rows >= count) & (rows < own)
@@ -236,7 +248,7 @@ def _page(trial: Trial, judgement: Judgement, *, has_policy: bool, share: float 
         if measure.title:
             columns[name] = (measure.title, measure.format)
     count = len(trial.evaluation.cases)
-    rows = judgement.table
+    rows = with_shares(judgement.table, judgement.counts, columns)
     if count > MAX_CASES:
         rows = [row for row in rows if row["case"] == "mean"]
     page = [markdown_table(rows, columns)]
@@ -297,10 +309,14 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> s
     )
 
 
-def _tick(env: EnvBase, pictures: Iterable[Picture], update: Callable[[], Any]) -> None:
+def _tick(env: EnvBase, pictures: list[Picture], update: Callable[[], Any]) -> None:
+    """Show an env to pictures; one that fails is taken out of the list."""
     update()
-    for picture in pictures:
-        picture.watch(env)
+    for picture in list(pictures):
+        pictures.remove(picture)
+        with decoration(f"the picture {type(picture).__name__}"):
+            picture.watch(env)
+            pictures.append(picture)
 
 
 def report_outcome(folder: Path) -> float:
@@ -310,15 +326,14 @@ def report_outcome(folder: Path) -> float:
     """
     path = folder / "evaluation.csv"
     with file_of_a_run(path, "remove the file, and evaluate again"):
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = list(csv.DictReader(io.StringIO(read_text(path, LARGEST_TABLE), newline="")))
         means = [row for row in rows if (row["case"], row["actions"]) == ("mean", "deterministic")]
         last = [row for row in means if not row["advice"]][-1]
         reward, completed = float(last["reward"]), float(last.get("completed", "nan"))
-        page = (folder / "evaluation.md").read_text().rstrip()
-    print(page)
+        page = read_text(folder / "evaluation.md", LARGEST_NUMBERS).rstrip()
+    say(page)
     share = "" if math.isnan(completed) else f", {completed:.0%} completed"
-    print(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
+    say(f"{last['driver']}: mean test reward {reward:.1f}{share}; see {folder}")
     return reward
 
 
@@ -340,7 +355,7 @@ def evaluate_guides(
     """
     cases = len(evaluation.cases)
     env, policy = make_env.guided(cases, TEST, guides, count=count)
-    with tqdm(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
+    with progress(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
         result = evaluation.run(env, policy, tick=bar.update)
     return dict(zip(guide_titles(guides), result.split(len(guides)), strict=True))
 

@@ -11,7 +11,8 @@ from typing import Any
 import pandas as pd
 
 from coil_rl.errors import UserError, file_of_a_run
-from coil_rl.files import whole_file
+from coil_rl.files import LARGEST_TABLE, read_file, whole_file
+from coil_rl.output import decoration
 from coil_rl.report.runs import RETURN, read_curve
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
@@ -49,12 +50,18 @@ class Metrics:
         self.log(row, int(row["frames"]))
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
-        """Log values with the TorchRL logger, if there is one; NaN is left out."""
+        """Log values with the TorchRL logger, if there is one; NaN is left out.
+
+        A logger that fails is left out from then on.
+        """
         if self.logger is None:
             return
-        for name, value in values.items():
-            if not math.isnan(value):
-                self.logger.log_scalar(name, value, step=frames)
+        logger, self.logger = self.logger, None
+        with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
+            for name, value in values.items():
+                if not math.isnan(value):
+                    logger.log_scalar(name, value, step=frames)
+            self.logger = logger
 
     def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Put values into rows that were logged before, by their numbers.
@@ -64,7 +71,8 @@ class Metrics:
         for number, values in results.items():
             self.rows[number] |= values
             self.log(values, int(self.rows[number]["frames"]))
-        text = pd.read_csv(self.path, dtype=str, keep_default_na=False)
+        file = io.BytesIO(read_file(self.path, LARGEST_TABLE))
+        text = pd.read_csv(file, dtype=str, keep_default_na=False)
         for number, values in results.items():
             text.loc[number, list(values)] = list(map(str, values.values()))
         with whole_file(self.path) as unfinished:
@@ -83,8 +91,9 @@ class Metrics:
         if self.path.exists():
             with self.path.open("a") as file:
                 os.fsync(file.fileno())
-        if self.tensorboard is not None:
-            self.tensorboard.flush()
+        if self.tensorboard is not None and self.logger is not None:
+            with decoration(f"the logger of {self.path.parent}"):
+                self.tensorboard.flush()
 
     def truncate(self, count: int) -> None:
         """Keep only the first rows, those that belong to a checkpoint.
@@ -92,7 +101,10 @@ class Metrics:
         Raises:
             UserError: if there are fewer rows, or the file is damaged.
         """
-        lines = self.path.read_bytes().splitlines(keepends=True) if self.path.exists() else []
+        lines: list[bytes] = []
+        if self.path.exists():
+            with file_of_a_run(self.path, REMEDY):
+                lines = read_file(self.path, LARGEST_TABLE).splitlines(keepends=True)
         if len(lines) <= count and count:
             found = max(len(lines) - 1, 0)
             raise UserError(

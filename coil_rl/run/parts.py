@@ -143,4 +143,8 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
         env.observation_spec  # noqa: B018  transforms check the specs when these are computed
     except (KeyError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0]}") from error
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, RuntimeError) and "allocate" not in str(error):
+            raise
+        raise UserError(f"{name}: there is not enough memory; make it smaller") from error
     return env

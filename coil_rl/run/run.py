@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,9 +18,10 @@ from torchrl.envs import EnvBase
 
 from coil_rl.compiled import compile_steps
 from coil_rl.errors import NO_SPACE, UserError, file_of_a_run
-from coil_rl.files import write_text
+from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
+from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
 from coil_rl.report.runs import EVALUATION, SELECTION, read_curve
 from coil_rl.run import checkpoint
@@ -44,6 +44,7 @@ from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
 from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
+from coil_rl.run.stopping import resume_command
 from coil_rl.transforms.normalised_action import given_units, units_of
 
 FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
@@ -246,10 +247,10 @@ class Run:
         write_config(self.folder, self.settings)
         for file in ("evaluation.csv", "evaluation.md", "training_time.json"):
             (self.folder / file).unlink(missing_ok=True)
-        print(
+        say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
             f"the run, such as a learning rate, go on at {budget.frames / frames:.0%} of their way",
-            file=sys.stderr,
+            error=True,
         )
 
     def finish_begun(self) -> float:
@@ -289,13 +290,13 @@ class Run:
             judge(self.trial, policy, self.folder, self.seed, fallback)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"continue with: coil-train resume={self.folder}") from None
+            raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
         except OSError as error:
             if error.errno not in NO_SPACE:
                 raise
             raise UserError(
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
-                f"and continue with coil-train resume={self.folder}"
+                f"and continue with {resume_command(self.folder)}"
             ) from error
         if policy is not None:
             rows = read_curve(self.folder / "metrics.csv")
@@ -318,7 +319,8 @@ class Run:
             seconds = {"seconds": time.monotonic() - start}
             write_text(self.folder / "training_time.json", json.dumps(seconds, indent=2))
         learner = experiment.learner
-        self._draw(rows, learner, guide_returns)
+        with decoration(f"the learning curve in {self.folder}"):
+            self._draw(rows, learner, guide_returns)
         learner.export(self.folder)
         state = checkpoint.load(weights_file(self.folder, self.which), self.device)
         learner.policy.load_state_dict(state)
@@ -401,14 +403,15 @@ class Run:
         if learner.kind == "guides":
             draw_phases(rows, list(learner.guides), path, title=label)
         else:
-            draw_learning_curves({label: [rows]}, path, guides=guide_returns)
+            cases = self.make_env.sizes.get(EVALUATION)
+            draw_learning_curves({label: [rows]}, path, guides=guide_returns, cases=cases)
 
     def _saved_guide_returns(self) -> dict[str, float]:
         """Return the mean return of each guide in the cases of the curve, measured once."""
         file = self.folder / "guide_return.json"
         if file.exists():
             with file_of_a_run(file, "remove it, and the run measures it again"):
-                numbers = json.loads(file.read_text())
+                numbers = json.loads(read_file(file, LARGEST_NUMBERS))
                 return {name: float(numbers[name]) for name in self.trial.guides}
         returns = guide_returns(self.make_env, self.make_env.guides())
         write_text(file, json.dumps(returns, indent=2))
@@ -565,7 +568,7 @@ def _say_units(env: EnvBase) -> None:
     spec = env.full_action_spec[env.action_key]
     units = given_units(env) or units_of(spec, len(env.batch_size))
     if units is not None and units.assumed:
-        print(f"action: {'; '.join(units.assumed)}", file=sys.stderr)
+        say(f"action: {'; '.join(units.assumed)}", error=True)
 
 
 def require_agent(make_learner: Any, folder: Path) -> None:

@@ -9,10 +9,12 @@ import hashlib
 import os
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
+import lz4.frame
+import zstandard
 from mcap import records
 from mcap.exceptions import RecordLengthLimitExceeded
 from mcap.reader import SeekingReader
@@ -21,10 +23,15 @@ from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from coil_rl.envs.recordings.messages import definition, encode
+from coil_rl.envs.regular_files import open_regular, read_regular
 
 MAGIC = b"\x89MCAP0\r\n"
 # If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
 CHUNK = 128 * 1024  # bytes
+
+LARGEST_METADATA = 1_000_000  # bytes of the metadata.yaml of a folder
+# A file unpacks to at most this many bytes, and this many for each of its own.
+UNPACKED, UNPACKED_SHARE = 20_000_000, 100
 
 CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
 
@@ -142,7 +149,9 @@ def digest(path: str | os.PathLike[str]) -> str:
     sha256 = hashlib.sha256()
     for file in _files(Path(path)):
         _check_format(file)
-        sha256.update(file.read_bytes())
+        with open_regular(file) as stream:
+            while block := stream.read(CHUNK):
+                sha256.update(block)
     return sha256.hexdigest()
 
 
@@ -256,7 +265,7 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
     damage = len(contents.damage)
     selected: dict[int, tuple[Channel, list[RawMessage]]] = {}
     schemas: dict[int, records.Schema] = {}
-    with file.open("rb") as stream:
+    with open_regular(file) as stream:
         for record in _records(file, stream, size, complete, contents):
             if type(record) is records.Message:
                 if record.channel_id in selected:
@@ -323,6 +332,7 @@ def _records(
     """
     reader = StreamReader(stream, emit_chunks=True, validate_crcs=True, record_size_limit=size)
     read = reader.records
+    left = UNPACKED + UNPACKED_SHARE * size
     while True:
         start, record = stream.tell(), None
         try:
@@ -331,7 +341,14 @@ def _records(
                 return
             parts = [record]
             if type(record) is records.Chunk:
-                parts = breakup_chunk(record, validate_crc=True)
+                unpacked = _unpacked(record, left)
+                left -= len(unpacked.data)
+                parts = breakup_chunk(unpacked, validate_crc=True)
+        except _TooLargeError:
+            raise RecordingError(
+                f"{file} has {size:,} bytes, but unpacks to more than {UNPACKED_SHARE} times as "
+                "many; no recording of a robot does."
+            ) from None
         # Damaged bytes raise almost any exception in the libraries below.
         except Exception as error:
             end = stream.tell()
@@ -363,6 +380,32 @@ def _records(
         yield from parts
 
 
+class _TooLargeError(Exception):
+    """A chunk that unpacks to more bytes than are left."""
+
+
+def _unpacked(chunk: records.Chunk, left: int) -> records.Chunk:
+    """Return a chunk without compression.
+
+    Args:
+        chunk: of a file.
+        left: number of bytes that it may unpack to; more are a `_TooLargeError`.
+    """
+    most = min(left, chunk.uncompressed_size) + 1
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(most)
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, max_length=most)
+    else:
+        data = chunk.data
+    if len(data) > left:
+        raise _TooLargeError
+    if chunk.compression and len(data) != chunk.uncompressed_size:
+        raise ValueError(f"a chunk does not unpack to {chunk.uncompressed_size} bytes")
+    return replace(chunk, compression="", data=data)
+
+
 def _places(summary: Summary) -> list[int]:
     """Return the places in a file of all chunks, metadata records and attachments."""
     return [
@@ -387,7 +430,7 @@ def _check_format(file: Path) -> tuple[int, bool]:
     Any other file is a `RecordingError`.
     """
     try:
-        with file.open("rb") as stream:
+        with open_regular(file) as stream:
             start = stream.read(32)
             size = stream.seek(0, os.SEEK_END)
             stream.seek(max(0, size - len(MAGIC)))
@@ -415,7 +458,7 @@ def _files(path: Path) -> Iterator[Path]:
         return
     metadata = path / "metadata.yaml"
     try:
-        text = metadata.read_text(encoding="utf-8")
+        text = read_regular(metadata, LARGEST_METADATA).decode()
     except (OSError, UnicodeDecodeError):
         raise RecordingError(
             f"{path} is a folder without a readable metadata.yaml; let ROS write it: ros2 bag "

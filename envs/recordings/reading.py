@@ -30,6 +30,8 @@ from coil_rl.envs.recordings.messages import (
 
 SIMULATED = "simulated"  # metadata record of simulated recordings
 LARGEST = 1e7  # of poses, commands and angles
+# All scans together may have this many ranges with their padding, and this many times their own.
+LARGEST_PADDED, PADDED_SHARE = 10**7, 4
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
@@ -277,6 +279,12 @@ def _scans(
         raise RecordingError(
             f"{path}, topic {topic}: no scan has a range; check that the scanner ran, and record "
             "again."
+        )
+    # All scans get the length of the longest, so one long scan makes all of them long.
+    if len(scans) * points.max() > max(LARGEST_PADDED, PADDED_SHARE * points.sum()):
+        raise RecordingError(
+            f"{path}, topic {topic}: scans of {points.min()} to {points.max()} ranges; a scanner "
+            "has about as many in each: record those of one scanner."
         )
     ranges = np.full((len(scans), points.max()), np.inf, np.float32)
     for row, scan in zip(ranges, scans, strict=True):

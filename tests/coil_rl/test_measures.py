@@ -3,7 +3,14 @@ import math
 import pytest
 from worlds import driving_measures
 
-from coil_rl.measures import Measure, measures_of, summarise
+from coil_rl.measures import (
+    Measure,
+    denominators,
+    measures_of,
+    summarise,
+    with_denominators,
+    with_shares,
+)
 
 
 def test_measure_of_a_yaml_file_has_tuples_as_keys():
@@ -86,3 +93,32 @@ def test_summary_is_the_mean_over_cases_of_means_over_episodes():
     assert math.isnan(rows[1]["lap_time"])
     assert [row["crashed"] for row in rows] == [0.5, 1, 0.75]
     assert [row["clearance"] for row in rows] == [0.1, 0.4, 0.1]
+
+
+def test_mean_over_fewer_episodes_says_so():
+    measures = {"lap_time": Measure("lap"), "speed": Measure("speed")}
+    lap_times = [5.0, math.nan, 7.0, math.nan]
+    episodes = [
+        {"case": case, "reward": 1.0, "lap_time": lap_time, "speed": 2.0}
+        for case, lap_time in zip("aabb", lap_times, strict=True)
+    ]
+    rows, counts = summarise(episodes, measures), denominators(episodes, measures)
+    assert [count["lap_time"] for count in counts] == [1, 1, 2]
+    columns = {"lap_time": ("lap", ".1f"), "speed": ("speed", ".1f")}
+    shown = with_shares(rows, counts, columns)
+    assert [row["lap_time"] for row in shown] == ["5.0 (1 of 2)", "7.0 (1 of 2)", "6.0 (2 of 4)"]
+    assert shown[-1]["speed"] == 2
+    full = with_denominators(rows, counts)
+    assert list(full[0]) == [*rows[0], "episodes", "lap_time_episodes"]
+    assert (full[-1]["episodes"], full[-1]["lap_time_episodes"]) == (4, 2)
+    complete = [{**episode, "lap_time": 1.0} for episode in episodes]
+    rows, counts = summarise(complete, measures), denominators(complete, measures)
+    assert with_denominators(rows, counts) == rows == with_shares(rows, counts, columns)
+
+
+def test_mean_of_returns_is_not_a_number_if_one_is_not():
+    episodes = [{"case": "a", "reward": 1.0}, {"case": "b", "reward": math.nan}]
+    rows, counts = summarise(episodes, {}), denominators(episodes, {})
+    assert math.isnan(rows[-1]["reward"])
+    shown = with_shares(rows, counts, {"reward": ("reward", ".1f")})
+    assert shown[-1]["reward"] == "- (1 of 2)"

@@ -91,7 +91,10 @@ def test_start_is_three_numbers_with_the_heading_in_degrees(tmp_path):
         (f"{HEADER}\n0,LEFT,1".encode(), "['1', '']"),
         (f"{HEADER}\n0,LEFT,{'1' * 140_000},2".encode(), "line 2: field larger than field limit"),
         (HEADER.encode(), "left side of track 'bad' has 0 cones"),
-        (f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6, "is no file of at most"),
+        (
+            f"{HEADER}\n".encode() + b"0,LEFT,1.0,2.0\n" * 10**6,
+            "cannot be read (it has more than 10,000,000 bytes)",
+        ),
     ],
 )
 def test_invalid_files_are_rejected_with_a_message(tmp_path, content, words):
@@ -148,7 +151,7 @@ def test_paths_without_a_level_are_rejected_by_name(tmp_path, monkeypatch, path)
     (tmp_path / "notes.txt").write_text("no level")
     assert "holds no level files" in error_of(load_tracks, tmp_path)
     (tmp_path / "bad.csv").mkdir()
-    assert "bad.csv is no file" in error_of(load_tracks, tmp_path)
+    assert "bad.csv cannot be read" in error_of(load_tracks, tmp_path)
 
 
 def test_folders_are_read_in_natural_order_with_one_start(tmp_path):

@@ -245,7 +245,7 @@ def test_trick_is_refused(key, value, message, saved, tmp_path):
         ("a: " + "[" * 5000 + "]" * 5000, "has more than 32 levels"),
         (
             "a: " + "x" * 200_000,
-            "has 200003 bytes, but the configuration of a run has at most 200000",
+            r"is not the configuration of a run \(it has more than 200,000 bytes\)",
         ),
         ("a: !!python/object/apply:os.system [ls]\n", "is not the configuration of a run"),
         ("label: " + "9" * 5000, "is not the configuration of a run"),

@@ -13,6 +13,8 @@ from sklearn.ensemble import (
 )
 from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.neighbors import KNeighborsRegressor
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import PolynomialFeatures
 from sklearn.svm import SVR
 from sklearn.tree import DecisionTreeRegressor
 
@@ -110,7 +112,56 @@ def hist_node(name, value):
     return change
 
 
+def begins(**changes):
+    def change(model):
+        vars(model.init_).update(changes)
+
+    return change
+
+
+BOOSTED = GradientBoostingRegressor(n_estimators=3)
 FORGED = {
+    "first prediction of other rows": (
+        BOOSTED,
+        begins(n_outputs_=2),
+        "wrong number of predictions",
+    ),
+    "no first prediction": (BOOSTED, begins(n_outputs_=0), "wrong number of predictions"),
+    "first prediction of many": (
+        BOOSTED,
+        begins(constant_=np.zeros((5, 1))),
+        "wrong number of predictions",
+    ),
+    "first prediction is no number": (
+        BOOSTED,
+        begins(constant_=np.full((1, 1), np.nan)),
+        "is not a number",
+    ),
+    "another first regressor": (
+        BOOSTED,
+        lambda model: setattr(model, "init_", fitted(KNeighborsRegressor())),
+        "begin with another regressor",
+    ),
+    "a list of first regressors": (
+        BOOSTED,
+        lambda model: setattr(model, "init_", [1.0]),
+        "begin with another regressor",
+    ),
+    "an unknown first regressor": (
+        BOOSTED,
+        lambda model: setattr(model, "init_", "one"),
+        "begin with something unknown",
+    ),
+    "inside of another": (
+        BaggingRegressor(BOOSTED, 2),
+        lambda model: begins(n_outputs_=7)(model.estimators_[0]),
+        "wrong number of predictions",
+    ),
+    "many features of a row": (
+        make_pipeline(PolynomialFeatures(), LinearRegression()),
+        lambda model: setattr(model[0], "n_output_features_", 10**9),
+        "polynomial features",
+    ),
     "child of a boosted tree": (
         HistGradientBoostingRegressor(max_iter=3),
         hist_node("left", 10**6),
@@ -169,6 +220,9 @@ def test_neighbours_are_found_from_the_points_whatever_the_archive_holds():
         BaggingRegressor(DecisionTreeRegressor(), 2),
         VotingRegressor([("a", Ridge()), ("b", LinearRegression())]),
         TransformedTargetRegressor(Ridge()),
+        GradientBoostingRegressor(n_estimators=3, init="zero"),
+        GradientBoostingRegressor(n_estimators=3, loss="huber"),
+        make_pipeline(PolynomialFeatures(), LinearRegression()),
     ],
     ids=lambda model: type(model).__name__,
 )

@@ -1,19 +1,23 @@
+import os
+
 import pytest
 import skops.io
 import torch
 from sklearn.cluster import KMeans
 from sklearn.ensemble import (
+    BaggingRegressor,
     ExtraTreesRegressor,
     GradientBoostingRegressor,
     HistGradientBoostingRegressor,
     RandomForestRegressor,
 )
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.linear_model import LinearRegression, Ridge
+from sklearn.linear_model import GammaRegressor, LinearRegression, Ridge
+from sklearn.model_selection import GridSearchCV
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, PowerTransformer, StandardScaler
 from sklearn.svm import SVR
 
 from coil_rl.errors import UserError
@@ -149,3 +153,39 @@ def test_unusable_estimators_and_values_out_of_range_are_refused_before_the_fit(
     with pytest.raises(ValueError, match=r"SVR\(\) predicts one number, .*MultiOutputRegressor"):
         SklearnRegressor(SVR()).fresh(4, 2)
     assert fitted(MultiOutputRegressor(SVR()), 2)(data()[0]).shape == (60, 2)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "words"),
+    [
+        (GammaRegressor(), "GammaRegressor cannot be fitted to 50 samples of 2 inputs"),
+        (BaggingRegressor(max_samples=2.0), "BaggingRegressor cannot be fitted"),
+        (make_pipeline(PowerTransformer(method="box-cox"), Ridge()), "Pipeline cannot be fitted"),
+        (GridSearchCV(Ridge(), {"alpah": [1]}), "GridSearchCV cannot be fitted.*alpah"),
+    ],
+    ids=lambda part: type(part).__name__,
+)
+def test_estimator_that_refuses_its_data_is_named(estimator, words):
+    x = torch.rand(50, 2) - 0.5
+    with pytest.raises(UserError, match=words):
+        SklearnRegressor(estimator).fresh(2, 1).fit(x, x[:, :1])
+
+
+@pytest.mark.parametrize("jobs", [100_000, -100_000, 2**40])
+def test_number_of_processes_is_limited(jobs):
+    regressor = SklearnRegressor(
+        BaggingRegressor(RandomForestRegressor(2, n_jobs=jobs), n_jobs=jobs)
+    )
+    most = os.cpu_count()
+    parameters = regressor.estimator.get_params()
+    assert abs(parameters["n_jobs"]) <= most
+    assert abs(parameters["estimator__n_jobs"]) <= most
+
+
+def test_boosted_trees_that_begin_with_another_regressor_are_refused():
+    for estimator in (
+        GradientBoostingRegressor(init=Ridge()),
+        BaggingRegressor(GradientBoostingRegressor(init=Ridge())),
+    ):
+        with pytest.raises(ValueError, match="leave init out"):
+            SklearnRegressor(estimator)

@@ -310,7 +310,6 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         # tracks and sweeps
         ("track=folder", "track.dir must be given: write track.dir=VALUE"),
         ("track=folder track.dir=/nowhere", "/nowhere cannot be read (No such file or directory)"),
-        ("-m seed=-1,0", "seed=-1 must be greater than or equal to 0"),
     ],
 )
 def test_mistake_ends_the_program_with_exit_code_2_and_leaves_no_folder(

@@ -41,7 +41,7 @@ def test_numbers_are_those_of_the_runs(sweep):
     assert (coil["score"], coil["low"], coil["high"]) == pytest.approx(estimate(scores)[:3])
     assert rows["guide", ""]["score"] == 1
     assert (coil["crashes"], zeroed["crashes"]) == ("0 of 3 (0% to 71%)", "3 of 3 (29% to 100%)")
-    assert rows["guide", ""]["crashes"] == "0 of 2 cases"
+    assert rows["guide", ""]["crashes"] == "0 of 2 cases (0% to 84%)"
     assert (coil["smoothness"], coil["lap_time"], coil["completed"]) == (pytest.approx(0.2), 50, 1)
     assert math.isnan(zeroed["lap_time"])
     assert math.isnan(rows["guide", ""]["low"])

@@ -21,19 +21,24 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
     heading, drivers, rewards = section(make_sweep(tmp_path / "sweep"), "ppo").split("\n\n")
     assert heading == "## Results"
     titles, guide, ppo, coil, zeroed = cells(drivers)
-    assert titles[:6] == [
+    assert titles[:8] == [
         "driver",
         "advice",
         "seeds",
+        "cases",
         "completed",
         "seeds with a crash (95 %)",
         "reward / guide's (95 %)",
+        "95 % over cases",
     ]
-    assert guide[:6] == ["guide", "", "-", "100%", "0 of 2 cases", "1.000"]
+    assert guide[:7] == ["guide", "", "-", "2", "100%", "0 of 2 cases (0% to 84%)", "1.000"]
+    over_cases = coil.pop(7)
+    assert over_cases.partition(" to ")[1]
     assert coil == [
         "coil",
         "",
         "3",
+        "2",
         "100%",
         "0 of 3 (0% to 71%)",
         "1.038 (1.034 to 1.043)",
@@ -46,7 +51,7 @@ def test_section_has_a_table_of_drivers_and_one_of_cases(tmp_path):
         "0.30",
         "yes",
     ]
-    assert (ppo[6:9], ppo[-1], zeroed[:2], zeroed[-1]) == (
+    assert (ppo[8:11], ppo[-1], zeroed[:2], zeroed[-1]) == (
         ["-", "-", "-"],
         "no",
         ["coil", "zeroed"],

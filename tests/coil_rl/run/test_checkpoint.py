@@ -1,4 +1,10 @@
+import codecs
+import copy
+import io
 import os
+import pickle
+import zipfile
+from collections import OrderedDict
 from pathlib import Path
 
 import pytest
@@ -49,6 +55,85 @@ def test_loading_runs_no_code(tmp_path):
     checkpoint.save(Payload(), tmp_path / "evil.pt")
     with pytest.raises(UserError, match="is damaged"):
         checkpoint.load(tmp_path / "evil.pt")
+
+
+def signed(archive, path):
+    """Write an archive of another program with the checksum of ours."""
+    content = archive.getvalue()[:-2] + checkpoint.DIGITS.to_bytes(2, "little")
+    path.write_bytes(content + checkpoint._checksum(content))
+
+
+def repacked(state, **options):
+    """The archive of a state, with other options of the entries."""
+    saved, other = io.BytesIO(), io.BytesIO()
+    torch.save(state, saved)
+    with zipfile.ZipFile(saved) as source, zipfile.ZipFile(other, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name), **options)
+    return other
+
+
+class Bytes:
+    def __reduce__(self):
+        return (bytearray, (10**12,))
+
+
+class Hexadecimal:
+    def __reduce__(self):
+        return (codecs.encode, (b"a", "hex"))
+
+
+def sharing(count):
+    """An archive in which many names have the bytes of one entry."""
+    archive = repacked({"a": torch.zeros(10**5)})
+    with zipfile.ZipFile(archive, "a") as target:
+        (first,) = [entry for entry in target.infolist() if entry.filename.endswith("data/0")]
+        for number in range(1, count):
+            entry = copy.copy(first)
+            entry.filename = first.filename[:-1] + str(number)
+            target.filelist.append(entry)
+            target.NameToInfo[entry.filename] = entry
+        target._didModify = True
+    return archive
+
+
+@pytest.mark.parametrize(
+    ("archive", "reason"),
+    [
+        (lambda: repacked({"a": torch.zeros(10**6)}, compress_type=8), "ValueError"),
+        (lambda: repacked({"a": torch.zeros(10**6)}, compress_type=14), "ValueError"),
+        (lambda: sharing(1000), "ValueError"),
+        (lambda: repacked(Bytes()), "UnpicklingError"),
+        (lambda: repacked(Hexadecimal()), "UnpicklingError"),
+        (lambda: repacked({"a": torch.zeros(3).to_sparse()}), "UnpicklingError"),
+        (lambda: io.BytesIO(pickle.dumps({"a": 1})), "BadZipFile"),
+    ],
+    ids=["deflated", "lzma", "sharing", "bytearray", "hex", "sparse", "pickle"],
+)
+def test_small_file_does_not_load_as_a_large_state(tmp_path, archive, reason):
+    signed(archive(), tmp_path / "policy_last.pt")
+    with pytest.raises(UserError, match=rf"is damaged \({reason}\)"):
+        checkpoint.load(tmp_path / "policy_last.pt")
+
+
+def test_stored_archive_of_another_program_is_read(tmp_path):
+    signed(repacked({"a": torch.arange(3)}), tmp_path / "a.pt")
+    assert checkpoint.load(tmp_path / "a.pt")["a"].tolist() == [0, 1, 2]
+
+
+def test_states_of_all_kinds_are_read(tmp_path):
+    state = OrderedDict(
+        a=torch.nn.Parameter(torch.ones(2)), b=torch.Size([1]), c=(1, {2.0}, b"x", 2j)
+    )
+    state |= {"d": torch.zeros(2, 3).T, "e": torch.ones(2, dtype=torch.bfloat16), "f": None}
+    checkpoint.save(state, tmp_path / "a.pt")
+    assert str(checkpoint.load(tmp_path / "a.pt")) == str(state)
+
+
+def test_pipes_are_refused(tmp_path):
+    os.mkfifo(tmp_path / "policy_last.pt")
+    with pytest.raises(UserError, match="there is no file"):
+        checkpoint.load(tmp_path / "policy_last.pt")
 
 
 @pytest.fixture(scope="module")

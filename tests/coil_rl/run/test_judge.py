@@ -1,10 +1,13 @@
 import csv
+from dataclasses import replace
+from itertools import pairwise
 
 import pytest
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
 
 from coil_rl.config.build import (
+    about_returns,
     build_evaluation,
     build_guides,
     build_learner,
@@ -15,6 +18,7 @@ from coil_rl.config.build import (
     trial,
 )
 from coil_rl.errors import UserError
+from coil_rl.report.pictures import Picture
 from coil_rl.run.judge import evaluate_guides, judge
 
 TINY = ["env.time_limit=1", "guide=[spline,random]", "run_dir=unused"]
@@ -102,3 +106,64 @@ def test_evaluation_without_cases_is_refused(composed, cases):
 
 def test_guides_without_a_guide_are_not_driven(composed):
     assert evaluated(composed("guide=none", "method=ppo")) == {}
+
+
+class Broken(Picture):
+    """A picture whose env draws no pixels, or that cannot be drawn."""
+
+    def __init__(self, place):
+        self.place, self.seen = place, 0
+
+    def watch(self, env):
+        self.seen += 1
+        if self.place == "watch":
+            raise TypeError("render() returns floats")
+
+    def draw(self, results, folder):
+        assert (folder / "evaluation.csv").exists()
+        if self.place == "draw":
+            raise ValueError("no frames")
+        (folder / "drawn").touch()
+
+
+@pytest.mark.parametrize("place", ["watch", "draw"])
+def test_results_are_complete_without_a_picture_that_fails(composed, tmp_path, place):
+    config = composed("guide=spline", "evaluation.repeats=1")
+    make_env = env_maker(config)
+    broken, intact = Broken(place), Broken("nowhere")
+    given = replace(trial(config, make_env), pictures=[broken, intact])
+    with pytest.warns(UserWarning, match="the picture Broken.* is left out"):
+        judge(given, build_learner(config, make_env()).policy, tmp_path, seed=0)
+    assert {"evaluation.csv", "evaluation.md", "episodes.csv", "drawn"} <= {
+        path.name for path in tmp_path.iterdir()
+    }
+    assert intact.seen > 1
+    assert (broken.seen == 1) == (place == "watch")
+
+
+def test_mean_over_fewer_episodes_is_told_on_the_page_and_in_the_table(composed, tmp_path):
+    config = composed("guide=spline", "evaluation.repeats=1", "evaluation.gif=false")
+    make_env = env_maker(config)
+    given = replace(trial(config, make_env), pictures=[])
+    judgement = judge(given, None, tmp_path, seed=0)
+    known = [count["lap_time"] for count in judgement.counts]
+    assert known == [0, 0, 0, 0]  # no lap is finished in a second
+    page = (tmp_path / "evaluation.md").read_text()
+    assert "of 3)" not in page
+    assert "lap_time_episodes" in (tmp_path / "evaluation.csv").read_text()
+
+
+def test_curve_of_an_own_env_rests_on_20_cases_that_the_table_has_not():
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", ["env=pendulum", "guide=none", "method=ppo", "run_dir=unused"])
+    sizes = env_maker(config).sizes
+    assert min(sizes.values()) >= 20
+    (_, sentence) = about_returns(sizes)
+    assert sentence == (
+        "The curve rests on 20 cases, and policy_best was chosen in 20 others; none of them is in "
+        "the table."
+    )
+    curve = config.evaluation.curve
+    firsts = [config.evaluation.env.first_seed, *(each.first_seed for each in curve.cases.values())]
+    firsts.sort()
+    assert all(later - first >= 20 for first, later in pairwise(firsts))

@@ -1,0 +1,92 @@
+"""What a program shows while it works: a fault in it must not end the work.
+
+A terminal may be closed, a disk full, and a picture is drawn by the code of an env. The results do
+not depend on any of them.
+"""
+
+import sys
+import textwrap
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from tqdm import tqdm
+
+
+class SafeStream:
+    """A stream that is written to as long as it can be.
+
+    Args:
+        stream: such as `sys.stderr`; None for one that is closed.
+
+    Attributes:
+        broken: whether it could not be written to.
+    """
+
+    def __init__(self, stream: Any) -> None:
+        self.stream, self.broken = stream, stream is None
+
+    def write(self, text: str) -> int:
+        """Write a text, unless the stream is broken; return its length."""
+        self._call("write", text)
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush the stream, unless it is broken."""
+        self._call("flush")
+
+    def isatty(self) -> bool:
+        """Return whether the stream is a terminal."""
+        return bool(self._call("isatty"))
+
+    def _call(self, name: str, *arguments: Any) -> Any:
+        if self.broken:
+            return None
+        try:
+            return getattr(self.stream, name)(*arguments)
+        except (OSError, ValueError):  # a ValueError for a closed file
+            self.broken = True
+            return None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+def progress(**options: Any) -> "tqdm[Any]":
+    """Return a progress bar on standard error; `options` are those of tqdm."""
+    return tqdm(file=SafeStream(sys.stderr), **options)
+
+
+def say(text: str, *, error: bool = False) -> None:
+    """Print a text.
+
+    Args:
+        text: the text.
+        error: whether to print on standard error.
+    """
+    stream = SafeStream(sys.stderr if error else sys.stdout)
+    stream.write(f"{text}\n")
+    stream.flush()
+
+
+def warn(text: str) -> None:
+    """Show a warning."""
+    try:
+        warnings.warn(text, stacklevel=3)
+    except (OSError, ValueError):  # standard error is closed
+        return
+
+
+@contextmanager
+def decoration(name: str) -> Iterator[None]:
+    """Turn any error in the block into a warning of one sentence.
+
+    Args:
+        name: of what is shown, the beginning of the sentence.
+    """
+    try:
+        yield
+    except Exception as error:  # whatever a library or an env raises
+        reason = textwrap.shorten(f"{type(error).__name__}: {error}", 200, placeholder=" ...")
+        warn(f"{name} is left out ({reason}); the results are complete without it")

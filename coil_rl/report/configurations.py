@@ -1,0 +1,116 @@
+"""Configurations of runs with one label: what differs between them besides the seed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from coil_rl.report.runs import Run
+
+# Keys, or parents of keys, on which the numbers of a run do not depend, or only by rounding.
+IRRELEVANT = (
+    "seed",
+    "label",
+    "run_dir",
+    "existing",
+    "resume",
+    "trust",
+    "logger",
+    "device",
+    "threads",
+    "compile",
+    "checkpoint_every",
+    "proxy.folder",
+    "evaluation.gif",
+    "evaluation.pictures",
+)
+LONGEST_VALUE = 40  # characters of a value in a label
+MOST_KEYS = 3  # in a label
+
+
+def distinguish(runs: Sequence[Run]) -> tuple[list[Run], list[str]]:
+    """Give runs of one label different labels where their configurations differ.
+
+    Args:
+        runs: finished runs.
+
+    Returns:
+        The runs in their order, and a sentence for each label that was divided.
+    """
+    distinguished, sentences = list(runs), []
+    for label in dict.fromkeys(run.label for run in runs):
+        of_label = [index for index, run in enumerate(runs) if run.label == label]
+        keys = differing([runs[index] for index in of_label])
+        if not keys:
+            continue
+        names = ", ".join(keys[:MOST_KEYS]) + (" and others" if len(keys) > MOST_KEYS else "")
+        sentences.append(
+            f"The runs of {label} differ in {names}, so they are not means of one another."
+        )
+        numbers: dict[str, int] = {}
+        for index in of_label:
+            run = runs[index]
+            values = [f"{key}={_text(relevant(run).get(key))}" for key in keys]
+            shown = ", ".join(values[:MOST_KEYS])
+            if len(keys) > MOST_KEYS:  # the shown values may be alike
+                number = numbers.setdefault(", ".join(values), len(numbers) + 1)
+                shown = f"{number}: {shown}, ..."
+            distinguished[index] = _relabelled(run, f"{label} ({shown})")
+    return distinguished, sentences
+
+
+def differing(runs: Sequence[Run]) -> list[str]:
+    """Return the keys in which the configurations of runs differ, besides what follows the seed.
+
+    Args:
+        runs: of one label.
+    """
+    configurations = [relevant(run) for run in runs]
+    keys = dict.fromkeys(key for configuration in configurations for key in configuration)
+    differ = []
+    for key in keys:
+        values = [configuration.get(key) for configuration in configurations]
+        follows = all(value == run.seed for value, run in zip(values, runs, strict=True))
+        if not follows and any(value != values[0] for value in values):
+            differ.append(key)
+    return differ
+
+
+def relevant(run: Run) -> dict[str, Any]:
+    """Return the values on which the numbers of a run depend, by their full keys.
+
+    The seed in the path of another run, as in `seed3`, is left out.
+
+    Args:
+        run: the run.
+    """
+    values: dict[str, Any] = {}
+    waiting = [("", run.settings)]
+    while waiting:
+        name, node = waiting.pop()
+        if name in IRRELEVANT:
+            continue
+        if isinstance(node, Mapping) and node:
+            waiting += [(f"{name}.{key}".lstrip("."), node[key]) for key in reversed(list(node))]
+        elif isinstance(node, str):
+            values[name] = re.sub(rf"seed{run.seed}(?!\d)", "seed", node)
+        else:
+            values[name] = node
+    return values
+
+
+def _text(value: Any) -> str:
+    """Return a value as a short text."""
+    text = "null" if value is None else str(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 3]}..."
+
+
+def _relabelled(run: Run, label: str) -> Run:
+    """Return a run with another label, also in its evaluation."""
+    evaluation = run.evaluation.copy()
+    own = evaluation["driver"].str.startswith(run.label)
+    renamed = label + evaluation["driver"].str.removeprefix(run.label)
+    evaluation["driver"] = evaluation["driver"].where(~own, renamed)
+    return replace(run, label=label, evaluation=evaluation)

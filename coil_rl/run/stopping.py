@@ -1,0 +1,62 @@
+"""How a run is stopped by a signal, and by which command it goes on."""
+
+import shlex
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+_trusted: list[str] = []  # packages that the command of this process trusts
+
+
+class Stop:
+    """Whether this process is asked to stop, by SIGTERM, SIGHUP or SIGUSR1.
+
+    A training first ends its update and saves its state. Everything else is interrupted at once,
+    and so is a training that is asked twice.
+
+    Attributes:
+        requested: whether it is asked.
+    """
+
+    def __init__(self) -> None:
+        self.requested, self._patient = False, False
+
+    def ask(self) -> bool:
+        """Ask to stop; return whether something runs that will stop by itself."""
+        waits = self._patient and not self.requested
+        self.requested = True
+        return waits
+
+    @contextmanager
+    def after_update(self) -> Iterator[None]:
+        """Say that what runs in the block stops by itself."""
+        self.requested, before = False, self._patient
+        self._patient = True
+        try:
+            yield
+        finally:
+            self._patient = before
+
+    @contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Interrupt what runs in the block."""
+        before = self._patient
+        self._patient = False
+        try:
+            yield
+        finally:
+            self._patient = before
+
+
+STOP = Stop()
+
+
+def remember_trust(packages: Iterable[str]) -> None:
+    """Set the packages that a command which continues a run must trust, too."""
+    _trusted[:] = packages
+
+
+def resume_command(folder: Path) -> str:
+    """Return the command that continues a run, as a shell reads it."""
+    trust = [f"trust=[{','.join(_trusted)}]"] if _trusted else []
+    return shlex.join(["coil-train", f"resume={folder}", *trust])

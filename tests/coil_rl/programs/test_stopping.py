@@ -1,0 +1,135 @@
+"""Signals, closed streams and failing jobs: what was learned is kept, and the others go on."""
+
+import os
+import shlex
+import signal
+import subprocess
+import time
+
+import pytest
+from programs import TINY, called, command, environment, program
+
+from coil_rl.run import checkpoint, stopping
+from coil_rl.run.folder import is_evaluated
+
+SMALL = [*TINY, "evaluation.gif=false", "method=ppo", "learner.epochs=1"]
+LONG = [*SMALL, "budget.frames=200_000", "checkpoint_every=10_000"]
+
+
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGTERM,
+        pytest.param(signal.SIGUSR1, marks=pytest.mark.slow),
+        pytest.param(signal.SIGHUP, marks=pytest.mark.slow),
+    ],
+)
+def test_signal_saves_the_present_update_and_says_how_to_go_on(tmp_path, number):
+    folder = tmp_path / "a run"
+    process = subprocess.Popen(
+        command("train", *LONG, f"hydra.run.dir='{folder}'"),
+        cwd=tmp_path,
+        env=environment(tmp_path),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    log = folder / "metrics.csv"
+    deadline = time.monotonic() + 120
+    while not log.exists() or log.read_bytes().count(b"\n") < 4:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(number)
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    expected = shlex.join(["coil-train", f"resume={folder}"])
+    assert error.splitlines()[-1] == f"train: interrupted; continue with: {expected}"
+    state = checkpoint.load(folder / "checkpoint.pt")
+    assert state["updates"] == log.read_bytes().count(b"\n") - 2
+
+
+def test_command_that_goes_on_is_quoted_and_keeps_its_trust(tmp_path):
+    stopping.remember_trust(["one", "two"])
+    try:
+        words = shlex.split(stopping.resume_command(tmp_path / "it's a run"))
+    finally:
+        stopping.remember_trust([])
+    assert words == ["coil-train", f"resume={tmp_path}/it's a run", "trust=[one,two]"]
+
+
+def test_training_stops_after_its_update_unless_it_is_asked_twice():
+    stop = stopping.Stop()
+    assert not stop.ask()
+    with stop.after_update():
+        assert not stop.requested
+        with stop.at_once():
+            assert not stop.ask()
+        stop.requested = False
+        assert stop.ask()
+        assert not stop.ask()
+    assert not stop.ask()
+
+
+@pytest.mark.parametrize(
+    "streams",
+    [
+        ">/dev/full 2>&-",
+        pytest.param(">&- 2>&-", marks=pytest.mark.slow),
+        pytest.param(">/dev/full 2>/dev/full", marks=pytest.mark.slow),
+    ],
+)
+def test_closed_or_full_streams_do_not_end_a_training(tmp_path, streams):
+    arguments = shlex.join(command("train", *SMALL, "hydra.run.dir=run"))
+    done = subprocess.run(
+        f"{arguments} {streams}", shell=True, cwd=tmp_path, env=environment(tmp_path), check=False
+    )
+    assert done.returncode == 0
+    assert is_evaluated(tmp_path / "run")
+    assert (tmp_path / "run" / "checkpoint.pt").exists()
+
+
+SWEEP = ["-m", *SMALL, "learner.gamma=7,0.9", "hydra.sweep.dir=sweep"]
+
+
+def test_failed_job_leaves_the_others_alone_and_the_same_command_goes_on(tmp_path):
+    error = called("train", *SWEEP, cwd=tmp_path, code=2).stderr
+    assert "1 job of this sweep failed: job 0" in error
+    assert "gamma=7 must be at least 0 and at most 1" in error
+    assert error.rstrip().endswith(shlex.join(["coil-train", *SWEEP]))
+    (folder,) = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    assert is_evaluated(folder)
+    assert "gamma=7" in (tmp_path / "sweep" / "failed_jobs.txt").read_text()
+    # Finished jobs are kept, one without an evaluation is finished.
+    (folder / "evaluation.csv").unlink()
+    checked = (folder / "checkpoint.pt").stat().st_mtime_ns
+    error = called("train", *SWEEP, cwd=tmp_path, code=2).stderr
+    assert is_evaluated(folder)
+    assert (folder / "checkpoint.pt").stat().st_mtime_ns == checked
+    called("train", *[each.replace("7,0.9", "0.9") for each in SWEEP], cwd=tmp_path)
+    assert not (tmp_path / "sweep" / "failed_jobs.txt").exists()
+
+
+def test_sweep_whose_jobs_are_all_refused_leaves_no_folder(tmp_path):
+    sweep = ["-m", *SMALL, "learner.gamma=7,8", "hydra.sweep.dir=sweep"]
+    error = called("train", *sweep, cwd=tmp_path, code=2).stderr
+    assert "2 jobs of this sweep failed" in error
+    assert not (tmp_path / "sweep").exists()
+
+
+@pytest.mark.slow
+def test_failed_job_of_joblib_leaves_the_others_alone(tmp_path):
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    launcher = ["hydra/launcher=joblib", "hydra.launcher.n_jobs=2"]
+    done = program("train", *SWEEP, *launcher, cwd=tmp_path, code=2)
+    assert "1 job of this sweep failed: job 0" in done.stderr
+    (folder,) = [path for path in (tmp_path / "sweep").iterdir() if path.is_dir()]
+    assert is_evaluated(folder)
+
+
+def test_number_of_processes_of_a_sweep_is_limited(tmp_path):
+    jobs = "hydra.launcher.n_jobs=100000"
+    sweep = [*SWEEP, "hydra/launcher=joblib", jobs]
+    error = called("train", *sweep, cwd=tmp_path, code=2).stderr
+    assert "n_jobs=100000 must be at most" in error
+    assert not os.listdir(tmp_path)

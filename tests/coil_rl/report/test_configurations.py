@@ -1,0 +1,77 @@
+"""Test of runs with one label and different configurations."""
+
+import json
+
+import pytest
+from run_folders import driven, make_run
+
+from coil_rl.report.configurations import distinguish
+from coil_rl.report.runs import read_runs
+
+CASES = {"a": 1.0, "b": 2.0}
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Return what makes two runs of one label, seeds 0 and 1, with changes of their settings."""
+
+    def make(*changes):
+        for seed, change in enumerate(changes):
+            folder = make_run(tmp_path / str(seed), "coil", seed, driven("coil", CASES))
+            config = json.loads((folder / "config.yaml").read_text())
+            (folder / "config.yaml").write_text(json.dumps(config | change))
+        return read_runs([tmp_path])
+
+    return make
+
+
+def labels(runs):
+    return [run.label for run in distinguish(runs)[0]]
+
+
+@pytest.mark.parametrize(
+    ("one", "two", "names"),
+    [
+        ({"learner": {"gamma": 0.9}}, {"learner": {"gamma": 0.99}}, "learner.gamma"),
+        ({"env": {"id": "A"}}, {"env": {"id": "B"}}, "env.id"),
+        ({"budget": {"frames": 10}}, {"budget": {"frames": 20}}, "budget.frames"),
+        ({"guide": {"a": {"x": 1}}}, {"guide": {}}, "guide.a.x"),
+        ({"env": {"first_seed": 5}}, {"env": {"first_seed": 6}}, "env.first_seed"),
+        ({"observes": ["a"]}, {"observes": ["a", "b"]}, "observes"),
+        ({"init": None}, {"init": "policy.pt"}, "init"),
+    ],
+)
+def test_runs_that_differ_are_divided_and_the_key_is_named(runs, one, two, names):
+    read = runs(one, two)
+    divided, sentences = distinguish(read)
+    assert len({run.label for run in divided}) == 2
+    assert all(run.label.startswith("coil (") and names in run.label for run in divided)
+    assert names in sentences[0]
+    for run in divided:
+        assert set(run.evaluation["driver"]) == {run.label}
+
+
+@pytest.mark.parametrize(
+    ("one", "two"),
+    [
+        ({}, {}),
+        ({"learner": {"seed": 0}}, {"learner": {"seed": 1}}),
+        ({"run_dir": "a", "existing": "refuse"}, {"run_dir": "b", "existing": "resume"}),
+        ({"device": "cpu", "threads": 1}, {"device": "cuda", "threads": 4}),
+        ({"logger": {"a": 1}}, {"logger": None}),
+        ({"guide": {"run": "x/coil_seed0"}}, {"guide": {"run": "x/coil_seed1"}}),
+        ({"proxy": {"folder": "a"}}, {"proxy": {"folder": "b"}}),
+    ],
+)
+def test_runs_that_differ_in_their_seed_only_are_pooled(runs, one, two):
+    assert labels(runs(one, two)) == ["coil", "coil"]
+
+
+def test_many_differences_are_numbered(runs):
+    one, two = (dict.fromkeys("abcde", seed) for seed in (5, 7))
+    divided, sentences = distinguish(runs(one, two))
+    assert [run.label for run in divided] == [
+        "coil (1: a=5, b=5, c=5, ...)",
+        "coil (2: a=7, b=7, c=7, ...)",
+    ]
+    assert "a, b, c and others" in sentences[0]
