@@ -189,8 +189,7 @@ class AnchoredUpdate(Stateful, Extension):
     """What an anchor changes in the updates of a learner, and the state of the anchor.
 
     At first only the critic learns, because it knows nothing about the returns of the guide.
-    Rewards are divided by their scale: a critic starts near 0, and would follow returns of hundreds
-    for most of the run. The noise of the policy follows a schedule.
+    The noise of the policy follows a schedule.
 
     Args:
         anchor: the settings.
@@ -200,8 +199,6 @@ class AnchoredUpdate(Stateful, Extension):
         active: whether the policy is anchored; otherwise the weight is 0 and training is COIL.
         guide: index of the guide to which it is anchored.
         sign: 1, or -1 for the opposite of the guide.
-        reward_scale: of the rewards in updates of PPO and the like: the largest mean return,
-            without its sign, before training; 1 without an anchor.
         guide_failures: number of cases in which the guide failed before training.
         tolerance: return that may be lost for a step of the weight; NaN before training.
         best_returns: of the best check-up, [C].
@@ -212,7 +209,6 @@ class AnchoredUpdate(Stateful, Extension):
         "active",
         "guide",
         "sign",
-        "reward_scale",
         "guide_failures",
         "tolerance",
         "best_returns",
@@ -223,14 +219,10 @@ class AnchoredUpdate(Stateful, Extension):
         self.anchor = anchor
         _, self.head = anchored_head(policy)
         self.active = True
-        self.guide, self.sign, self.reward_scale = 0, 1, 1.0
+        self.guide, self.sign = 0, 1
         self.guide_failures, self.tolerance = 0, math.nan
         self.best_returns = torch.empty(0)
         self.best_state: dict[str, Tensor] = {}
-
-    def prepare(self, batch: TensorDictBase) -> None:
-        """Divide the rewards of a batch [B, T] by their scale."""
-        batch["next", "reward"] = batch["next", "reward"] / self.reward_scale
 
     def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
         """Return the weights of the losses; those of the policy are 0 during the warm-up."""
@@ -314,7 +306,6 @@ class AnchoredUpdate(Stateful, Extension):
         guide_return = abs(results.mean_return(best))
         if self.active:
             self._keep(policy, results.returns[best])
-            self.reward_scale = max(guide_return, float(others.mean(1).abs().max()))
         chance = float(standard_error(results.returns[best])) / 2
         self.tolerance = max(self.anchor.tolerance * guide_return, chance)
 
