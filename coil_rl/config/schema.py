@@ -82,6 +82,7 @@ class TrainingConfig(NodeConfig):
     """Training values for an env, and overrides of `env` in training; `imitation_env` is for methods that imitate."""
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
+    normalise: Any = "auto"  # of the learner: auto | true | false
     noise_correlation: Annotated[float, Field(ge=0, le=1)] = (
         0.0  # of the noise of continuous actions, see `Rollout`
     )

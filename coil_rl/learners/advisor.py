@@ -40,8 +40,8 @@ class Advisor(PPO):
         guide: index of the guide in the advice.
         hidden: widths of the hidden layers of all networks, without `network`.
         network: architecture of the networks, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -74,7 +74,7 @@ class Advisor(PPO):
         guide: int = 0,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,

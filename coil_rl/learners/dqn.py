@@ -82,7 +82,7 @@ class DQN(OffPolicy):
         action_gain: float = 1.0,
         epsilon: float | Schedule = Linear(1.0, 0.05, until=0.3),
         double: bool = True,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         tau: float = 0.01,
         ratio: float = 16.0,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),

@@ -11,7 +11,7 @@ from torchrl.envs import EnvBase
 from coil_rl.learners.anchor import Anchor, AnchoredUpdate
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.learner import Callback, Cases
-from coil_rl.learners.normaliser import Normaliser, RunningStatistics
+from coil_rl.learners.normaliser import Normaliser, RawObservations, RunningStatistics
 from coil_rl.learners.several_agents import SummedRewards
 
 
@@ -20,10 +20,11 @@ class Extensions(Extension):
 
     Args:
         extensions: in the order in which they act.
+        raw: what is observed as it is, looked at after the first update; None: nothing.
     """
 
-    def __init__(self, extensions: Iterable[Extension]) -> None:
-        self.each = list(extensions)
+    def __init__(self, extensions: Iterable[Extension], raw: RawObservations | None = None) -> None:
+        self.each, self.raw = list(extensions), raw
 
     @property
     def keys(self) -> Sequence[NestedKey]:
@@ -55,6 +56,8 @@ class Extensions(Extension):
         metrics: dict[str, float] = {}
         for extension in self.each:
             metrics |= extension.finish(batch, progress)
+        if self.raw is not None:
+            self.raw.look(batch)
         return metrics
 
     def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
@@ -75,6 +78,7 @@ def extensions_of(
     env: EnvBase,
     policy: nn.Module,
     *,
+    in_keys: Sequence[NestedKey],
     normaliser: Normaliser | None,
     auxiliary: Sequence[Extension],
     anchor: Anchor | None,
@@ -84,6 +88,7 @@ def extensions_of(
     Args:
         env: the env; the rewards of several agents are summed.
         policy: of the learner.
+        in_keys: entries that the policy observes.
         normaliser: of the policy; None: it has none.
         auxiliary: extensions that a user adds.
         anchor: of the policy; None: it has none.
@@ -96,4 +101,4 @@ def extensions_of(
     extensions += auxiliary
     if anchor is not None:  # the last one, because it delays the losses of the others too
         extensions.append(AnchoredUpdate(anchor, policy))
-    return Extensions(extensions)
+    return Extensions(extensions, RawObservations(env, in_keys, normaliser))

@@ -105,7 +105,7 @@ class IBRL(SAC):
         critic_layer_norm: bool = False,
         uncertainty: bool = False,
         auxiliary: Sequence[Extension] = (),
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         tau: float = 0.02,
         ratio: float = 8.0,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),

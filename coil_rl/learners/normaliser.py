@@ -5,8 +5,10 @@ state, so whoever loads the policy has them, guides see the observations as they
 evaluation never changes them.
 """
 
+import sys
+import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase, unravel_key
@@ -20,6 +22,10 @@ from coil_rl.learners.extension import Extension
 from coil_rl.transforms import GuideActions
 
 LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
+# An element is out of scale if its deviation is not between these two, or its mean is more than
+# that many deviations from 0; one that never changed is, beyond that number.
+SMALL, LARGE, FAR = 0.1, 10.0, 3.0
+MOST_SHOWN = 4  # elements in a message
 CHOICES = (OneHot, Categorical)  # specs of choices, of several at once too
 
 
@@ -33,9 +39,12 @@ class Normaliser(TensorDictModuleBase):
     Args:
         env: the env, for its specs.
         keys: the entries.
+        automatic: whether the first `learn` decides which entries are normalised: those with an
+            element that is out of scale, see `out_of_scale`. The others stay as they are. The
+            decision is a part of the state.
     """
 
-    def __init__(self, env: EnvBase, keys: Sequence[NestedKey]) -> None:
+    def __init__(self, env: EnvBase, keys: Sequence[NestedKey], *, automatic: bool = False) -> None:
         self.in_keys = list(keys)
         self.out_keys: list[NestedKey] = [unravel_key(("normalised", key)) for key in keys]
         super().__init__()
@@ -48,7 +57,8 @@ class Normaliser(TensorDictModuleBase):
                 )
             if not spec.dtype.is_floating_point:
                 raise ValueError(f"normalise: {key} has numbers of type {spec.dtype}; leave it out")
-            self.moments.append(Moments(spec.shape[len(env.batch_size) :], spec.device))
+            shape = spec.shape[len(env.batch_size) :]
+            self.moments.append(Moments(shape, spec.device, automatic=automatic))
 
     def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
         """Return the keys that a network reads in place of `keys`."""
@@ -64,7 +74,12 @@ class Normaliser(TensorDictModuleBase):
     def learn(self, batch: TensorDictBase) -> None:
         """Add the entries of a batch of any shape to the statistics."""
         for key, moments in zip(self.in_keys, self.moments, strict=True):
+            first = not moments.count
             moments.add(batch[key])  # type: ignore[operator]
+            if first and moments.used is not None:
+                wrong = moments.out_of_scale
+                moments.used.fill_(wrong.any())  # type: ignore[operator]
+                _say(key, moments.described(wrong))  # type: ignore[operator]
 
 
 class RunningStatistics(Extension):
@@ -92,19 +107,59 @@ class Moments(nn.Module):
     Args:
         shape: of an array.
         device: of the statistics; None: PyTorch's default.
+        automatic: whether values are normalised only once `used` is true.
+
+    Attributes:
+        used: whether values are normalised, a scalar; None: always.
     """
 
-    def __init__(self, shape: torch.Size, device: torch.device | None = None) -> None:
+    def __init__(
+        self, shape: torch.Size, device: torch.device | None = None, *, automatic: bool = False
+    ) -> None:
         super().__init__()
         options: dict[str, Any] = {"dtype": torch.float64, "device": device}
         self.count: Tensor = nn.Buffer(torch.zeros((), **options))
         self.mean: Tensor = nn.Buffer(torch.zeros(shape, **options))
         self.variance: Tensor = nn.Buffer(torch.ones(shape, **options))
+        self.used: Tensor | None
+        self.register_buffer("used", torch.tensor(False, device=device) if automatic else None)
 
     def forward(self, values: Tensor) -> Tensor:
         """Normalise values [*batch, *shape]."""
         scaled = (values - self.mean) / (self.variance + 1e-8).sqrt()
-        return scaled.clamp(-LIMIT, LIMIT).to(values.dtype)
+        scaled = scaled.clamp(-LIMIT, LIMIT).to(values.dtype)
+        return scaled if self.used is None else torch.where(self.used, scaled, values)
+
+    @property
+    def size(self) -> Tensor:
+        """Root of the mean square of each element."""
+        return (self.variance + self.mean.square()).sqrt()
+
+    @property
+    def out_of_scale(self) -> Tensor:
+        """Whether each element is out of scale for a network.
+
+        It is with a deviation below SMALL or above LARGE, or a mean of more than FAR deviations; if
+        it never changed, with a mean beyond FAR.
+        """
+        sizes, deviations = self.mean.abs(), self.variance.sqrt()
+        constant = deviations <= 1e-6 * sizes
+        far = sizes > FAR * torch.where(constant, 1.0, deviations)
+        return far | (~constant & ((deviations < SMALL) | (deviations > LARGE)))
+
+    def described(self, chosen: Tensor) -> list[str]:
+        """Return index, mean and deviation of some elements as texts; of many the first ones.
+
+        Args:
+            chosen: whether each element is one of them.
+        """
+        means, deviations = self.mean.flatten().tolist(), self.variance.sqrt().flatten().tolist()
+        indices = chosen.flatten().nonzero().flatten().tolist()
+        texts = [
+            f"[{index}] mean {means[index]:.4g} deviation {deviations[index]:.4g}"
+            for index in indices[:MOST_SHOWN]
+        ]
+        return [*texts, "..."] if len(indices) > MOST_SHOWN else texts
 
     @torch.no_grad()
     def add(self, values: Tensor) -> None:
@@ -131,14 +186,22 @@ def advice_keys(env: EnvBase) -> set[NestedKey]:
 
 
 def normaliser(
-    env: EnvBase, in_keys: Sequence[NestedKey], normalise: bool | Sequence[NestedKey]
+    env: EnvBase,
+    in_keys: Sequence[NestedKey],
+    normalise: bool | Literal["auto"] | Sequence[NestedKey],
 ) -> Normaliser | None:
     """Return the normaliser of a learner, None without entries.
 
     `normalise` names them; True: all of `in_keys` that hold vectors of measurements, that is not
-    advice, choices or images.
+    advice, choices or images; "auto": those of them that are out of scale in the first batch.
     """
-    if isinstance(normalise, bool):
+    if isinstance(normalise, str):
+        if normalise != "auto":
+            raise ValueError(
+                f"normalise={normalise!r} must be auto, true, false or a list of entries"
+            )
+        chosen = vectors_of_measurements(env, in_keys)
+    elif isinstance(normalise, bool):
         chosen = vectors_of_measurements(env, in_keys) if normalise else []
     else:
         chosen = list(normalise)
@@ -147,7 +210,49 @@ def normaliser(
                 f"normalise: {', '.join(unread)} is not observed; "
                 f"observed are {', '.join(map(str, in_keys))}"
             )
-    return Normaliser(env, chosen) if chosen else None
+    return Normaliser(env, chosen, automatic=normalise == "auto") if chosen else None
+
+
+class RawObservations:
+    """Warns once of observed entries that are out of scale and not normalised; changes nothing.
+
+    Args:
+        env: the env, for its specs.
+        in_keys: entries that are observed.
+        normaliser: of some of them; None: of none.
+    """
+
+    def __init__(
+        self, env: EnvBase, in_keys: Sequence[NestedKey], normaliser: Normaliser | None
+    ) -> None:
+        done = [] if normaliser is None else normaliser.in_keys
+        self.raw = [key for key in vectors_of_measurements(env, in_keys) if key not in done]
+        self.batch_dims = len(env.batch_size)
+
+    def look(self, batch: TensorDictBase) -> None:
+        """Look at a batch [*B, T]; only at the first one."""
+        raw, self.raw = self.raw, []
+        for key in raw:
+            moments = Moments(batch[key].shape[self.batch_dims + 1 :], batch[key].device)
+            moments.add(batch[key])
+            if found := moments.described(moments.size > LARGE):
+                warnings.warn(
+                    f"{_name(key)} is observed as it is, but is far out of scale for a network: "
+                    f"{', '.join(found)}; use learner.normalise=auto or true",
+                    stacklevel=2,
+                )
+
+
+def _say(key: NestedKey, found: Sequence[str]) -> None:
+    """Print what the first batch decided about an entry."""
+    if found:
+        print(f"normalise: {_name(key)} is normalised: {', '.join(found)}", file=sys.stderr)
+    else:
+        print(f"normalise: {_name(key)} is in scale and stays as it is", file=sys.stderr)
+
+
+def _name(key: NestedKey) -> str:
+    return key if isinstance(key, str) else ".".join(map(str, key))
 
 
 def vectors_of_measurements(env: EnvBase, keys: Sequence[NestedKey]) -> list[NestedKey]:

@@ -18,7 +18,7 @@ from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
 from coil_rl.learners.learner import Callback, Cases, Learner
-from coil_rl.learners.normaliser import normaliser
+from coil_rl.learners.normaliser import RawObservations, normaliser
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
@@ -89,7 +89,7 @@ class OffPolicy(Stateful, Learner):
         env: EnvBase,
         in_keys: Sequence[NestedKey],
         *,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         tau: float,
         ratio: float,
         learning_rate: float | Schedule = Linear(1e-3, 0.0),
@@ -115,6 +115,7 @@ class OffPolicy(Stateful, Learner):
         check_range(0, LARGEST_SEED, seed=seed)
         check_replay(env, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
+        self.raw = RawObservations(env, in_keys, self.normaliser)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = guide_may_act(env)
         self.of_guide = stored_of_guide(env)
@@ -141,7 +142,7 @@ class OffPolicy(Stateful, Learner):
         self.generator = torch.Generator(self.device).manual_seed(seed)
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
-        self.extensions = Extensions([])
+        self.extensions = Extensions([], self.raw)
         self.anchored: AnchoredUpdate | None = None
 
     def _new_buffer(self) -> ReplayBuffer:
@@ -181,7 +182,7 @@ class OffPolicy(Stateful, Learner):
         if self.anchor is not None:
             self.anchored = AnchoredUpdate(self.anchor, policy)
             every.append(self.anchored)
-        self.extensions = Extensions(every)
+        self.extensions = Extensions(every, self.raw)
         self.also_store(*self.extensions.keys)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:

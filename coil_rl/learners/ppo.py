@@ -53,8 +53,8 @@ class PPO(Stateful, Learner):
         in_keys: entries that policy and critic observe.
         hidden: widths of the hidden layers of both networks, without `network`.
         network: architecture of both networks; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -101,7 +101,7 @@ class PPO(Stateful, Learner):
         *,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
@@ -145,7 +145,12 @@ class PPO(Stateful, Learner):
         self.critic = self.build_critic(env, in_keys, network)
         memory, self.head = networks.split_memory(self.policy)
         self.extensions = extensions_of(
-            env, self.policy, normaliser=self.normaliser, auxiliary=auxiliary, anchor=anchor
+            env,
+            self.policy,
+            in_keys=in_keys,
+            normaliser=self.normaliser,
+            auxiliary=auxiliary,
+            anchor=anchor,
         )
 
         self.advantage = Advantages(self.critic, gamma, gae_lambda)

@@ -35,8 +35,8 @@ class Reinforce(A2C):
         in_keys: entries that policy and critic observe.
         hidden: widths of the hidden layers of both networks, without `network`.
         network: architecture of both networks; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -62,7 +62,7 @@ class Reinforce(A2C):
         *,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,

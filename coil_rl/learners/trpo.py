@@ -8,7 +8,7 @@ sure that the objective improved and that the bound holds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -46,8 +46,8 @@ class TRPO(PPO):
         shrink: factor by which it shortens a step.
         hidden: widths of the hidden layers of both networks, without `network`.
         network: architecture of both networks, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the policy.
         action_gain: initial scale of the last weights of the policy; with 0 its mean is 0
             everywhere.
@@ -79,7 +79,7 @@ class TRPO(PPO):
         shrink: float = 0.8,
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
