@@ -23,7 +23,13 @@ import torch
 from tabulate import tabulate
 from tensordict import TensorDict
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    ExplorationType,
+    TransformedEnv,
+    set_exploration_type,
+)
 from tqdm import tqdm
 
 from benchmarks.timing import Stopwatch
@@ -31,6 +37,7 @@ from coil_rl.envs.gymnasium_env import GymnasiumEnv
 from coil_rl.learners import DQN, PPO, SAC, Mlp
 from coil_rl.run.rollout import Rollout
 from coil_rl.schedules import Linear
+from coil_rl.transforms.normalised_action import given_units, normalising
 
 Act = Callable[[Tensor], Tensor]  # observations [B, D] to deterministic actions
 # Values of an algorithm on any env, with `every` frames to a minibatch; and what differs on some,
@@ -104,7 +111,10 @@ def ours(
         The deterministic policy, and the gradient steps per CPU second of the updates.
     """
     torch.manual_seed(seed)
-    env = GymnasiumEnv(env_id, values["envs"], seed=seed)
+    env: EnvBase = GymnasiumEnv(env_id, values["envs"], seed=seed)
+    if first := normalising(env):
+        env = TransformedEnv(env, Compose(*first))
+    units = given_units(env)
     learner = our_learner(algorithm, env, values, seed)
     rollout = Rollout(env, learner.policy, values["steps"], learner.keys)
     stopwatch, steps = updates_of(learner, "update"), 0.0
@@ -117,13 +127,13 @@ def ours(
         state = TensorDict({"observation": observation}, observation.shape[:1])
         with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
             action: Tensor = learner.policy(state)["action"]
-        return action
+        return action if units is None else units.denormalise(action)
 
     return act, per_second(steps, stopwatch)
 
 
 def our_learner(
-    algorithm: str, env: GymnasiumEnv, values: Mapping[str, Any], seed: int
+    algorithm: str, env: EnvBase, values: Mapping[str, Any], seed: int
 ) -> PPO | SAC | DQN:
     """Return our learner with the values of Stable-Baselines3; see `ours`."""
     common: dict[str, Any] = {

@@ -59,6 +59,7 @@ if TYPE_CHECKING:
     from coil_rl.transforms import GuideActions as GuideActions
     from coil_rl.transforms import JumpStart as JumpStart
     from coil_rl.transforms import MixedAction as MixedAction
+    from coil_rl.transforms import NormalisedAction as NormalisedAction
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
@@ -83,8 +84,8 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
-    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction ResidualAction RewardCoupling "
-    "set_progress",
+    "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
+    "ResidualAction RewardCoupling set_progress",
 }
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 

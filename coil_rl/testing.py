@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, Transform, TransformedEnv, check_env_specs, step_mdp
 
 from coil_rl.transforms import GuideActions, set_progress
-from coil_rl.transforms.action_space import ActionSpace, nested_key
+from coil_rl.transforms.action_space import ActionSpace, first_choices, nested_key
 
 
 def check_env(env: EnvBase, steps: int = 10) -> None:
@@ -255,7 +255,10 @@ class _AskedGuide:
         self.env = TransformedEnv(
             _Recorded(env, recorded), GuideActions({"guide": guide}, action_key)
         )
-        self.space = ActionSpace(self.env.full_action_spec[action_key], 1)
+        self.env.base_env.first_choices = first_choices(getattr(env, "base_env", env))
+        self.space = ActionSpace(
+            self.env.full_action_spec[action_key], 1, self.env.base_env.first_choices
+        )
 
     def check_action(self, _: object, __: object, written: TensorDictBase) -> None:
         """Raise a `ValueError` for an invalid action; a forward hook of the guide."""

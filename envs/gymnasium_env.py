@@ -24,7 +24,13 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.envs.env_batch import SeededRows
-from coil_rl.envs.gymnasium_spaces import Entry, action_spec, leaves, start
+from coil_rl.envs.gymnasium_spaces import (
+    Entry,
+    action_spec,
+    has_whole_numbers,
+    leaves,
+    lowest_choices,
+)
 from coil_rl.envs.limits import check_range
 
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
@@ -43,8 +49,8 @@ class GymnasiumEnv(SeededRows):
     `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
     "1", ...). A Box is a tensor of `dtype`, but uint8 stays uint8; Discrete and MultiDiscrete are
     one-hot vectors of `dtype`, MultiBinary is one of 0 and 1; texts are left out. Actions are
-    bounded or unbounded for a Box (and clamped to its bounds), indices for Discrete [B] and
-    MultiDiscrete [B, n], and 0 or 1 for MultiBinary.
+    bounded or unbounded for a Box (and clamped to its bounds), indices from 0 for Discrete [B],
+    MultiDiscrete [B, n] and a Box of a few whole numbers [B, n], and 0 or 1 for MultiBinary.
 
     A row whose episode is over stays as it is, with reward 0, until it is reset. A restored state
     goes on to the bit if the env is deterministic, see `SeededRows`. `rate` is the steps per second
@@ -67,8 +73,8 @@ class GymnasiumEnv(SeededRows):
             one object an env, `THING(env)`, with a method `act(observation)` and, if it wants,
             `reset()`, called at the start of an episode; a function is called as `THING(env,
             observation)`. Either may be a `functools.partial`. Its action for the present
-            observation is written as ("controller", NAME), not clamped; after a termination it is
-            the last one.
+            observation is written as ("controller", NAME), not clamped, in the env's own
+            numbering; after a termination it is the last one.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
@@ -124,6 +130,8 @@ class GymnasiumEnv(SeededRows):
         self.floats = torch.empty(0, dtype=dtype).numpy().dtype
         self.rate = float(env.metadata.get("render_fps") or "nan")
         self.space = env.action_space
+        first = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
+        self.first_choices = first if first.any() else None  # the lowest numbers, if not 0
         name = _name(maker)
         self.entries = [
             Entry(name, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
@@ -147,6 +155,8 @@ class GymnasiumEnv(SeededRows):
             advice = action.clone()
             if isinstance(action, Bounded):
                 advice = Unbounded(action.shape, dtype=dtype)
+            elif self.first_choices is not None:
+                advice = Unbounded(action.shape, dtype=action.dtype)
             observation["controller", name] = advice
         flag = Binary(1, dtype=torch.bool)
         ends = Composite({name: flag.clone() for name in ("done", "terminated", "truncated")})
@@ -193,12 +203,13 @@ class GymnasiumEnv(SeededRows):
         return action
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
-        if isinstance(self.space, spaces.Box):
+        if isinstance(self.space, spaces.Box) and not has_whole_numbers(self.space):
             typed = actions.astype(self.space.dtype)
             if not self.space.shape:
                 typed = typed[..., 0]
             return np.clip(typed, self.space.low, self.space.high)
-        return actions + start(self.space)
+        numbered = actions + lowest_choices(self.space)
+        return numbered.astype(self.space.dtype) if has_whole_numbers(self.space) else numbered
 
     def _output(self, *, stepped: bool) -> TensorDict:
         rows = self.rows
@@ -276,7 +287,10 @@ class _Row:
         space = self.env.action_space
         for name, (act, _) in self.controllers.items():
             advice = np.asarray(act(self.observation))
-            if isinstance(space, spaces.Box):
+            if has_whole_numbers(space):
+                whole = advice.astype(space.dtype)
+                fits = bool((whole == advice).all()) and space.contains(whole)
+            elif isinstance(space, spaces.Box):
                 fits = advice.shape == space.shape and np.isfinite(advice).all()
             else:
                 fits = space.contains(advice)
@@ -284,7 +298,7 @@ class _Row:
                 raise ValueError(
                     f"controller {name} gave {advice.tolist()}, not an action of {space}"
                 )
-            self.advice[name] = advice - start(space)
+            self.advice[name] = advice
 
 
 def _maker(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
@@ -319,7 +333,27 @@ def _make(
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     for wrapper in wrappers:
         env = wrapper(env)
+    _check_statistics(env, _name(maker))
     return env
+
+
+def _check_statistics(env: Env, name: str) -> None:
+    """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
+    layer: Any = env
+    while layer is not None:
+        kinds = {kind.__name__ for kind in type(layer).__mro__}
+        if any(kind.startswith("NormalizeObservation") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
+                "evaluation begins anew; leave it out and give learner.normalise=true"
+            )
+        if any(kind.startswith("NormalizeReward") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, which changes the returns "
+                "that a table shows by statistics of its own; leave it out, returns are the env's "
+                "own"
+            )
+        layer = getattr(layer, "env", None)
 
 
 def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:

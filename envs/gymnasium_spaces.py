@@ -5,7 +5,7 @@ and nested Dict and Tuple spaces become nested keys.
 """
 
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -20,6 +20,8 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
+
+MOST_CHOICES = 32  # of a whole number that is an action
 
 
 class Entry:
@@ -102,6 +104,29 @@ def start(space: spaces.Space[Any]) -> Any:
     return getattr(space, "start", 0)
 
 
+def lowest_choices(space: spaces.Space[Any]) -> Any:
+    """Return the lowest number of each choice of an action; 0 for real numbers."""
+    if has_whole_numbers(space):
+        return space.low.astype(np.int64)
+    return start(space)
+
+
+def has_whole_numbers(space: spaces.Space[Any]) -> TypeGuard[spaces.Box]:
+    """Return whether a space is a Box of whole numbers, each of which is a choice as an action."""
+    return isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.integer)
+
+
+def _whole_numbers(id: str, space: spaces.Box) -> TensorSpec:
+    """Return the spec of an action of whole numbers: a few are choices, more a `ValueError`."""
+    sizes = space.high.astype(np.float64) - space.low.astype(np.float64) + 1
+    if len(space.shape) != 1 or sizes.max() > MOST_CHOICES:
+        raise ValueError(
+            f"the action of {id} is a {space} of whole numbers, which are choices, but only up to "
+            f"{MOST_CHOICES} of each and in one dimension: replace it with a wrapper"
+        )
+    return MultiCategorical([int(size) for size in sizes], dtype=torch.int64)
+
+
 def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> TensorSpec:
     """Return the spec of an action of one env.
 
@@ -110,9 +135,11 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
         space: of the action.
         dtype: of actions that are real numbers.
     """
+    if has_whole_numbers(space):
+        return _whole_numbers(id, space)
     if isinstance(space, spaces.Box):
         shape = space.shape or (1,)
-        if not space.is_bounded():
+        if not (np.isfinite(space.low).any() or np.isfinite(space.high).any()):
             return Unbounded(shape, dtype=dtype)
         low, high = (
             torch.as_tensor(bound, dtype=dtype).reshape(shape) for bound in (space.low, space.high)

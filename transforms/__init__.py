@@ -25,4 +25,5 @@ from coil_rl.transforms.guide_actions import GuideActions as GuideActions
 from coil_rl.transforms.guide_actions import Guides as Guides
 from coil_rl.transforms.guide_transform import GuideTransform as GuideTransform
 from coil_rl.transforms.guide_transform import set_progress as set_progress
+from coil_rl.transforms.normalised_action import NormalisedAction as NormalisedAction
 from coil_rl.transforms.reward_coupling import RewardCoupling as RewardCoupling

@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import torch
-from tensordict import NestedKey, unravel_key
+from tensordict import NestedKey, TensorDictBase, unravel_key
 from torch import Tensor
 from torch.nn import functional as F
 from torchrl.data import (
@@ -24,7 +24,9 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
-from torchrl.envs import Transform
+from torchrl.envs import EnvBase, Transform
+
+from coil_rl.transforms.normalised_action import ActionUnits, given_units, units_of
 
 Key = TypeVar("Key", NestedKey, NestedKey | None)
 
@@ -44,9 +46,13 @@ class ActionSpace:
         spec: of the action. A single action without a dimension of its own, or one of whole numbers
             that are no choices, is a `ValueError`.
         batch_dims: number of batch dimensions of the env.
+        first: lowest number of each choice, as controllers count them, [n]; None: 0.
+
+    Attributes:
+        units: of its vectors, which are those of `spec`; None for choices.
     """
 
-    def __init__(self, spec: TensorSpec, batch_dims: int) -> None:
+    def __init__(self, spec: TensorSpec, batch_dims: int, first: Tensor | None = None) -> None:
         self.spec = spec
         self.event = spec.shape[batch_dims:]
         self.continuous = spec.dtype.is_floating_point
@@ -62,10 +68,56 @@ class ActionSpace:
         self.indexed = bool(self.choices) and not self.one_hot
         own = not self.indexed or len(self.choices) > 1 or self.event[-1:] == (1,)
         self.agents = self.event[:-1] if own else self.event
+        self.first = first if self.indexed else None
+        self.units = units_of(spec, batch_dims) if self.continuous else None
         self.bounds: tuple[Tensor, Tensor] | None = None
         if isinstance(spec, Bounded):
-            first = (0,) * batch_dims
-            self.bounds = spec.space.low[first], spec.space.high[first]
+            row = (0,) * batch_dims
+            self.bounds = spec.space.low[row], spec.space.high[row]
+
+    def normalise(self, vectors: Tensor) -> Tensor:
+        """Return vectors [..., A] in normalised numbers; those of choices stay as they are."""
+        return vectors if self.units is None else self.units.normalise(vectors)
+
+    def denormalise(self, vectors: Tensor) -> Tensor:
+        """Return normalised vectors [..., A] in the unit of the action, within its bounds."""
+        return vectors if self.units is None else self.units.denormalise(vectors)
+
+    def added(self, vectors: Tensor, others: Tensor, scale: float) -> Tensor:
+        """Return vectors plus `scale` times others, added in normalised numbers and clamped.
+
+        Args:
+            vectors: [..., A].
+            others: [..., A].
+            scale: a factor.
+        """
+        if self.units is None or self.units.identity:
+            return self.clamp(vectors + scale * others)
+        return self.denormalise(self.normalise(vectors) + scale * self.normalise(others))
+
+    def mirrored(self, vectors: Tensor) -> Tensor:
+        """Return the opposite of vectors [..., A]: of choices their reverse order."""
+        if self.units is not None:
+            return self.denormalise(-self.normalise(vectors))
+        return torch.cat([part.flip(-1) for part in vectors.split(self.choices, -1)], -1)
+
+    def neutral(self) -> Tensor:
+        """Return the vector [*agents, A] of the centre of the action, or of first choices."""
+        if self.units is not None:
+            return self.denormalise(torch.zeros_like(self.units.centre))
+        indices = torch.zeros(*self.agents, len(self.choices), dtype=torch.int64)
+        return self._encoded(indices.to(self.spec.device)).to(self.dtype)
+
+    def random(self, draws: Tensor) -> Tensor:
+        """Return vectors that are uniform in the action, for uniform numbers from 0 to 1 [..., A].
+
+        A coordinate without a bound is uniform in one unit to each side of its centre. Of choices
+        the one with the largest number is taken.
+        """
+        if self.units is not None:
+            return self.denormalise(-1.0 + 2.0 * draws)
+        parts = [part.argmax(-1) for part in draws.split(self.choices, -1)]
+        return self._encoded(torch.stack(parts, -1)).to(self.dtype)
 
     def vectors(self, action: Tensor) -> Tensor:
         """Convert env actions to vectors [*batch, *agents, A]."""
@@ -102,10 +154,17 @@ class ActionSpace:
             # The elements of a vector are 0 or 1.
             limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
             numbers = action if indices is None else indices
-            if not ((numbers >= 0) & (numbers < limit)).all():
+            if ((numbers >= 0) & (numbers < limit)).all():
+                if not (numbers == numbers.long()).all():
+                    raise ValueError("is no whole number, but must be the number of a choice")
+                return
+            if self.first is not None:
+                low, high = self.first, self.first + torch.tensor(self.choices) - 1
                 raise ValueError(
-                    f"is neither an index below {max(self.choices)} nor a one-hot vector"
+                    f"is neither a number from {low.tolist()} to {high.tolist()} nor a one-hot "
+                    "vector"
                 )
+            raise ValueError(f"is neither an index below {max(self.choices)} nor a one-hot vector")
 
     def _indices(self, action: Tensor, batch: torch.Size) -> Tensor | None:
         """Return the choices of a guide as indices [*batch, *agents, n].
@@ -117,7 +176,8 @@ class ActionSpace:
             return None
         n = len(self.choices)
         if (n and action.shape == (*lead, n)) or (n == 1 and action.shape == lead):
-            return action.reshape(*lead, n)
+            indices = action.reshape(*lead, n)
+            return indices if self.first is None else indices - self.first.to(indices)
         raise ValueError(f"has the shape {list(action.shape)}, but must have {[*lead, self.size]}")
 
     def actions(self, vectors: Tensor) -> Tensor:
@@ -174,6 +234,35 @@ class ActionTransform(Transform):
                 f"{type(self).__name__} needs the action spec of an env: use it in a TransformedEnv"
             )
         return ActionSpace(env.full_action_spec[self.action_key], env.batch_dims)
+
+    @cached_property
+    def given_units(self) -> ActionUnits | None:
+        """Units in which the env gets the action, None if they are those of its spec."""
+        return given_units(self.parent)
+
+    def given_vectors(self, action: Tensor) -> Tensor:
+        """Return an action, as the env was given it, as vectors of `action_space` [..., A]."""
+        vectors = self.action_space.vectors(action)
+        return vectors if self.given_units is None else self.given_units.normalise(vectors)
+
+
+def first_choices(env: EnvBase) -> Tensor | None:
+    """Return the lowest number of each choice of an env, [n], if it has one and that is not 0."""
+    return getattr(env, "first_choices", None)
+
+
+def random_action(env: EnvBase, tensordict: TensorDictBase) -> TensorDictBase:
+    """Write a random action of an env, which is uniform where the action is bounded.
+
+    Args:
+        env: with one action.
+        tensordict: of the env, [*batch].
+    """
+    spec = env.full_action_spec[env.action_key]
+    if not isinstance(spec, Bounded) or bool((spec.space.high - spec.space.low).isfinite().all()):
+        return env.rand_action(tensordict)
+    draws = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device)
+    return tensordict.set(env.action_key, ActionSpace(spec, env.batch_dims).random(draws))
 
 
 def choices_of(spec: TensorSpec) -> list[int]:

@@ -1,7 +1,7 @@
 """Env actions combined from the actions of agent and guide.
 
 `action` remains the agent's own action, so its log-probability stays valid. The action that the env
-was given is `("next", "executed_action")` [*batch, *A], in the unit of the env's action.
+was given is `("next", "executed_action")` [*batch, *A], in the unit of the agent's action.
 `ResidualAction`, `MixedAction` and `AdaptiveMixedAction` add the two actions. `Takeover`,
 `JumpStart` and `GradualResidual` let the guide act alone in some steps and write `agent_acts`
 [*batch, 1] with the observation; on-policy learners leave these steps out of the policy loss,
@@ -95,6 +95,9 @@ class CombinedAction(GuideTransform):
 class ResidualAction(CombinedAction):
     """Residual policy: the env action is g + scale * a, clamped (Johannink et al. 2019).
 
+    It is computed in normalised actions, see `ActionUnits`: an agent in the centre of the action
+    leaves the guide as it is.
+
     Args:
         scale: a number or a schedule over the run; with 0 the guide acts alone.
         guide: row of the advice, the index of the guide.
@@ -117,8 +120,8 @@ class ResidualAction(CombinedAction):
         self.scale = scale
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:
-        residual = self.current(self.scale) * tensordict[self.action_key]
-        return self.action_space.clamp(self.advice(tensordict) + residual)
+        scale, action = self.current(self.scale), tensordict[self.action_key]
+        return self.action_space.added(self.advice(tensordict), action, scale)
 
 
 class MixedAction(CombinedAction):
@@ -333,7 +336,7 @@ class GradualResidual(Takeover):
     """Residual policy that is mixed in step by step: Policy Decorator (Yuan et al. 2024).
 
     The env action is g with a probability that decreases over the run, else g + scale * a, clamped;
-    in evaluation always the latter.
+    in evaluation always the latter. It is computed in normalised actions, see `ActionUnits`.
 
     Args:
         scale: of the agent's action, a number or a schedule over the run.
@@ -371,8 +374,8 @@ class GradualResidual(Takeover):
         self.scale = scale
 
     def _of_agent(self, tensordict: TensorDictBase) -> Tensor:
-        residual = self.current(self.scale) * super()._of_agent(tensordict)
-        return self.action_space.clamp(self.advice(tensordict) + residual)
+        scale, action = self.current(self.scale), super()._of_agent(tensordict)
+        return self.action_space.added(self.advice(tensordict), action, scale)
 
 
 class JumpStart(_ActionSwitch):

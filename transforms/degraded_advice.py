@@ -15,18 +15,20 @@ from torch import Tensor
 from torchrl.data import Bounded, Composite, TensorSpec
 from torchrl.envs import Transform
 
-from coil_rl.transforms.action_space import ActionTransform, nested_key
+from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
 from coil_rl.transforms.guide_transform import SeededGenerator
+from coil_rl.transforms.normalised_action import ActionUnits, units_of
 
 
 class DegradedAdvice(Transform):
     """Base class: applies `degrade` to the advice of all guides.
 
-    The result is clamped to the bounds of the advice. `transform(tensordict)` does the same for
-    stored data; outside an env there are no bounds.
+    Advice is degraded in normalised actions, see `ActionUnits`. The result is clamped to the bounds
+    of the advice. `transform(tensordict)` does the same for stored data; outside an env there are
+    no bounds, and advice counts as normalised.
 
     Args:
-        key: entry of the advice, [*batch, n_guides, A] in action units.
+        key: entry of the advice, [*batch, n_guides, A].
         memory_key: entry for advice of the past, [*batch, slots, n_guides, A].
         slots: length of the memory; 0 for none.
     """
@@ -41,6 +43,8 @@ class DegradedAdvice(Transform):
         super().__init__(in_keys=[key], out_keys=out_keys)
         self.key, self.memory_key, self.slots = key, memory_key, slots
         self._bounds: tuple[Tensor, Tensor] | None = None
+        self._units: ActionUnits | None = None
+        self._choices: ActionSpace | None = None  # the space of the action if it is choices
         self._bounds_known = False
 
     def degrade(self, advice: Tensor) -> Tensor:
@@ -48,7 +52,13 @@ class DegradedAdvice(Transform):
         raise NotImplementedError(f"{type(self).__name__} must define degrade")
 
     def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._write(next_tensordict, self.degrade(next_tensordict[self.key]))
+        return self._write(next_tensordict, self.degrade(self._normalised(next_tensordict)))
+
+    def _normalised(self, tensordict: TensorDictBase) -> Tensor:
+        """Return the advice in normalised numbers."""
+        self._know_bounds()
+        advice = tensordict[self.key]
+        return advice if self._units is None else self._units.normalise(advice)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -63,15 +73,27 @@ class DegradedAdvice(Transform):
             )
         return DegradedAdvice._call(self, tensordict)
 
+    def _know_bounds(self) -> None:
+        """Find the bounds and the unit of the advice, once: `self.parent` is as slow as a step."""
+        if self._bounds_known or self.parent is None:
+            return
+        spec = self.parent.full_observation_spec[self.key]
+        if isinstance(spec, Bounded):
+            first = (0,) * len(self.parent.batch_size)
+            self._bounds = spec.space.low[first], spec.space.high[first]
+        keys, batch_dims = self.parent.action_keys, len(self.parent.batch_size)
+        space = ActionSpace(self.parent.full_action_spec[keys[0]], batch_dims)
+        if space.choices:
+            self._choices = space
+        else:
+            self._units = units_of(spec, batch_dims)
+        self._bounds_known = True
+
     def _write(self, tensordict: TensorDictBase, advice: Tensor) -> TensorDictBase:
-        """Write the advice within its bounds."""
-        # Only once, as `self.parent` is as slow as an env step.
-        if not self._bounds_known and self.parent is not None:
-            spec = self.parent.full_observation_spec[self.key]
-            if isinstance(spec, Bounded):
-                first = (0,) * len(self.parent.batch_size)
-                self._bounds = spec.space.low[first], spec.space.high[first]
-            self._bounds_known = True
+        """Write normalised advice in its own unit and within its bounds."""
+        self._know_bounds()
+        if self._units is not None:
+            advice = self._units.denormalise(advice)
         if self._bounds is not None:
             advice = advice.clamp(*self._bounds)
         return tensordict.set(self.key, advice)
@@ -105,7 +127,7 @@ class BiasedAdvice(DegradedAdvice):
     """Advice with a constant offset.
 
     Args:
-        offset: in action units, finite.
+        offset: in normalised actions, finite.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
@@ -119,11 +141,11 @@ class BiasedAdvice(DegradedAdvice):
 
 
 class ScaledAdvice(DegradedAdvice):
-    """Advice multiplied by a constant.
+    """Advice multiplied by a constant: 0 is the centre of a bounded action.
 
     Args:
-        gain: the constant, finite: 0.5 for an undertuned guide, 0 for no advice, -1 for an
-            adversary.
+        gain: the constant, finite: 0.5 for an undertuned guide, 0 for neutral advice, -1 for an
+            adversary. With a negative one choices are advised in the reverse order.
         key: entry of the advice, [*batch, n_guides, A].
     """
 
@@ -133,11 +155,13 @@ class ScaledAdvice(DegradedAdvice):
 
     def degrade(self, advice: Tensor) -> Tensor:
         """Return advice * gain."""
+        if self.gain < 0 and self._choices is not None:
+            return self._choices.mirrored(advice) * -self.gain
         return advice * self.gain
 
 
 class PartialAdvice(DegradedAdvice):
-    """Advice to one side only, 0 for the other side.
+    """Advice to one side only, 0 (the centre of a bounded action) for the other side.
 
     Args:
         side: "left" keeps positive values, "right" negative values; else a `ValueError`.
@@ -193,14 +217,15 @@ class _DrawnAdvice(DegradedAdvice):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         after_reset = tensordict.get("_reset", None) is not None
-        return self._write(tensordict_reset, self.degrade(tensordict_reset[self.key], after_reset))
+        advice = self._normalised(tensordict_reset)
+        return self._write(tensordict_reset, self.degrade(advice, after_reset))
 
 
 class NoisyAdvice(_DrawnAdvice):
     """Advice with Gaussian noise, independent at every step.
 
     Args:
-        sigma: standard deviation in action units, finite and at least 0.
+        sigma: standard deviation in normalised actions, finite and at least 0.
         seed: of the draws.
         key: entry of the advice, [*batch, n_guides, A].
     """
@@ -217,11 +242,11 @@ class NoisyAdvice(_DrawnAdvice):
 
 
 class RandomAdvice(_DrawnAdvice):
-    """Placebo: uniform random numbers instead of advice, drawn at every step.
+    """Placebo: uniform random numbers, or a random choice, instead of advice, drawn at every step.
 
     Args:
-        low: smallest number, in action units, finite.
-        high: largest number, in action units, finite and more than `low`.
+        low: smallest number, in normalised actions, finite.
+        high: largest number, in normalised actions, finite and more than `low`.
         seed: of the draws.
         key: entry of the advice, [*batch, n_guides, A].
     """
@@ -236,7 +261,10 @@ class RandomAdvice(_DrawnAdvice):
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return random numbers."""
-        return self.low + self.range * self._draw(torch.rand, advice, after_reset)
+        draws = self._draw(torch.rand, advice, after_reset)
+        if self._choices is not None:
+            return self._choices.random(draws).to(advice)
+        return self.low + self.range * draws
 
 
 class ShuffledAdvice(DegradedAdvice):
@@ -286,7 +314,8 @@ class ShuffledAdvice(DegradedAdvice):
         if mask is None or previous is None or mask.all():
             return self._call(tensordict_reset)
         tensordict_reset.set(self.memory_key, tensordict_reset[self.key].unsqueeze(-3))
-        return self._write(tensordict_reset, self.degrade(previous.squeeze(-3)))
+        shuffled = self.degrade(previous.squeeze(-3))
+        return tensordict_reset.set(self.key, shuffled)
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the memory."""
@@ -333,7 +362,7 @@ class DelayedAdvice(DegradedAdvice):
 
 
 class RemovedAdvice(DegradedAdvice, ActionTransform):
-    """Placebo: the agent's previous action in place of the advice; zeros in the first step.
+    """Placebo: the agent's previous action in place of the advice; neutral in the first step.
 
     Args:
         key: entry of the advice, [*batch, n_guides, A].
@@ -351,7 +380,7 @@ class RemovedAdvice(DegradedAdvice, ActionTransform):
         return torch.zeros_like(advice)
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        action = self.action_space.vectors(tensordict[self.action_key])
+        action = self.action_space.normalise(self.given_vectors(tensordict[self.action_key]))
         advice = next_tensordict[self.key]
         return self._write(next_tensordict, action.to(advice.dtype).unsqueeze(-2).expand_as(advice))
 

@@ -22,16 +22,16 @@ class DiscreteActions(ActionTransform):
     """Discretise the action, and round the advice to the nearest choice.
 
     The agent's action becomes the index of a choice, and the advice becomes one-hot. Place it last:
-    the transforms before it and the env work in action units, with the advice as given, not
+    the transforms before it and the env work with numbers, with the advice as given, not
     rounded.
 
     Args:
-        choices: number of choices, equally spaced from bound to bound, or the values in action
-            units.
+        choices: number of choices, equally spaced from bound to bound, or the values in the unit of
+            the env.
         action_key: entry of the action, one bounded number; becomes [*batch], int64.
         advice_key: entry of the advice, if any, [*batch, n_guides, 1]; becomes [*batch, n_guides,
             n], 0 or 1.
-        number_key: entry for the advice in action units, [*batch, n_guides, 1].
+        number_key: entry for the advice as numbers, [*batch, n_guides, 1].
 
     Raises:
         ValueError: for fewer than two choices, and for values that are not finite and increasing;
@@ -66,7 +66,7 @@ class DiscreteActions(ActionTransform):
 
     @cached_property
     def values(self) -> Tensor:
-        """[n], values of the choices in action units; RuntimeError outside an env."""
+        """[n], values of the choices in the unit of the agent; RuntimeError outside an env."""
         spec = self.action_space.spec
         size = spec.shape[self.parent.batch_dims :].numel()
         real = spec.dtype.is_floating_point
@@ -75,20 +75,28 @@ class DiscreteActions(ActionTransform):
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
                 f"{size} numbers"
             )
-        if not real or not isinstance(spec, Bounded) or size != 1:
+        bounded = isinstance(spec, Bounded) and bool(
+            (spec.space.high - spec.space.low).isfinite().all()
+        )
+        if not real or not bounded:
             raise ValueError(
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
                 f"{type(spec).__name__}"
             )
-        low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
         if isinstance(self.choices, int):
+            low, high = (float(bound.flatten()[0]) for bound in (spec.space.low, spec.space.high))
             return torch.linspace(low, high, self.choices, dtype=spec.dtype, device=spec.device)
+        bounds = (spec.space.low, spec.space.high)
+        if self.given_units is not None:
+            bounds = self.given_units.bounds
+        low, high = (float(bound.flatten()[0]) for bound in bounds)
         if self.choices[0] < low or self.choices[-1] > high:
             raise ValueError(
                 f"choices={list(self.choices)} must lie between the action's bounds {low} and "
                 f"{high}"
             )
-        return torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
+        values = torch.tensor(self.choices, dtype=spec.dtype, device=spec.device)
+        return values if self.given_units is None else self.given_units.normalise(values)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Discretise the advice in stored data of any batch size."""

@@ -17,8 +17,14 @@ from torch import Tensor, nn
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, Transform
 
-from coil_rl.transforms.action_space import ActionSpace, ActionTransform, nested_key
+from coil_rl.transforms.action_space import (
+    ActionSpace,
+    ActionTransform,
+    first_choices,
+    nested_key,
+)
 from coil_rl.transforms.guide_memory import SUPPLIED, GuideMemory
+from coil_rl.transforms.normalised_action import ActionUnits
 
 
 class UnfitActionError(ValueError):
@@ -42,6 +48,9 @@ class Guides(TensorDictModuleBase):
         action_key: entry written by each guide, [*batch, A].
         out_key: entry for the advice, [*batch, n_guides, A].
         trainable: require parameters and no memory in each guide.
+
+    Attributes:
+        units: of the actions of the guides; None: of the advice.
 
     Raises:
         TypeError: if `guides` is not a mapping.
@@ -85,6 +94,7 @@ class Guides(TensorDictModuleBase):
         super().__init__()
         self.guides = nn.ModuleDict(guides)
         self.action_key = action_key
+        self.units: ActionUnits | None = None
         self._in_keys_of = {name: guide.in_keys for name, guide in guides.items()}
         self._input_dtype: dict[str, torch.dtype] = {}
 
@@ -94,8 +104,11 @@ class Guides(TensorDictModuleBase):
         return list(self.guides)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the advice."""
-        return tensordict.set(self.out_keys[0], self.advice(tensordict))
+        """Write the advice, normalised if `units` are set."""
+        advice = self.advice(tensordict)
+        if self.units is not None:
+            advice = self.units.normalise(advice)
+        return tensordict.set(self.out_keys[0], advice)
 
     def advice(
         self,
@@ -123,6 +136,16 @@ class Guides(TensorDictModuleBase):
             action = data[self.action_key]
             rows.append(action if convert is None else convert(name, action, tensordict.batch_size))
         return torch.stack(rows, -2)
+
+    def tell(self, space: ActionSpace) -> None:
+        """Tell the guides that ask for it, by a method `in_space`, which actions there are.
+
+        Args:
+            space: of the actions of the guides.
+        """
+        for guide in self.guides.values():
+            if hasattr(guide, "in_space"):
+                guide.in_space(space)  # type: ignore[operator]
 
     def match_dtypes(self, tensordict: TensorDictBase) -> None:
         """Convert from here on what a guide reads to the dtype of its parameters.
@@ -199,8 +222,9 @@ class GuideActions(ActionTransform):
     the env and writes an action. Guides run in evaluation mode, without gradients, on a copy of the
     data. If all guides have the attribute `pure = True` (the action is a deterministic function of
     the guide's input entries of the same row), the advice for the first states of episodes is
-    cached. With discrete actions the advice is one-hot; a guide may write an index or a one-hot
-    vector. Advice is clamped to the bounds of the action.
+    cached. With discrete actions the advice is one-hot; a guide may write an index, in the
+    numbering of the env, or a one-hot vector. Advice is clamped to the bounds of the action. Guides
+    act in the unit of the env; behind `NormalisedAction` the advice is normalised.
 
     A guide may have a memory: what it reads as `k` and writes as `("next", k)`, declared by its
     `make_tensordict_primer()`, as TorchRL's `LSTMModule` and `GRUModule` do. It is kept in the data
@@ -212,8 +236,8 @@ class GuideActions(ActionTransform):
     Args:
         guides: name to guide, in the order of the rows of the advice.
         action_key: entry written by the guides, and the env's action.
-        out_key: entry for the advice, [*batch, n_guides, A] in action units; with an action for
-            each of several agents [*batch, n_agents, n_guides, A].
+        out_key: entry for the advice, [*batch, n_guides, A] in the unit of the agent's action; with
+            an action for each of several agents [*batch, n_agents, n_guides, A].
 
     Raises:
         TypeError: if `guides` is not a mapping.
@@ -249,7 +273,17 @@ class GuideActions(ActionTransform):
     def given_space(self) -> ActionSpace:
         """Action space of the env without any transforms."""
         env = self.parent.base_env
-        return ActionSpace(env.full_action_spec[self.action_key], env.batch_dims)
+        return ActionSpace(
+            env.full_action_spec[self.action_key], env.batch_dims, first_choices(env)
+        )
+
+    @cached_property
+    def guide_space(self) -> ActionSpace:
+        """Action space of the guides: that of the env, in its own unit and numbering."""
+        if self.given_units is not None:
+            return self.given_space
+        space = self.action_space
+        return ActionSpace(space.spec, self.parent.batch_dims, self.given_space.first)
 
     @cached_property
     def rows(self) -> Tensor:
@@ -358,6 +392,7 @@ class GuideActions(ActionTransform):
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
         if not self._checked:
             self.guides.match_dtypes(tensordict)
+            self.guides.tell(self.guide_space)
         return self.guides.advice(tensordict, self._fitted, memory)
 
     def _advice_with_past(
@@ -397,11 +432,14 @@ class GuideActions(ActionTransform):
         """Return the action of a guide within the bounds; in the first step, check it."""
         try:
             if name not in self._checked:
-                self.action_space.check_advice(action, batch)
+                self.guide_space.check_advice(action, batch)
                 self._checked.add(name)
-            return self.action_space.advice(action, batch)
+            advice = self.guide_space.advice(action, batch)
         except ValueError as error:
             raise UnfitActionError(name, str(error)) from None
+        if self.given_units is None:
+            return advice
+        return self.action_space.clamp(self.given_units.normalise(advice))
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
         """Add the advice and the memory.

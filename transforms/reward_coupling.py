@@ -19,6 +19,8 @@ NORMS = {"l1": 1.0, "l2": 2.0, "linf": float("inf")}
 class RewardCoupling(GuideTransform):
     """Reward R - beta ||a - g||, where g is the advice that the agent observed before action a.
 
+    Both are normalised, see `ActionUnits`.
+
     Writes the env's own reward as `task_reward` [*batch, 1] and ||a - g|| as `guide_distance`
     [*batch, 1]. In evaluation the reward is the task reward.
 
@@ -65,8 +67,9 @@ class RewardCoupling(GuideTransform):
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         reward = next_tensordict[self.reward_key]
-        action = self.action_space.vectors(tensordict[self.action_key])
-        difference = action - self.advice(tensordict)
+        space = self.action_space
+        action = space.normalise(self.given_vectors(tensordict[self.action_key]))
+        difference = action - space.normalise(self.advice(tensordict))
         distance = torch.linalg.vector_norm(difference, self.order, -1, keepdim=True)
         distance = distance.to(reward.dtype)
         next_tensordict.set("task_reward", reward).set("guide_distance", distance)

@@ -20,6 +20,7 @@ from coil_rl.config.schema import TrainConfig, fingerprint
 from coil_rl.config.start import run_configured
 from coil_rl.errors import UserError
 from coil_rl.files import temporary, whole_file
+from coil_rl.transforms.normalised_action import in_unit_of
 
 FILES = ("config.yaml", "policy_last.pt")  # files of a run that are needed to load its policy
 
@@ -90,5 +91,6 @@ def guides_with_untrained_proxies(config: DictConfig) -> dict[str, TensorDictMod
     guides = build_guides(config)
     for name in guides_without_parameters(guides):
         proxy = proxy_config(config, name)
-        guides[name] = build_learner(proxy, env_maker(proxy)()).policy
+        env = env_maker(proxy)()
+        guides[name] = in_unit_of(env, build_learner(proxy, env).policy)
     return guides

@@ -27,6 +27,8 @@ from coil_rl.guides import PerRow
 from coil_rl.run.parts import TRAIN
 from coil_rl.run.policy_batch import memory_keys
 from coil_rl.run.run import Run
+from coil_rl.transforms.action_space import first_choices
+from coil_rl.transforms.normalised_action import normalising
 
 LONGEST_CHAIN = 4  # learned guides of learned guides
 _loading: list[Path] = []  # runs that are being loaded, each of which is a guide of the one before
@@ -61,17 +63,21 @@ class LearnedGuide(TensorDictModuleBase):
             )
         with _guarded(folder):
             opened = assemble(config, folder)
-            guide: TensorDictModuleBase = _AllRows(config, opened, which)
-            if guide.needs_past:
-                guide = PerRow(partial(_OneRow, opened, which), guide.plant_keys)
+            all_rows = _AllRows(config, opened, which)
+            guide: TensorDictModuleBase = all_rows
+            if all_rows.needs_past:
+                guide = PerRow(partial(_OneRow, opened, which), all_rows.plant_keys)
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
-        self.guide = guide
+        self.guide, self.first = guide, all_rows.first
         self.requires_grad_(False)
         self.eval()
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write `action` as executed by the env, and the next state of a policy with a memory."""
-        return self.guide(tensordict)
+        tensordict = self.guide(tensordict)
+        if self.first is not None:
+            tensordict["action"] = tensordict["action"] + self.first
+        return tensordict
 
 
 class _AllRows(TensorDictModuleBase):
@@ -80,19 +86,24 @@ class _AllRows(TensorDictModuleBase):
     Attributes:
         needs_past: whether it has such a past, so that it must not be used.
         plant_keys: entries of the env of the run.
+        first: lowest numbers of the choices of the env, [n] or one; None: 0.
     """
 
     def __init__(self, config: DictConfig, run: Run, which: str) -> None:
         super().__init__()
         # The transforms need the specs of an env; some need at least two rows.
-        env = TransformedEnv(run.make_env.bare(2, TRAIN, None), Compose(*build_transforms(config)))
+        env = run.make_env.bare(2, TRAIN, None)
+        first = normalising(env)
+        env = TransformedEnv(env, Compose(*first, *build_transforms(config)))
         self.policy = run.load_policy(env, which)
         memory = memory_keys(self.policy)
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]
         specs = env.base_env.observation_spec
         self.plant_keys = observed(env.base_env)
+        lowest = first_choices(env.base_env)
+        self.first = None if lowest is None else lowest.squeeze()
         self.transforms, self.needs_past = None, False
-        if config.method.needs_guide or config.action:
+        if first or config.method.needs_guide or config.action:
             self.transforms = env.transform
             parts = env.transform.modules()
             self.needs_past = bool(memory) or any(getattr(p, "needs_past", False) for p in parts)

@@ -13,6 +13,7 @@ from coil_rl.config.saved import read_config
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
 from coil_rl.run.run import Run
+from coil_rl.transforms.normalised_action import in_unit_of
 
 PROXIES = "proxies"  # subfolder with the networks that replace guides without parameters
 
@@ -69,5 +70,7 @@ def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModu
             raise UserError(
                 f"{proxy} trains guides itself, but a proxy imitates one; train the run again"
             )
-        guides[name] = assemble(proxy_config, proxy).policy(which="last")
+        run = assemble(proxy_config, proxy)
+        env = run.make_env()
+        guides[name] = in_unit_of(env, run.policy(env, which="last"))
     return guides

@@ -235,7 +235,7 @@ class RecordedGuide(TensorDictModuleBase):
     The last one is held after the end of the file.
 
     Args:
-        file: a CSV of numbers, [T, A] in action units, one line for each step; a first line with
+        file: a CSV of numbers, [T, A] in the env's unit, one line for each step; a first line with
             names is left out. A file that cannot be read, or without finite numbers, is a
             `ValueError`.
     """

@@ -18,22 +18,33 @@ from coil_rl.transforms.guide_transform import SeededGenerator
 
 
 class _Uniform(SeededGenerator):
-    """Uniform random numbers [*batch, size] from `low` to `high`, whatever is observed."""
+    """Uniform random numbers [*batch, size] from `low` to `high`, or random actions of a space.
 
-    def __init__(self, low: float, high: float, size: int, seed: int) -> None:
+    What is observed gives the batch shape only.
+    """
+
+    def __init__(self, low: float | None, high: float | None, size: int, seed: int) -> None:
         super().__init__(seed)
         self.low, self.high, self.size = low, high, size
+        self.space: ActionSpace | None = None
 
     def forward(self, observation: Tensor) -> Tensor:
-        draw = torch.rand(*observation.shape[:-1], self.size, generator=self.generator)
-        return (self.low + (self.high - self.low) * draw).to(observation)
+        batch = observation.shape[:-1]
+        if self.space is not None and self.low is None and self.high is None:
+            shape = (*batch, *self.space.agents, self.space.size)
+            draw = torch.rand(shape, generator=self.generator)
+            return self.space.random(draw.to(observation.device, self.space.dtype))
+        low = -1.0 if self.low is None else self.low
+        high = 1.0 if self.high is None else self.high
+        draw = torch.rand(*batch, self.size, generator=self.generator)
+        return (low + (high - low) * draw).to(observation)
 
 
 class ConstantGuide(TensorDictModuleBase):
     """Guide with a constant action.
 
     Args:
-        value: the action in action units, one number or one per dimension.
+        value: the action in the unit of the env, one number or one per dimension.
         in_key: any entry [*batch, N], for the batch shape.
         out_key: entry for the action, [*batch, A].
     """
@@ -56,31 +67,51 @@ class ConstantGuide(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], self.value.expand(*batch, -1))
 
 
-class ZeroGuide(ConstantGuide):
-    """Guide with the action 0.
+class ZeroGuide(TensorDictModuleBase):
+    """Guide with the neutral action: the centre of a bounded coordinate, the first of some choices.
 
     Args:
-        size: A, number of dimensions of the action, at least 1.
+        size: A, number of dimensions of the action where no env says it, at least 1.
         in_key: any entry [*batch, N], for the batch shape.
-        out_key: entry for the action, [*batch, A].
+        out_key: entry for the action, [*batch, A]; 0 until `GuideActions` says which actions there
+            are.
     """
+
+    pure = True
 
     def __init__(
         self, size: int = 1, in_key: NestedKey = "observation", out_key: NestedKey = "action"
     ) -> None:
         check_range(1, size=size)
-        super().__init__([0.0] * size, in_key, out_key)
+        self.in_keys, self.out_keys = [in_key], [out_key]
+        super().__init__()
+        self.value: Tensor = nn.Buffer(torch.zeros(size), persistent=False)
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Take the neutral action of a space.
+
+        Args:
+            space: of the env.
+        """
+        self.value = space.neutral()
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        batch = tensordict[self.in_keys[0]].shape[:-1]
+        return tensordict.set(self.out_keys[0], self.value.expand(*batch, *self.value.shape))
 
 
 class RandomGuide(TensorDictModule):
-    """Guide with uniform random actions.
+    """Guide with random actions, uniform in the actions of the env: numbers or choices.
 
-    The state of its generator is in `state_dict()`.
+    Of a coordinate without a bound see `ActionSpace.random`. The state of its generator is in
+    `state_dict()`.
 
     Args:
-        low: smallest number, in action units.
-        high: largest number, in action units.
-        size: A, number of dimensions of the action, at least 1.
+        low: smallest number, in the unit of the env; None: that of the env, or -1 outside of one.
+        high: largest number, in the unit of the env; None: that of the env, or 1 outside of one.
+        size: A, number of dimensions of the action with `low` or `high` or outside of an env, at
+            least 1.
         seed: of the generator.
         in_key: any entry [*batch, N], for the batch shape.
         out_key: entry for the action, [*batch, A].
@@ -88,8 +119,8 @@ class RandomGuide(TensorDictModule):
 
     def __init__(
         self,
-        low: float = -1.0,
-        high: float = 1.0,
+        low: float | None = None,
+        high: float | None = None,
         size: int = 1,
         seed: int = 0,
         in_key: NestedKey = "observation",
@@ -97,6 +128,14 @@ class RandomGuide(TensorDictModule):
     ) -> None:
         check_range(1, size=size)
         super().__init__(_Uniform(low, high, size, seed), in_keys=[in_key], out_keys=[out_key])
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Draw from a space from here on, unless `low` or `high` is given.
+
+        Args:
+            space: of the env.
+        """
+        self.module.space = space
 
 
 class FollowAdvice(TensorDictModuleBase):

@@ -24,6 +24,7 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.guide_actions import Guides
+from coil_rl.transforms.normalised_action import given_units
 
 
 @dataclass(frozen=True)
@@ -187,8 +188,8 @@ class DynamicCoil(PPO):
         critic_phases: phases in which the critic learns: "both", "agent" or "guide".
         hidden: widths of the hidden layers of agent and critic, without `network`.
         network: architecture of agent and critic, without a memory; None: `Mlp(hidden)`.
-        normalise: whether to normalise what is observed, or the entries to normalise, see
-            `Normaliser`.
+        normalise: whether to normalise what is observed, "auto" to decide it on the first batch, or
+            the entries to normalise, see `Normaliser`.
         action_scale: initial standard deviation of the agent.
         action_gain: initial scale of the last weights of the agent; with 0 its mean is 0
             everywhere.
@@ -225,7 +226,7 @@ class DynamicCoil(PPO):
         critic_phases: Literal["both", "agent", "guide"] = "both",
         hidden: Sequence[int] = (64, 64),
         network: Mlp | None = None,
-        normalise: bool | Sequence[NestedKey] = False,
+        normalise: bool | Literal["auto"] | Sequence[NestedKey] = False,
         action_scale: float = 0.5,
         action_gain: float = 0.01,
         squash: bool = True,
@@ -252,6 +253,7 @@ class DynamicCoil(PPO):
         self.guide_learning_rate = schedule(guide_learning_rate)
         check_range(0, guide_learning_rate=self.guide_learning_rate(0))
         self.advice = Guides(guides, trainable=True)
+        self.advice.units = given_units(env)
         parameters = [parameter for guide in guides.values() for parameter in guide.parameters()]
         if len({id(parameter) for parameter in parameters}) < len(parameters):
             raise ValueError(
@@ -353,5 +355,7 @@ class DynamicCoil(PPO):
             observed = batch.select(*guide.in_keys)
             before = functional_call(guide, initial, (observed.copy(),))["action"]
             change = guide(observed)["action"] - before
+            if self.advice.units is not None:
+                change = change / self.advice.units.unit
             distances[f"moved_{name}"] = float(change.abs().mean())
         return distances

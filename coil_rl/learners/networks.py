@@ -1,5 +1,6 @@
 """Policy and value networks, built from the specs of an env."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -44,6 +45,7 @@ from coil_rl.learners.heads import Choices, ChoicesHead, GaussianHead, GlobalSca
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.learners.sampling import ClippedNormal, Sample
 from coil_rl.transforms.action_space import choices_of
+from coil_rl.transforms.normalised_action import units_of
 
 REMEMBERED = "remembered"  # what a memory gives to the layers after it
 DEFAULT = Mlp()
@@ -97,6 +99,14 @@ def action_spec(env: EnvBase) -> TensorSpec:
             f"the action of this env is {type(spec).__name__} of {spec.dtype}, but a policy "
             "chooses numbers (Bounded, Unbounded), one of several options (Categorical, OneHot) or "
             "several such (MultiCategorical); transform it"
+        )
+    units = units_of(spec, len(env.batch_size))
+    if units is not None and not units.identity:
+        warnings.warn(
+            f"the action of this env goes from {units.bounds[0].tolist()} to "
+            f"{units.bounds[1].tolist()}, but networks compute with numbers between -1 and 1; put "
+            "NormalisedAction() first, next to the env",
+            stacklevel=3,
         )
     return spec
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -15,6 +16,7 @@ from coil_rl.learners.learner import CaseResults
 from coil_rl.report.measures import Measure
 from coil_rl.run.evaluation import Totals, episodes
 from coil_rl.run.policy_batch import policy_batch
+from coil_rl.transforms.action_space import random_action
 
 RANDOM_SEED = 0  # of random actions: the same ones at each call
 
@@ -57,7 +59,7 @@ class SelectionCases:
         env = self.build(1, self.count)
         with torch.random.fork_rng():
             torch.manual_seed(RANDOM_SEED)
-            return self._totals(env, env.rand_action)["return"]
+            return self._totals(env, partial(random_action, env))["return"]
 
     @torch.no_grad()
     def _totals(

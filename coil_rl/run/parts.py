@@ -10,11 +10,20 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import Protocol
 
 from tensordict.nn import TensorDictModuleBase
-from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    EnvBase,
+    RewardSum,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
 
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
+from coil_rl.transforms.normalised_action import normalising
 
 TRAIN = "train"  # episodes of the training: random starts, tracks or seeds
 TEST = "test"  # cases of the table, which training never sees
@@ -71,8 +80,21 @@ class EnvMaker:
         return self.around(self.bare(rows, cases, count), advice)
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
-        """Return any env with the transforms of the method; arguments and errors as above."""
-        return transformed(env, self.transforms(advice), "method.transforms")
+        """Return any env with normalised actions and the transforms of the method.
+
+        Args:
+            env: the env.
+            advice: as above.
+
+        Raises:
+            UserError: as above.
+        """
+        try:
+            first = normalising(env)
+        except ValueError as error:
+            raise UserError(f"env: {error}") from error
+        transforms = [*first, *self.transforms(advice)]
+        return transformed(env, transforms, "method.transforms")
 
     def guided(
         self,
@@ -83,6 +105,8 @@ class EnvMaker:
         count: int | None = None,
     ) -> tuple[EnvBase, TensorDictModuleBase]:
         """Return an env in which the guides act alone, with degraded advice, and the policy that does so.
+
+        Its actions are in the unit of the env.
 
         Args:
             rows: number of rows for each guide. Those of the first guide come first.
@@ -102,6 +126,13 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
 
     Transforms that do not fit are a `UserError` that begins with `name`.
     """
+    # Of the env itself and of the transforms.
+    parts = [*env.modules(), *transforms]
+    if any(isinstance(part, (VecNorm, VecNormV2)) for part in parts):
+        raise UserError(
+            f"{name}: VecNorm normalises by statistics that an evaluation begins anew; leave it "
+            "out and give learner.normalise=true"
+        )
     # The sum comes first, before a method changes the reward.
     env = TransformedEnv(env, Compose(RewardSum(), *transforms))
     try:

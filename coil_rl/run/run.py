@@ -43,6 +43,7 @@ from coil_rl.run.folder import (
 from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
 from coil_rl.run.parts import TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
+from coil_rl.transforms.normalised_action import given_units, units_of
 
 FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
 INIT = "init.pt"  # the policy that a run began from
@@ -315,6 +316,7 @@ class Run:
         make_learner = self.make_learner
         require_agent(make_learner, self.folder)
         env = self.make_env(self.budget.rows)
+        _say_units(env)
         if self.compiled:
             compile_steps(env)
         learner = make_learner(env)  # type: ignore[misc]
@@ -537,6 +539,16 @@ def load_weights(policy: TensorDictModuleBase, path: Path, device: str = "cpu") 
         raise UserError(
             f"{path} holds weights that are NaN or infinite; train again or use another"
         )
+
+
+def _say_units(env: EnvBase) -> None:
+    """Print in which units an action without some of its bounds is normalised."""
+    if len(env.action_keys) != 1:
+        return
+    spec = env.full_action_spec[env.action_key]
+    units = given_units(env) or units_of(spec, len(env.batch_size))
+    if units is not None and units.assumed:
+        print(f"action: {'; '.join(units.assumed)}", file=sys.stderr)
 
 
 def require_agent(make_learner: Any, folder: Path) -> None:

@@ -1,0 +1,168 @@
+"""Observations in physical units: decided on the first batch, said, and kept with the policy."""
+
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from gymnasium.wrappers import NormalizeObservation, NormalizeReward
+
+import coil_rl
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.errors import UserError
+from coil_rl.learners.normaliser import Moments
+
+TINY = ["budget.num_envs=4", "budget.steps=16", "evaluation.cases=2", "logger=none"]
+TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
+TINY += ["checkpoint_every=1"]
+ON_POLICY = ["learner.minibatches=2"]
+REPLAY = ["learner=sac", "learner.starts=16", "learner.ratio=0.25", "learner.batch_size=16"]
+
+
+class Reactor(gymnasium.Env):
+    """A temperature and a height: in kelvin and metres, or in units of their own."""
+
+    action_space = Box(-1, 1, (1,), np.float32)
+    observation_space = Box(-np.inf, np.inf, (2,), np.float32)
+
+    def __init__(self, offset=(0.0, 0.0), unit=(1.0, 1.0), render_mode=None):
+        self.offset, self.unit = np.array(offset), np.array(unit)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.state, self.steps = self.np_random.normal(size=2), 0
+        return self.seen(), {}
+
+    def seen(self):
+        return (self.offset + self.unit * self.state).astype(np.float32)
+
+    def step(self, action):
+        self.state = 0.9 * self.state + 0.3 * self.np_random.normal(size=2)
+        self.steps += 1
+        reward = -float(np.square(action - 0.5 * self.state[:1]).sum())
+        return self.seen(), reward, False, self.steps >= 10, {}
+
+
+PHYSICAL = partial(Reactor, (322.0, 7000.0), (0.5, 900.0))
+
+
+def learned(env, folder, *overrides, frames=128, method="ppo"):
+    run = coil_rl.prepare(
+        env, method=method, frames=frames, folder=folder, overrides=[*TINY, *overrides]
+    )
+    run.begin()
+    run.learn()
+    return run
+
+
+def used(run, which="last"):
+    (moments,) = [m for m in run.policy(which=which).modules() if isinstance(m, Moments)]
+    return bool(moments.used)
+
+
+@pytest.mark.parametrize("options", [ON_POLICY, REPLAY], ids=["ppo", "sac"])
+def test_observations_in_physical_units_are_normalised_and_it_is_said(options, tmp_path, capsys):
+    run = learned(PHYSICAL, tmp_path / "run", *options)
+    said = capsys.readouterr().err
+    assert said.count("normalise: observation is normalised: [0] mean 32") == 1
+    assert "deviation" in said
+    assert "[1] mean" in said
+    assert used(run)
+    controller = run.controller()
+    actions = [controller.act(np.float32([322 + x, 7000 + 1000 * x])) for x in (-1, 0, 1)]
+    assert np.ptp(actions) > 1e-3  # the network is not saturated
+
+
+def test_observations_in_scale_stay_as_they_are(tmp_path, capsys):
+    run = learned(Reactor, tmp_path / "auto", *ON_POLICY)
+    assert "normalise: observation is in scale and stays as it is" in capsys.readouterr().err
+    assert not used(run)
+    raw = learned(Reactor, tmp_path / "raw", *ON_POLICY, "learner.normalise=false")
+    state, expected = run.policy().state_dict(), raw.policy().state_dict()
+    for key, value in expected.items():
+        found = [state[name] for name in state if name.endswith(key.split(".", 2)[2])]
+        assert any(torch.equal(value, each) for each in found)
+
+
+def test_decision_is_resumed_to_the_bit(tmp_path, capsys):
+    whole = learned(PHYSICAL, tmp_path / "whole", *ON_POLICY, frames=256)
+    capsys.readouterr()
+    run = coil_rl.prepare(
+        PHYSICAL,
+        method="ppo",
+        frames=256,
+        folder=tmp_path / "parts",
+        overrides=[*TINY, *ON_POLICY],
+    )
+    run.begin()
+    experiment = run._experiment()
+    torch.manual_seed(run.seed)
+    experiment = run._experiment()
+    experiment.update(0.0)
+    state = experiment.state_dict()
+    other = run._experiment()
+    other.load_state_dict(state)
+    capsys.readouterr()
+    other.update(0.25)
+    assert "normalise" not in capsys.readouterr().err  # decided once
+    assert used(whole)
+    assert bool(other.learner.normaliser.moments[0].used)
+
+
+def test_raw_observations_far_out_of_scale_are_named(tmp_path):
+    with pytest.warns(
+        UserWarning,
+        match=r"observation is observed as it is, but is far out of scale for a network: \[0\] "
+        r"mean 32\d.* deviation .*, \[1\] mean .*; use learner.normalise=auto or true",
+    ):
+        learned(PHYSICAL, tmp_path / "run", *ON_POLICY, "learner.normalise=false")
+
+
+def test_cone_world_and_robot_are_not_normalised():
+    from coil_rl.config.python import _composed
+
+    for env in ("cone_track", "driving_tasks", "simulated_robot"):
+        assert _composed([f"env={env}"]).learner.normalise is False
+    for env in ("lunar_lander", "cart_pole", "babyai"):
+        assert _composed([f"env={env}", "method=ppo"]).learner.normalise == "auto"
+
+
+@pytest.mark.parametrize(
+    ("mean", "variance", "wrong"),
+    [
+        (0.0, 1.0, False),
+        (0.0, 0.0, False),
+        (2.0, 0.0, False),
+        (4.0, 0.0, True),
+        (322.0, 0.25, True),
+        (0.0, 1e-4, True),
+        (0.0, 1e6, True),
+        (2.0, 1.0, False),
+    ],
+)
+def test_what_is_out_of_scale(mean, variance, wrong):
+    moments = Moments(torch.Size([1]))
+    moments.mean.fill_(mean)
+    moments.variance.fill_(variance)
+    assert moments.out_of_scale.tolist() == [wrong]
+
+
+def test_other_word_is_refused(tmp_path):
+    with pytest.raises(UserError, match="normalise"):
+        learned(Reactor, tmp_path / "run", *ON_POLICY, "learner.normalise=sometimes")
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "message"),
+    [
+        (NormalizeObservation, "statistics an evaluation begins anew; leave it out and give "),
+        (NormalizeReward, "changes the returns that a table shows by statistics of its own"),
+    ],
+)
+def test_wrappers_with_statistics_of_their_own_are_refused(wrapper, message):
+    with pytest.raises(ValueError, match=message):
+        GymnasiumEnv(Reactor, wrappers=[wrapper])
+    with pytest.raises(ValueError, match=message):
+        GymnasiumEnv(lambda: gymnasium.wrappers.ClipReward(wrapper(Reactor()), -1, 1))

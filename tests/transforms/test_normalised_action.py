@@ -1,0 +1,258 @@
+"""The unit of the action: guides and env speak the env's, all else the normalised one."""
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box, Discrete, MultiBinary, MultiDiscrete
+from tensordict.nn import TensorDictModule
+from torchrl.envs import TransformedEnv
+
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.guides import ConstantGuide, ControllerGuide, EntryGuide, RandomGuide, ZeroGuide
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.transforms import (
+    BiasedAdvice,
+    DiscreteActions,
+    GuideActions,
+    NormalisedAction,
+    RandomAdvice,
+    RemovedAdvice,
+    ResidualAction,
+    RewardCoupling,
+    ScaledAdvice,
+)
+from coil_rl.transforms.normalised_action import ActionUnits, normalising
+
+INF = np.inf
+
+
+class Seen(gymnasium.Env):
+    """Writes nothing; keeps the actions that it gets, and pays for choices near to the last."""
+
+    observation_space = Box(-1, 1, (2,), np.float32)
+
+    def __init__(self, space):
+        self.action_space, self.got = space, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
+
+    def step(self, action):
+        self.got.append(np.array(action))
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), 0.0, False, False, {}
+
+
+def box(low, high, dtype=np.float32):
+    return Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
+
+
+def advised(space, guide, *transforms, rows=1, normalised=True, controllers=None):
+    env = GymnasiumEnv(lambda: Seen(space), rows, controllers=controllers)
+    first = normalising(env) if normalised else []
+    env = TransformedEnv(env)
+    for transform in (*first, GuideActions({"guide": guide}), *transforms):
+        env.append_transform(transform)
+    return env.eval()
+
+
+def followed(env, steps=3):
+    """Return the actions that the env of row 0 got while its guide acted."""
+    policy, carrier = FollowAdvice(env), env.reset()
+    for _ in range(steps):
+        _, carrier = env.step_and_maybe_reset(policy(carrier))
+    return np.array(env.base_env.rows[0].env.got)
+
+
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [([-1], [1]), ([0], [1]), ([0], [2000]), ([200], [1000]), ([0, -5], [1, 3000]), ([3], [INF])],
+    ids=str,
+)
+def test_guides_act_in_the_unit_of_the_env(low, high, normalised):
+    top = np.where(np.isfinite(high), high, np.array(low) + 2.0)
+    value = (np.array(low) + 0.3 * (top - np.array(low))).tolist()
+    env = advised(box(low, high), ConstantGuide(value), normalised=normalised)
+    np.testing.assert_allclose(followed(env), np.tile(value, (3, 1)), rtol=1e-6)
+    if normalised:
+        torch.testing.assert_close(env.reset()["guide_action"], torch.full((1, 1, len(low)), -0.4))
+
+
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+def test_advice_is_clamped_per_coordinate_where_a_bound_is_finite(normalised):
+    env = advised(box([-1, -INF], [1, INF]), ConstantGuide([5.0, 5.0]), normalised=normalised)
+    assert env.reset()["guide_action"].tolist() == [[[1.0, 5.0]]]
+    assert followed(env, 1).tolist() == [[1.0, 5.0]]
+
+
+def test_units_of_bounds():
+    units = ActionUnits(torch.tensor([0.0, 3, -INF, -INF]), torch.tensor([10.0, INF, 3, INF]))
+    assert units.centre.tolist() == [5, 4, 2, 0]
+    assert units.unit.tolist() == [5, 1, 1, 1]
+    assert units.low.tolist() == [-1, -1, -INF, -INF]
+    assert units.high.tolist() == [1, INF, 1, INF]
+    assert units.assumed == [
+        "coordinate 1 has no upper bound: it counts in units of 1 around 4",
+        "coordinate 2 has no lower bound: it counts in units of 1 around 2",
+        "coordinate 3 has no bounds: it counts in units of 1 around 0",
+    ]
+    largest = torch.full((1,), torch.finfo(torch.float32).max)
+    assert ActionUnits(-largest, largest).identity  # the largest number stands for infinity
+    with pytest.raises(ValueError, match="each lower one must be below the upper one"):
+        ActionUnits(torch.tensor([1.0]), torch.tensor([1.0]))
+
+
+def test_an_action_between_minus_one_and_one_is_left_alone():
+    assert normalising(GymnasiumEnv(lambda: Seen(box([-1, -1], [1, 1])))) == []
+    assert normalising(GymnasiumEnv(lambda: Seen(Discrete(3)))) == []
+
+
+@pytest.mark.parametrize(("low", "high"), [(200, 1000), (0, 4), (-1, 1), (0, 2000)])
+def test_random_guide_is_uniform_in_a_box(low, high):
+    got = followed(advised(box([low, -1], [high, 3]), RandomGuide()), 2000)
+    for numbers, bottom, top in zip(got.T, (low, -1), (high, 3), strict=True):
+        counts, _ = np.histogram(numbers, 10, (bottom, top))
+        assert counts.sum() == 2000  # none beyond the bounds
+        assert np.square(counts - 200).sum() / 200 < 27.9  # chi-square, 9 degrees, 0.1 %
+
+
+@pytest.mark.parametrize(
+    ("space", "actions"),
+    [(Discrete(3), 3), (Discrete(3, start=1), 3), (MultiDiscrete([3, 2]), 6), (MultiBinary(2), 4)],
+    ids=str,
+)
+@pytest.mark.parametrize("degraded", [False, True], ids=["guide", "degraded"])
+def test_random_guide_is_uniform_among_choices(space, actions, degraded):
+    env = advised(space, RandomGuide())
+    if degraded:
+        env = advised(space, ZeroGuide(), RandomAdvice())
+    got = followed(env, 1200).reshape(1200, -1)
+    values, counts = np.unique(got, axis=0, return_counts=True)
+    assert len(values) == actions
+    expected = 1200 / actions
+    assert np.square(counts - expected).sum() / expected < 20.5  # chi-square, 5 degrees, 0.1 %
+
+
+@pytest.mark.parametrize(
+    ("space", "expected"),
+    [
+        (box([0], [2000]), [1000]),
+        (box([200, -1], [1000, 1]), [600, 0]),
+        (box([3], [INF]), [4]),
+        (Discrete(3, start=1), 1),
+        (MultiDiscrete([3, 2]), [0, 0]),
+        (box([-2], [2], np.int64), [-2]),
+    ],
+    ids=str,
+)
+def test_zero_guide_is_neutral(space, expected):
+    assert followed(advised(space, ZeroGuide()), 1)[0].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    "guide",
+    [
+        lambda: ConstantGuide(3),
+        lambda: ControllerGuide(lambda observation: 3),
+        lambda: EntryGuide(["controller", "mine"]),
+    ],
+    ids=["constant", "controller", "beside the env"],
+)
+@pytest.mark.parametrize("space", [Discrete(3, start=1), Discrete(5, start=-1)], ids=str)
+def test_controller_speaks_the_numbers_of_the_env_by_every_way_in(guide, space):
+    env = advised(space, guide(), controllers={"mine": lambda env, observation: 3})
+    assert followed(env).tolist() == [3, 3, 3]
+
+
+def test_number_that_the_env_does_not_have_is_refused():
+    with pytest.raises(ValueError, match=r"neither a number from \[1\] to \[3\] nor a one-hot"):
+        advised(Discrete(3, start=1), ConstantGuide(0)).reset()
+    with pytest.raises(ValueError, match="is no whole number, but must be the number of a choice"):
+        advised(Discrete(3), ConstantGuide([0.5])).reset()
+
+
+def test_box_of_whole_numbers_is_choices():
+    space = box([-2, 0], [2, 1], np.int64)
+    assert followed(advised(space, ConstantGuide([-2, 1]))).tolist() == [[-2, 1]] * 3
+    assert followed(advised(space, ConstantGuide([2.0, 0.0]))).tolist() == [[2, 0]] * 3
+    controller = {"mine": lambda env, observation: np.array([2, 1])}
+    env = advised(space, EntryGuide(["controller", "mine"]), controllers=controller)
+    assert followed(env).tolist() == [[2, 1]] * 3
+    env = GymnasiumEnv(lambda: Seen(space), 8)
+    env.rollout(100)
+    got = np.concatenate([row.env.got for row in env.rows])
+    assert set(got[:, 0].tolist()) == {-2, -1, 0, 1, 2}
+    with pytest.raises(ValueError, match="of whole numbers, which are choices, but only up to 32"):
+        GymnasiumEnv(lambda: Seen(box([0], [1000], np.int64)))
+
+
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+def test_degraded_advice_is_degraded_in_normalised_actions(normalised):
+    space = box([0, 100], [1, 300])
+    for transform, expected in [
+        (ScaledAdvice(0.0), [0.5, 200]),
+        (ScaledAdvice(-1.0), [0.75, 260]),
+        (ScaledAdvice(0.5), [0.375, 170]),
+        (BiasedAdvice(0.2), [0.35, 160]),
+        (RemovedAdvice(), [0.5, 200]),
+    ]:
+        env = advised(space, ConstantGuide([0.25, 140.0]), transform, normalised=normalised)
+        np.testing.assert_allclose(followed(env, 1)[0], expected, rtol=1e-6)
+
+
+def test_adversarial_advice_is_not_zeroed_advice():
+    for space, value in [(box([0], [1]), [0.25]), (box([0], [INF]), [0.25]), (Discrete(3), 0)]:
+        zeroed, opposite = (
+            followed(advised(space, ConstantGuide(value), ScaledAdvice(gain)), 1).tolist()
+            for gain in (0.0, -1.0)
+        )
+        assert opposite != zeroed
+    assert followed(advised(Discrete(3), ConstantGuide(0), ScaledAdvice(-1.0)), 1).tolist() == [2]
+
+
+@pytest.mark.parametrize("normalised", [True, False], ids=["normalised", "own unit"])
+def test_residual_and_distance_are_computed_in_normalised_actions(normalised):
+    space = box([0, 100], [1, 300])
+    transforms = [ResidualAction(0.5), RewardCoupling(1.0)]
+    env = advised(space, ConstantGuide([0.25, 140.0]), *transforms, normalised=normalised)
+    state = env.reset()
+    middle = torch.zeros(1, 2) if normalised else torch.tensor([[0.5, 200.0]])
+    after = env.step(state.clone().set("action", middle))["next"]
+    np.testing.assert_allclose(env.base_env.rows[0].env.got[-1], [0.25, 140], rtol=1e-6)
+    top = torch.ones(1, 2) if normalised else torch.tensor([[1.0, 300.0]])
+    after = env.step(state.clone().set("action", top))["next"]
+    np.testing.assert_allclose(env.base_env.rows[0].env.got[-1], [0.5, 190], rtol=1e-6)
+    assert float(after["guide_distance"]) == pytest.approx(0.5 * 2**0.5, rel=1e-5)
+
+
+def test_guide_reads_its_last_action_in_the_unit_of_the_env():
+    seen = []
+
+    def act(last):
+        seen.append(last.clone())
+        return torch.full_like(last, 140.0)
+
+    guide = TensorDictModule(act, in_keys=["last_action"], out_keys=["action"])
+    followed(advised(box([100], [300]), guide))
+    assert [round(float(each)) for each in seen[1:]] == [140, 140, 140]
+
+
+def test_normalised_action_outside_an_env_says_so():
+    with pytest.raises(RuntimeError, match="NormalisedAction needs an env"):
+        NormalisedAction().units  # noqa: B018
+
+
+def test_values_of_choices_are_in_the_unit_of_the_env():
+    for choices, expected in [([0.0, 0.5, 2.0], [0.0, 0.5, 2.0]), (3, [0.0, 1.0, 2.0])]:
+        env = advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions(choices))
+        state = env.reset()
+        for choice in range(3):
+            env.step(state.clone().set("action", torch.tensor([choice])))
+        got = np.concatenate(env.base_env.rows[0].env.got)
+        np.testing.assert_allclose(got, expected, atol=1e-6)
+    with pytest.raises(ValueError, match=r"must lie between the action's bounds 0.0 and 2.0"):
+        advised(box([0], [2]), ConstantGuide([0.4]), DiscreteActions([-0.5, 0.5])).reset()
+    with pytest.raises(ValueError, match="needs an action of one bounded number"):
+        advised(box([0], [INF]), ConstantGuide([0.4]), DiscreteActions(3)).reset()
