@@ -102,7 +102,10 @@ class ActionSpace:
             # The elements of a vector are 0 or 1.
             limit = torch.tensor(2 if indices is None else self.choices, device=action.device)
             numbers = action if indices is None else indices
-            if not ((numbers >= 0) & (numbers < limit)).all():
+            fits = (numbers >= 0) & (numbers < limit)
+            if indices is not None and action.dtype.is_floating_point:
+                fits &= numbers == numbers.floor()
+            if not fits.all():
                 raise ValueError(
                     f"is neither an index below {max(self.choices)} nor a one-hot vector"
                 )

@@ -12,7 +12,7 @@ from omegaconf.errors import (
     OmegaConfBaseException,
 )
 
-from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean
+from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, did_you_mean, is_outside
 
 # Launchers of Hydra, and the extra of the package that installs each.
 LAUNCHERS = {
@@ -26,9 +26,9 @@ LAUNCHERS = {
 def is_no_bug(error: BaseException) -> bool:
     """Return whether an error has a cause outside of the program.
 
-    That is the input, the configuration or the disk.
+    That is the input, the configuration, an env or controller of somebody else, or the disk.
     """
-    outside = isinstance(error, (UserError, OmegaConfBaseException))
+    outside = is_outside(error) or isinstance(error, OmegaConfBaseException)
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 
