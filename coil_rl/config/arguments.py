@@ -2,10 +2,12 @@
 
 import inspect
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
-from types import NoneType
-from typing import Any, get_args
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Number
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
@@ -13,6 +15,8 @@ from pydantic_core import SchemaError
 from coil_rl.errors import UserError, did_you_mean
 
 PLAIN = (bool, int, float, str, NoneType)
+# Annotations of numbers, and of what holds them.
+NUMERIC = (Number, np.generic, np.ndarray, tuple, list, Sequence)
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -20,6 +24,10 @@ def check_arguments(
     target: Callable[..., Any], node: Mapping[str, Any], name: str, program: Iterable[str] = ()
 ) -> None:
     """Raise a `UserError` for an unknown or missing argument, or one that does not fit its annotation.
+
+    Annotations of other people are often stricter than their code, and YAML has neither tuples nor
+    arrays. So their callables are given any numbers where the annotation is of numbers, arrays or
+    sequences; `converted` makes the tuples and arrays.
 
     Args:
         target: class or function.
@@ -50,7 +58,58 @@ def check_arguments(
             f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE"
         )
     for key in given.keys() & known:
-        _check_type(given[key], known[key].annotation, f"{name}.{key}")
+        annotation = known[key].annotation
+        if not (is_foreign(target) and _holds_numbers(given[key]) and _takes_numbers(annotation)):
+            _check_type(given[key], annotation, f"{name}.{key}")
+
+
+def is_foreign(target: Callable[..., Any]) -> bool:
+    """Return whether a class or function is not of this project."""
+    return not (getattr(target, "__module__", None) or "").startswith("coil_rl.")
+
+
+def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the node of a callable of other people with nodes for the tuples and arrays it wants.
+
+    Args:
+        target: class or function.
+        node: its checked arguments.
+    """
+    if not is_foreign(target):
+        return dict(node)
+    annotations = {each.name: each.annotation for each in _parameters(target) or ()}
+    arguments = dict(node)
+    for key, value in node.items():
+        if not isinstance(value, list) or not _holds_numbers(value):
+            continue
+        kinds = _kinds(annotations.get(key))
+        if kinds & {list, Sequence}:
+            continue
+        if tuple in kinds:
+            arguments[key] = {"_target_": "builtins.tuple", "_args_": [value]}
+        elif np.ndarray in kinds:
+            arguments[key] = {"_target_": "numpy.array", "_args_": [value]}
+    return arguments
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Return whether a value is a number, or a nested list of numbers."""
+    if isinstance(value, list):
+        return all(map(_holds_numbers, value))
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _takes_numbers(annotation: Any) -> bool:
+    """Return whether an annotation is of numbers, arrays or sequences."""
+    return any(kind is not bool and issubclass(kind, NUMERIC) for kind in _kinds(annotation))
+
+
+def _kinds(annotation: Any) -> set[type]:
+    """Return the classes of an annotation, those of a union one by one."""
+    if get_origin(annotation) in (Union, UnionType):
+        return {kind for part in get_args(annotation) for kind in _kinds(part)}
+    kind = get_origin(annotation) or annotation
+    return {kind} if isinstance(kind, type) else set()
 
 
 def _check_type(value: Any, annotation: Any, name: str) -> None:

@@ -8,7 +8,7 @@ import hydra.utils
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.envs import Transform
 
-from coil_rl.config.arguments import check_arguments, yaml_text
+from coil_rl.config.arguments import check_arguments, converted, yaml_text
 from coil_rl.errors import UserError
 
 
@@ -23,7 +23,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         expected: type of the result.
         arguments: added by the program.
     """
-    node = check_node(node, name, arguments)
+    node = _converted(check_node(node, name, arguments))
     try:
         built = hydra.utils.instantiate(node, **arguments, _convert_="all")
     except hydra.errors.InstantiationException as error:
@@ -73,6 +73,14 @@ def _check(node: Any, name: str, program: Iterable[str] = ()) -> None:
     elif isinstance(node, list):
         for index, value in enumerate(node):
             _check(value, f"{name}[{index}]")
+
+
+def _converted(node: Any) -> Any:
+    """Return a checked node with nodes for the tuples and arrays that callables of others want."""
+    if isinstance(node, Mapping):
+        node = {key: _converted(value) for key, value in node.items()}
+        return converted(hydra.utils.get_object(node["_target_"]), node) if "_target_" in node else node
+    return [_converted(value) for value in node] if isinstance(node, list) else node
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:
