@@ -37,6 +37,7 @@ from coil_rl import programs
 from coil_rl.config.sentences import is_no_bug, sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
+from coil_rl.programs.folders import spelled
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
 HYDRA_FILES = (
@@ -144,6 +145,7 @@ def run(
             raise
 
     with program(config_name):
+        sys.argv[1:] = map(spelled, sys.argv[1:])
         _check_options(config_name)
         try:
             hydra.main(
