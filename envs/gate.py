@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-import textwrap
+import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,18 +50,24 @@ def foreign(name: str, call: str) -> Iterator[None]:
 
 def shortened(text: str) -> str:
     """Return a text on one line, of at most 200 characters."""
-    return textwrap.shorten(text, 200, placeholder=" ...")
+    return _cut(text, 200)
+
+
+def _cut(text: str, most: int) -> str:
+    """Return a text on one line, of at most so many characters."""
+    line = " ".join(text.split())
+    return line if len(line) <= most else f"{line[:most].rstrip()} ..."
 
 
 def shown(value: Any) -> str:
     """Return in a few words what code of other people has returned."""
-    if hasattr(value, "shape") and hasattr(value, "dtype") and np.size(value) > 8:
-        return f"an array of the shape {list(value.shape)} ({value.dtype})"
     try:
+        if hasattr(value, "dtype") and math.prod(value.shape) > 8:
+            return f"an array of the shape {list(value.shape)} ({value.dtype})"
         text = repr(value.tolist() if hasattr(value, "tolist") else value)
     except Exception:  # a `__repr__` of other people may fail, too
         text = f"an object of {type(value).__name__}"
-    return textwrap.shorten(text, 80, placeholder=" ...")
+    return _cut(text, 80)
 
 
 def plain_array(value: Any, what: str) -> NDArray[Any]:

@@ -15,8 +15,7 @@ from pydantic_core import SchemaError
 from coil_rl.errors import UserError, did_you_mean
 
 PLAIN = (bool, int, float, str, NoneType)
-# Annotations of numbers, and of what holds them.
-NUMERIC = (Number, np.generic, np.ndarray, tuple, list, Sequence)
+HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -59,7 +58,7 @@ def check_arguments(
         )
     for key in given.keys() & known:
         annotation = known[key].annotation
-        if not (is_foreign(target) and _holds_numbers(given[key]) and _takes_numbers(annotation)):
+        if not is_foreign(target) or not _may_take(given[key], annotation):
             _check_type(given[key], annotation, f"{name}.{key}")
 
 
@@ -93,15 +92,19 @@ def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, 
 
 
 def _holds_numbers(value: Any) -> bool:
-    """Return whether a value is a number, or a nested list of numbers."""
+    """Return whether a value is a finite number, or a nested list of such."""
     if isinstance(value, list):
         return all(map(_holds_numbers, value))
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 2**63
 
 
-def _takes_numbers(annotation: Any) -> bool:
-    """Return whether an annotation is of numbers, arrays or sequences."""
-    return any(kind is not bool and issubclass(kind, NUMERIC) for kind in _kinds(annotation))
+def _may_take(value: Any, annotation: Any) -> bool:
+    """Return whether the code behind an annotation of numbers may take a value from YAML."""
+    kinds = _kinds(annotation) - {bool, int, str, bytes}
+    wanted = HOLDERS if isinstance(value, list) else (Number, np.generic, *HOLDERS)
+    return _holds_numbers(value) and any(issubclass(kind, wanted) for kind in kinds)
 
 
 def _kinds(annotation: Any) -> set[type]:

@@ -19,6 +19,7 @@ from coil_rl.config.check import check
 from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
+from coil_rl.envs.gate import foreign
 from coil_rl.errors import UserError
 from coil_rl.run.controller import Controller
 from coil_rl.run.run import Run
@@ -138,8 +139,10 @@ def _env(env: Any, name: str) -> Words:
             "conf/env, or a class or function that makes an env"
         )
     path = import_path(env)
-    made = env()
-    made.close()
+    with foreign(f"the env {path or getattr(env, '__name__', 'of the maker')}", "its maker"):
+        made = env()
+    if hasattr(made, "close"):
+        made.close()
     if isinstance(made, gymnasium.Env):
         if path is not None:
             return _gym_words(path), {}

@@ -199,7 +199,7 @@ class ControllerGuide(TensorDictModuleBase):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         thing = load(of) if isinstance(of, str) else of
-        title = of if isinstance(of, str) else type(of).__name__
+        title = of if isinstance(of, str) else getattr(of, "__name__", type(of).__name__)
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
         make = _of_class if inspect.isclass(thing) else _of_object
         guide = make(thing, title, keys, dict(options or {}))
@@ -299,6 +299,22 @@ class _ModelOfRow(Predictor):
             return super().act({key: _in_space(entry, parts.get(key)) for key, entry in named})
         (entry,) = entries
         return super().act(_in_space(entry, self.space))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next actions of the episode depend on."""
+        return {"first": self.first, "state": _mapped(torch.from_numpy, np.ndarray, self.state)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.first = state["first"]
+        self.state = _mapped(torch.Tensor.numpy, torch.Tensor, state["state"])
+
+
+def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
+    """Convert what is of a kind in nested tuples."""
+    if isinstance(value, tuple):
+        return tuple(_mapped(convert, kind, part) for part in value)
+    return convert(value) if isinstance(value, kind) else value
 
 
 def _in_space(entry: NDArray[Any], space: Any) -> Any:
