@@ -95,7 +95,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         for name, what in what_guides_see(config).items()
     ]
     return Trial(
-        config.label,
+        OmegaConf.select(config, "label") or "",  # guides alone have none
         build_evaluation(config, recorded(pictures)),
         make_env,
         pictures=pictures,
