@@ -20,7 +20,7 @@ class UserError(Exception):
 
 
 def is_outside(error: BaseException) -> bool:
-    """Return whether an error says that its cause is not in this program: the user, or other code."""
+    """Return whether an error has its cause in the user's input, or in code of other people."""
     return isinstance(error, UserError) or bool(getattr(error, "outside", False))
 
 

@@ -273,7 +273,11 @@ class EnvBatch(SeededRows):
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
         super().__init__(
-            [_EnvRow(env, number) for number, env in enumerate(envs)], seed, first_seed, cases, one.device or "cpu"
+            [_EnvRow(env, number) for number, env in enumerate(envs)],
+            seed,
+            first_seed,
+            cases,
+            one.device or "cpu",
         )
         for spec in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
             full = f"full_{spec}"

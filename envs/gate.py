@@ -277,7 +277,9 @@ class EnvGate:
         with foreign(f"the env {self.name}", "render"):
             picture = self.env.render()
         found = isinstance(picture, np.ndarray) and picture.dtype == np.uint8 and picture.size > 0
-        if not found or not (picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] in (3, 4))):
+        if not found or not (
+            picture.ndim == 2 or (picture.ndim == 3 and picture.shape[2] in (3, 4))
+        ):
             raise ForeignError(
                 f"render returned {shown(picture)}, not a picture [height, width, 3] of uint8"
             )

@@ -143,7 +143,8 @@ class GymnasiumEnv(SeededRows):
             makes[0] = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name, self.floats = _name(maker), torch.empty(0, dtype=dtype).numpy().dtype
         rows = [
-            _Row(make, makers, fresh, name, number, self.floats) for number, make in enumerate(makes)
+            _Row(make, makers, fresh, name, number, self.floats)
+            for number, make in enumerate(makes)
         ]
         super().__init__(rows, seed, first_seed, cases, device)
         env = rows[0].gate.env

@@ -129,9 +129,9 @@ def _check_repeats(env: EnvBase) -> None:
     key = env.unrepeated()
     if key is not None:
         warnings.warn(
-            f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, so "
-            "the cases of an evaluation are not the same for each policy; draw random numbers from "
-            "self.np_random, or give env.fresh=true if a reset leaves something of the past",
+            f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
+            "so the cases of an evaluation are not the same for each policy; draw random numbers "
+            "from self.np_random, or give env.fresh=true if a reset leaves something of the past",
             stacklevel=2,
         )
 

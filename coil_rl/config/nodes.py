@@ -79,7 +79,11 @@ def _converted(node: Any) -> Any:
     """Return a checked node with nodes for the tuples and arrays that callables of others want."""
     if isinstance(node, Mapping):
         node = {key: _converted(value) for key, value in node.items()}
-        return converted(hydra.utils.get_object(node["_target_"]), node) if "_target_" in node else node
+        return (
+            converted(hydra.utils.get_object(node["_target_"]), node)
+            if "_target_" in node
+            else node
+        )
     return [_converted(value) for value in node] if isinstance(node, list) else node
 
 

@@ -46,7 +46,7 @@ class PerRow(TensorDictModuleBase):
     episodes begin when a run is resumed. They are called one after the other: a batched guide is
     many times faster.
 
-    What an object raises or returns that is no action is a `ForeignError` with the row and the step.
+    What an object raises, or returns that is no action, is a `ForeignError` with its row and step.
 
     Args:
         make: makes an object; called without arguments.
@@ -157,8 +157,8 @@ class PerRow(TensorDictModuleBase):
         self.continues = state is not None
         if state is None:
             warnings.warn(
-                f"the controller {self.title} has no state_dict() and load_state_dict(state), so new "
-                "episodes begin",
+                f"the controller {self.title} has no state_dict() and load_state_dict(state), so "
+                "new episodes begin",
                 stacklevel=2,
             )
             state = {}
@@ -455,9 +455,7 @@ def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
         with open(file, encoding="utf-8-sig") as text:  # with a byte-order mark, as Excel writes it
             lines = [line.partition("#")[0].translate(MINUS).strip() for line in text]
     except (OSError, UnicodeError) as error:
-        raise ValueError(
-            f"file={name} cannot be read as numbers with commas ({error})"
-        ) from error
+        raise ValueError(f"file={name} cannot be read as numbers with commas ({error})") from error
     rows = [_fields(line) for line in lines if line]
     if rows and not any(map(_is_number, rows[0])):
         del rows[0]

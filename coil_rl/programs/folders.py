@@ -16,7 +16,7 @@ KEYS = ("run", "hydra.run.dir", "run_dir", "init", "guide.learned.run", "proxy.f
 
 
 def spelled(argument: str) -> str:
-    """Return an argument of a program as Hydra reads it, with quotes around a folder that needs them.
+    """Return an argument of a program as Hydra reads it: a folder has the quotes that it needs.
 
     Args:
         argument: as the shell passed it on; it may be anything.
@@ -70,7 +70,5 @@ def _as_hydra(text: str) -> object | None:
 
 def _quoted(text: str) -> str:
     """Return a text in quotes of Hydra, where a backslash is special before a quote only."""
-    escaped = re.sub(
-        r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text
-    )
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
     return f"'{escaped}'"

@@ -85,7 +85,8 @@ def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
     given = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(list(others)))
     trust_packages(given.trust)
     lengthens = any(argument.startswith("budget.frames=") for argument in others)
-    resume(folders.folder(resumed.removeprefix("resume=")), given.budget.frames if lengthens else None)
+    folder = folders.folder(resumed.removeprefix("resume="))
+    resume(folder, given.budget.frames if lengthens else None)
 
 
 def main() -> None:

@@ -99,7 +99,10 @@ PLACE = r"^the env .*\(row 0, seed 7, step 3\): "
         (put(4, None), "info of step is None, not a dictionary"),
         (put(4, [("a", 1)]), "info of step is .*, not a dictionary"),
         (put(0, None), "the observation is None, not an array of numbers"),
-        (put(0, np.zeros((1, 2))), r"the observation has the shape \[1, 2\], but its space has \[2"),
+        (
+            put(0, np.zeros((1, 2))),
+            r"the observation has the shape \[1, 2\], but its space has \[2",
+        ),
         (put(0, np.zeros(3)), r"the observation has the shape \[3\]"),
         (put(0, 0.5), r"the observation has the shape \[\]"),
         (put(0, ["a", "b"]), "the observation is .*, not an array of numbers"),
@@ -159,7 +162,11 @@ TWO = spaces.Tuple([spaces.Discrete(2), BOX])
         (spaces.Box(-1, 1, (2, 3)), np.zeros((3, 2)), r"has the shape \[3, 2\], but .* \[2, 3\]"),
         (spaces.Box(-1, 1, (2, 3)), np.zeros(6), r"has the shape \[6\], but its space has \[2, 3"),
         (spaces.Box(-1, 1, (3,)), np.zeros((3, 1)), r"has the shape \[3, 1\]"),
-        (spaces.Box(0, 255, (2,), np.uint8), [0.5, 0.25], "the observation holds 0.5, which is not"),
+        (
+            spaces.Box(0, 255, (2,), np.uint8),
+            [0.5, 0.25],
+            "the observation holds 0.5, which is not",
+        ),
         (spaces.Box(0, 255, (2,), np.uint8), [0, 256], "the observation holds 256, which is not"),
         (spaces.Box(0, 255, (2,), np.uint8), [0, -1], "the observation holds -1, which is not in"),
         (spaces.MultiBinary(2), [0, 2], "the observation holds 2, which is not in MultiBinary"),
@@ -265,7 +272,7 @@ def test_bounds_that_are_no_numbers_or_in_the_wrong_order_are_refused():
     for low, high in ((np.nan, 1.0), (1.0, -1.0)):
         space = spaces.Box(-1, 1, (1,))
         space.low, space.high = np.array([low]), np.array([high])
-        with pytest.raises(ValueError, match="number 0 of the action of .* has the bounds"):
+        with pytest.raises(ValueError, match=r"number 0 of the action of .* has the bounds"):
             GymnasiumEnv(lambda **_: Plant(action=space))  # noqa: B023
 
 
@@ -288,7 +295,7 @@ def test_maker_without_an_env_is_refused(maker, message):
 
 def test_maker_that_returns_one_env_twice_is_refused():
     plant = Plant()
-    with pytest.raises(ValueError, match="the maker of .* returned one env twice"):
+    with pytest.raises(ValueError, match=r"the maker of .* returned one env twice"):
         GymnasiumEnv(lambda: plant, 2)
 
 
@@ -335,7 +342,7 @@ def test_limit_of_an_env_is_its_own():
 def test_env_that_ignores_its_seed_is_noticed():
     class Own(Plant):
         def good(self):
-            return np.random.uniform(size=2).astype(np.float32)  # noqa: NPY002
+            return np.random.uniform(size=2).astype(np.float32)
 
     assert GymnasiumEnv(lambda: Own()).unrepeated() == "observation"
     assert GymnasiumEnv(lambda: Plant()).unrepeated() is None
@@ -373,7 +380,9 @@ def test_picture_of_another_size_is_a_warning(monkeypatch):
     env.reset()
     assert env.render() is not None
     assert env.render() is not None
-    with pytest.warns(UserWarning, match=r"a picture of the shape \[5, 4, 3\] after one of \[4, 4,"):
+    with pytest.warns(
+        UserWarning, match=r"a picture of the shape \[5, 4, 3\] after one of \[4, 4,"
+    ):
         assert env.render() is None
 
 
@@ -412,10 +421,8 @@ def test_controller_beside_its_env_is_named_with_the_place(advice, message):
         return advice(env, observation) if env.time == STEP else observation[:1]
 
     env = GymnasiumEnv(lambda: Plant(), 2, first_seed=7, controllers={"pid": late})
-    carrier = env.reset()
     with pytest.raises(ForeignError, match=message) as caught:
-        for _ in range(STEP):
-            carrier = env.step_and_maybe_reset(env.rand_action(carrier))[1]
+        env.rollout(STEP)
     assert "(row 0, seed 7, step 3)" in str(caught.value)
 
 

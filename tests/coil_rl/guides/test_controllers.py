@@ -195,7 +195,7 @@ def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
             r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)",
         ),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
-        ("my_control:number", {}, "of=my_control:number is int; name a class, a function, an object with act"),
+        ("my_control:number", {}, "my_control:number is int; name a class, a function, an object"),
         (
             "my_control:Other",
             {},

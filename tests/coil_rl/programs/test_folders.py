@@ -5,7 +5,20 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from coil_rl.programs.folders import folder, spelled
 
-NAMES = ["a b", "a=b", "\u00fc", "a'b", 'a"b', "a,b", "[x]", "a(1)", "tail\\", "a{b}", "a#b", "null"]
+NAMES = [
+    "a b",
+    "a=b",
+    "\u00fc",
+    "a'b",
+    'a"b',
+    "a,b",
+    "[x]",
+    "a(1)",
+    "tail\\",
+    "a{b}",
+    "a#b",
+    "null",
+]
 NAMES += ["2024", "a: b", "$x", "a\\'b", "'q'", " lead", "~", "a\\\\", "{}", "1e3", "true"]
 
 

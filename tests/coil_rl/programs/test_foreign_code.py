@@ -115,7 +115,12 @@ def guided(of="P"):
         ("train", "TrainingOnly", ["method=ppo"], "step returned 4 values, not the five"),
         ("train", "Plant", guided("Late"), "the controller odd_plants:Late (row 0, step 10)"),
         ("evaluate", "NoReward", guided()[1:], "the reward is None, not one number"),
-        ("evaluate", "Plant", guided("Late")[1:], "the controller odd_plants:Late (row 0, step 10)"),
+        (
+            "evaluate",
+            "Plant",
+            guided("Late")[1:],
+            "the controller odd_plants:Late (row 0, step 10)",
+        ),
     ],
 )
 def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tmp_path):
