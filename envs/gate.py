@@ -84,7 +84,7 @@ def plain_array(value: Any, what: str) -> NDArray[Any]:
         array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     except Exception as error:
         raise ForeignError(f"{what} is {shown(value)}, not an array of numbers") from error
-    if array.dtype.kind not in "biuf":
+    if array.dtype.kind not in "biuf" or np.ma.is_masked(value):
         raise ForeignError(f"{what} is {shown(value)}, not an array of numbers")
     return array
 

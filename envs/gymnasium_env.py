@@ -468,6 +468,11 @@ def _make(
             env = _called(maker, settings)
         for wrapper in wrappers:
             env = wrapper(env)
+        missing = [
+            which
+            for which in ("action_space", "observation_space")
+            if isinstance(env, gymnasium.Env) and getattr(env, which, None) is None
+        ]
     except (Exception, SystemExit) as error:
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
     if not isinstance(env, gymnasium.Env):
@@ -475,9 +480,8 @@ def _make(
             f"the env {name} is {shown(env)}, not an env of Gymnasium: derive its class from "
             "gymnasium.Env"
         )
-    for which in ("action_space", "observation_space"):
-        if getattr(env, which, None) is None:
-            raise ValueError(f"the env {name} has no {which}: set it in its __init__")
+    if missing:
+        raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
     return env
 
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -52,6 +53,7 @@ def train(
 
     Raises:
         UserError: for a mistake in an argument, with one sentence that says what to do.
+        ValueError: for what the env or the guide raises, or returns that does not fit.
 
     Example:
         >>> import coil_rl
@@ -141,7 +143,7 @@ def _env(env: Any, name: str) -> Words:
     path = import_path(env)
     with foreign(f"the env {path or getattr(env, '__name__', 'of the maker')}", "its maker"):
         made = env()
-    if hasattr(made, "close"):
+    with suppress(Exception):  # nothing depends on it
         made.close()
     if isinstance(made, gymnasium.Env):
         if path is not None:
