@@ -14,6 +14,7 @@ import math
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
@@ -101,16 +102,23 @@ def number(value: Any, what: str, dtype: np.dtype[Any]) -> float:
         ForeignError: for None, a text, an array with a dimension, a complex number, and for a
             number that is not finite.
     """
-    if isinstance(value, (str, bytes)) or np.ndim(value) > 0:
+    plain = isinstance(value, (float, int))
+    if not plain and (isinstance(value, (str, bytes)) or np.ndim(value) > 0):
         raise ForeignError(f"{what} is {shown(value)}, not one number")
     try:
         result = float(value)
     except Exception as error:
         raise ForeignError(f"{what} is {shown(value)}, not one number") from error
-    with np.errstate(over="ignore"):
-        if not np.isfinite(dtype.type(result)):
-            raise ForeignError(f"{what} is {result}, not a finite number of {dtype}")
+    largest = _largest(dtype)
+    if not -largest <= result <= largest:
+        raise ForeignError(f"{what} is {result}, not a finite number of {dtype}")
     return result
+
+
+@cache
+def _largest(dtype: np.dtype[Any]) -> float:
+    """Return the largest number of a dtype."""
+    return float(np.finfo(dtype).max)
 
 
 def flag(value: Any, what: str) -> bool:
@@ -123,6 +131,8 @@ def flag(value: Any, what: str) -> bool:
     Raises:
         ForeignError: for anything but True, False, 1 and 0.
     """
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
     single = np.ndim(value) == 0 and not isinstance(value, (str, bytes))
     if not single or value is None or value not in (0, 1):
         raise ForeignError(f"{what} is {shown(value)}, not True or False")
@@ -221,20 +231,31 @@ class EnvGate:
             answer = self.env.step(action)
         except (Exception, SystemExit) as error:
             self._fail("step", error)
-        with self.placed():
-            if not isinstance(answer, (tuple, list)) or len(answer) != 5:
-                raise ForeignError(
-                    f"step returned {_counted(answer)}, not the five of Gymnasium (observation, "
-                    "reward, terminated, truncated, info)"
-                )
-            observation, reward, terminated, truncated, info = answer
-            if not isinstance(info, Mapping):
-                raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
-            reward = number(reward, "the reward", self.dtype)
-            terminated, truncated = flag(terminated, "terminated"), flag(truncated, "truncated")
+        try:
+            observation, reward, terminated, truncated, info = self._five(answer)
+        except ForeignError as error:
+            raise ForeignError(f"{self.place}: {error}") from error.__cause__
         if not terminated and not truncated:
             truncated = self._is_too_long()
         return observation, reward, terminated, truncated, info
+
+    def _five(self, answer: Any) -> tuple[Any, float, bool, bool, Mapping[str, Any]]:
+        """Return the checked values of a step."""
+        if not isinstance(answer, (tuple, list)) or len(answer) != 5:
+            raise ForeignError(
+                f"step returned {_counted(answer)}, not the five of Gymnasium (observation, "
+                "reward, terminated, truncated, info)"
+            )
+        observation, reward, terminated, truncated, info = answer
+        if not isinstance(info, Mapping):
+            raise ForeignError(f"info of step is {shown(info)}, not a dictionary")
+        return (
+            observation,
+            number(reward, "the reward", self.dtype),
+            flag(terminated, "terminated"),
+            flag(truncated, "truncated"),
+            info,
+        )
 
     def read(
         self, observation: Any, entries: Sequence[Callable[[Any], NDArray[Any]]]
@@ -248,8 +269,10 @@ class EnvGate:
         Raises:
             ForeignError: for an entry that is missing or does not fit its space.
         """
-        with self.placed():
+        try:  # without `placed`, which costs as much as a step of a small env
             return [entry(observation) for entry in entries]
+        except ForeignError as error:
+            raise ForeignError(f"{self.place}: {error}") from error.__cause__
 
     def _fail(self, call: str, error: BaseException) -> None:
         with foreign(self.place, call):

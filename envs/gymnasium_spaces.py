@@ -63,6 +63,7 @@ class Entry:
                 f"the observation of {id} has a {type(space).__name__} space: replace it with a "
                 "wrapper"
             )
+        self.given = tuple(self.spec.shape)
 
     def __call__(self, observation: Any) -> NDArray[Any]:
         """Return a copy of this entry of an observation, of the shape of `spec`.
@@ -77,9 +78,7 @@ class Entry:
         for part in self.path:
             observation = self._part(observation, part)
         value = plain_array(observation, self.title)
-        # A single number may have a dimension of its own.
-        single = value.size == 1 and value.ndim <= 1
-        if value.shape != self.shape and not (single and self.shape in ((), (1,))):
+        if value.shape != self.shape and not self._is_single(value):
             raise ForeignError(
                 f"{self.title} has the shape {list(value.shape)}, but its space has "
                 f"{list(self.shape)}"
@@ -90,12 +89,19 @@ class Entry:
             self._check(value, (value >= 0) & (value <= 255) & (value == np.floor(value)))
         if self.binary:
             self._check(value, (value == 0) | (value == 1))
-        with np.errstate(over="ignore"):
-            converted = np.array(value, dtype=self.dtype).reshape(self.spec.shape)
-        if not np.isfinite(converted).all():
+        if value.dtype == self.dtype:
+            converted = value.copy().reshape(self.given)
+        else:
+            with np.errstate(over="ignore"):
+                converted = value.astype(self.dtype).reshape(self.given)
+        if converted.dtype.kind == "f" and not np.isfinite(converted).all():
             wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
             raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
         return converted
+
+    def _is_single(self, value: NDArray[Any]) -> bool:
+        """Return whether a value is one number, which may have a dimension of its own."""
+        return value.size == 1 and value.ndim <= 1 and self.shape in ((), (1,))
 
     def _part(self, observation: Any, part: str | int) -> Any:
         """Return a part of an observation by the key of a Dict space or the index of a Tuple."""
@@ -125,7 +131,7 @@ class Entry:
         sizes = np.array(self.choices)
         fits = (chosen >= 0) & (chosen < sizes) & (chosen == np.floor(chosen))
         self._check(value.reshape(-1), fits)
-        vector = np.zeros(self.spec.shape, self.dtype)
+        vector = np.zeros(self.given, self.dtype)
         vector[chosen.astype(np.int64) + self.first] = 1
         return vector
 
