@@ -19,6 +19,11 @@ class UserError(Exception):
     """
 
 
+def is_outside(error: BaseException) -> bool:
+    """Return whether an error has its cause in the user's input, or in code of other people."""
+    return isinstance(error, UserError) or bool(getattr(error, "outside", False))
+
+
 @contextmanager
 def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
     """Turn the errors of a damaged file into a `UserError`.
@@ -30,7 +35,7 @@ def file_of_a_run(path: Path, remedy: str) -> Iterator[None]:
     try:
         yield
     except (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError) as error:
-        if getattr(error, "errno", None) in NO_SPACE:
+        if is_outside(error) or getattr(error, "errno", None) in NO_SPACE:
             raise
         missing = f"it lacks {error.args[0]}" if isinstance(error, KeyError) else str(error)
         problem = textwrap.shorten(missing, 200, placeholder=" ...")

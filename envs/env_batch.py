@@ -15,11 +15,12 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.envs.gate import foreign
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 
 SEEDS = 2**31  # seeds of drawn episodes are below
@@ -104,6 +105,36 @@ class SeededRows(SeededEnv):
             row.step(action)
         return self._output(stepped=True)
 
+    def unrepeated(self, steps: int = 10) -> NestedKey | None:
+        """Return an entry that differs when an episode of one seed is repeated; None if none does.
+
+        Another episode lies between the two. The running episodes of the env are lost.
+
+        Args:
+            steps: of random actions, the same ones in both episodes.
+        """
+        with torch.random.fork_rng():
+            torch.manual_seed(0)
+            actions = [self.action_spec.rand().cpu().numpy() for _ in range(steps)]
+        episodes = [self._driven(seed, actions) for seed in (0, 1, 0)]
+        self.seeds, self.ages[:] = [], 0
+        for first, again in zip(episodes[0], episodes[-1], strict=True):
+            for key, value in first.items(True, True):
+                if not _same(value, again[key]):
+                    return key
+        return None
+
+    def _driven(self, seed: int, actions: Sequence[NDArray[Any]]) -> list[TensorDict]:
+        """Return the entries of an episode that begins with a seed in every row."""
+        for row in self.rows:
+            row.begin(seed)
+        data = [self._output(stepped=False).clone()]
+        for action in actions:
+            for row, chosen in zip(self.rows, self._decode(action), strict=True):
+                row.step(chosen)
+            data.append(self._output(stepped=True).clone())
+        return data
+
     def _observed(self) -> TensorDictBase:
         return self._output(stepped=False).select(*self.observation_spec.keys(True, True))
 
@@ -159,20 +190,35 @@ class _EnvRow:
     """One TorchRL env of a batch; see `rows` of `SeededRows`."""
 
     env: EnvBase
+    number: int
+    steps: int = 0  # since the reset
 
     def begin(self, seed: int) -> None:
+        self.steps = 0
         # TorchRL's envs may seed the global generators, from which policies sample.
-        with torch.random.fork_rng(range(torch.cuda.device_count())):
+        with (
+            torch.random.fork_rng(range(torch.cuda.device_count())),
+            foreign(f"the env {self.name} (row {self.number}, seed {seed})", "reset"),
+        ):
             self.env.set_seed(seed)
             self.after = self.state = self.env.reset()
+
+    @property
+    def name(self) -> str:
+        """Class of the env of the user."""
+        env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
+        return type(env).__name__
 
     def step(self, action: Tensor) -> None:
         reward = self.env.reward_key
         if self.after["done"].any():
             self.after = self.after.copy().set(reward, self.env.full_reward_spec[reward].zero())
             return
-        step = self.env.step(self.state.copy().set(self.env.action_key, action.to(self.env.device)))
-        self.after, self.state = step["next"], self.env.step_mdp(step)
+        self.steps += 1
+        given = self.state.copy().set(self.env.action_key, action.to(self.env.device))
+        with foreign(f"the env {self.name} (row {self.number}, step {self.steps})", "step"):
+            step = self.env.step(given)
+            self.after, self.state = step["next"], self.env.step_mdp(step)
 
 
 class EnvBatch(SeededRows):
@@ -227,7 +273,11 @@ class EnvBatch(SeededRows):
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
         super().__init__(
-            [_EnvRow(env) for env in envs], seed, first_seed, cases, one.device or "cpu"
+            [_EnvRow(env, number) for number, env in enumerate(envs)],
+            seed,
+            first_seed,
+            cases,
+            one.device or "cpu",
         )
         for spec in ("observation_spec", "action_spec", "reward_spec", "done_spec"):
             full = f"full_{spec}"

@@ -4,6 +4,7 @@ Importing this module registers the id; `gymnasium.make("coil_rl.envs.gym:coil_r
 does both at once.
 """
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -30,7 +31,8 @@ Flags = NDArray[np.bool_]
 class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
     """A batch of cars as a `gymnasium.vector.VectorEnv`.
 
-    A car is reset in the step that ends its episode. One seed determines the tracks of all cars.
+    A car is reset in the step that ends its episode. One seed determines the tracks of all cars: it
+    is the one of `reset`, or an option `seed`.
 
     Args:
         num_envs: B, the number of cars.
@@ -59,6 +61,8 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         if isinstance(tracks, str):
             tracks = shipped_tracks(tracks)
         self.num_envs, self.advice = num_envs, advice
+        self._seeded = "seed" in options
+        self._state: TensorDictBase | None = None  # of all cars
         self.env = ConeTrackEnv(tracks, num_envs, **options)
         numbers = self.env.observation_spec["observation"].shape[-1] + (advice is not None)
         self.single_observation_space = Box(-1.0, 1.0, (numbers,), np.float32)
@@ -70,20 +74,32 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Floats, dict[str, Any]]:
-        """Put all cars on the starts of newly drawn tracks.
+        """Put cars on the starts of newly drawn tracks.
 
         Args:
-            seed: determines all draws from now on; None to go on drawing.
-            options: ignored.
+            seed: determines all draws of all cars from now on; None to go on drawing.
+            options: `reset_mask`, flags [B], is of the cars that are reset; by default all are. The
+                others stay as they are.
 
         Returns:
             Observations [B, 20] or, with advice, [B, 21]; and the entries of `info`, [B] or [B, n].
+
+        Raises:
+            ValueError: for a list of seeds, a mask that does not fit, and another option.
         """
-        first = self._np_random is None
+        mask = _reset_mask(options, self.num_envs)
+        seed = _one_seed(seed)
+        first = self._np_random is None and not self._seeded
         super().reset(seed=seed)
         if first or seed is not None:
             self.env.set_seed((self.np_random_seed or 0) % 2**63)
-        state = self.env.reset()
+            self._seeded = True
+        if mask is None or self._state is None:
+            state = self.env.reset()
+        else:
+            chosen = torch.from_numpy(mask).to(self.env.device).unsqueeze(-1)
+            state = self.env.reset(self._state.copy().set("_reset", chosen))
+        self._state = state
         return self.observe(state), _info(state)
 
     @torch.no_grad()
@@ -102,6 +118,7 @@ class ConeTrackVectorGym(VectorEnv[Floats, Floats, NDArray[Any]]):
         reward, terminated, truncated = (
             _numpy(after[k].squeeze(-1)) for k in ("reward", "terminated", "truncated")
         )
+        self._state = state
         done = terminated | truncated
         final: dict[str, Any] = {}
         if done.any():
@@ -158,10 +175,11 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
 
         Args:
             seed: determines all draws from now on; None to go on drawing.
-            options: ignored.
+            options: none are known.
         """
+        seed = _one_seed(seed)
         super().reset(seed=seed)
-        observation, info = self.cars.reset(seed=seed)
+        observation, info = self.cars.reset(seed=seed, options=options)
         return observation[0], _first_row(info)
 
     @torch.no_grad()
@@ -172,6 +190,33 @@ class ConeTrackGym(gymnasium.Env[Floats, Floats]):
             state[key].item() for key in ("reward", "terminated", "truncated")
         )
         return self.cars.observe(state)[0], reward, terminated, truncated, _first_row(_info(state))
+
+
+def _reset_mask(options: dict[str, Any] | None, cars: int) -> NDArray[np.bool_] | None:
+    """Return the mask of the cars that are reset, [B]; None for all."""
+    others = sorted(set(options or {}) - {"reset_mask"})
+    if others:
+        raise ValueError(f"options has {', '.join(others)}, but can only hold reset_mask")
+    if not options or options["reset_mask"] is None:
+        return None
+    mask = np.asarray(options["reset_mask"])
+    if mask.dtype != np.bool_ or mask.shape != (cars,) or not mask.any():
+        raise ValueError(
+            f"reset_mask must be {cars} flags, one a car, at least one of them true; it is "
+            f"{mask.tolist()}"
+        )
+    return mask.copy()
+
+
+def _one_seed(seed: Any) -> int | None:
+    """Return a seed as a whole number; None for none."""
+    try:
+        return None if seed is None else operator.index(seed)
+    except TypeError as error:
+        raise ValueError(
+            f"seed={seed!r} must be one whole number: it determines the draws of all cars; to seed "
+            "a car alone, reset it with options={'reset_mask': MASK}"
+        ) from error
 
 
 def _numpy(tensor: torch.Tensor) -> NDArray[Any]:

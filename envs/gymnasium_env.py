@@ -7,12 +7,15 @@ beside the env that need the env itself, not only its observation.
 
 import importlib
 import inspect
+import math
 import pkgutil
 import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
+from weakref import WeakValueDictionary
 
 import gymnasium
 import numpy as np
@@ -24,9 +27,22 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
 from coil_rl.envs.env_batch import SeededRows
+from coil_rl.envs.gate import (
+    LIMIT,
+    OWN_LIMITS,
+    EnvGate,
+    ForeignError,
+    acting,
+    foreign,
+    plain_array,
+    predicts,
+    shortened,
+    shown,
+)
 from coil_rl.envs.gymnasium_spaces import (
     Entry,
     action_spec,
+    check_action_space,
     has_whole_numbers,
     leaves,
     lowest_choices,
@@ -62,7 +78,8 @@ class GymnasiumEnv(SeededRows):
         num_envs: B, number of rows.
         options: keyword arguments of `gymnasium.make`, or of the maker.
         wrappers: callables that take an env and return one, applied in this order.
-        max_steps: steps after which an episode is truncated, instead of the registered number.
+        max_steps: steps after which an episode is truncated, instead of the registered number. An
+            env that names no number at all is truncated after 1,000, with a warning.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
@@ -74,7 +91,8 @@ class GymnasiumEnv(SeededRows):
             `reset()`, called at the start of an episode; a function is called as `THING(env,
             observation)`. Either may be a `functools.partial`. Its action for the present
             observation is written as ("controller", NAME), not clamped, in the env's own
-            numbering; after a termination it is the last one.
+            numbering; after a termination it is the last one. An object with `act`, or a trained
+            model with `predict`, is used as it is.
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
@@ -84,7 +102,9 @@ class GymnasiumEnv(SeededRows):
 
     Raises:
         ValueError: if the env cannot be made, has a space that is not supported or an entry with a
-            reserved name, or if a controller cannot be imported.
+            reserved name or bounds that leave no choice, or if a controller cannot be imported.
+        ForeignError: at a reset or a step, for what the env or a controller raises or returns that
+            does not fit; see `coil_rl.envs.gate`.
 
     Example:
         >>> from coil_rl import GymnasiumEnv
@@ -120,22 +140,26 @@ class GymnasiumEnv(SeededRows):
             settings["max_episode_steps"] = max_steps
         maker = _maker(id)
         makes = [partial(_make, maker, wrappers, settings)] * num_envs
-        self.shown = render and "rgb_array" in makes[0]().metadata.get("render_modes", ())
+        self.shown = render and "rgb_array" in _metadata(makes[0](), "render_modes", ())
         if self.shown:
             makes[0] = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
-        rows = [_Row(make, makers, fresh) for make in makes]
+        name, self.floats = _name(maker), torch.empty(0, dtype=dtype).numpy().dtype
+        rows = [
+            _Row(make, makers, fresh, name, number, self.floats)
+            for number, make in enumerate(makes)
+        ]
         super().__init__(rows, seed, first_seed, cases, device)
-        env = rows[0].env
+        env = rows[0].gate.env
         self.info = tuple(info)
-        self.floats = torch.empty(0, dtype=dtype).numpy().dtype
-        self.rate = float(env.metadata.get("render_fps") or "nan")
+        self.rate = _rate(env)
         self.space = env.action_space
+        check_action_space(name, self.space)
         first = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
         self.first_choices = first if first.any() else None  # the lowest numbers, if not 0
-        name = _name(maker)
-        self.entries = [
-            Entry(name, path, leaf, self.floats) for path, leaf in leaves(env.observation_space)
-        ]
+        self.entries = _entries(name, env, self.floats)
+        for row in rows:
+            row.entries = self.entries
+            _check_same_spaces(name, row.number, row.gate.env, env)
         self._declare_specs(name, makers, dtype)
 
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
@@ -171,17 +195,20 @@ class GymnasiumEnv(SeededRows):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return a picture of row 0, [height, width, 3]; None if there are none."""
+        if not self.shown:
+            return None
         try:
-            return self.rows[0].env.render() if self.shown else None
-        except Exception as error:  # a missing package or display; each library raises its own
+            return self.rows[0].gate.render()
+        except ForeignError as error:
             self.shown = False
-            warnings.warn(f"no pictures of the env: {error}", stacklevel=2)
+            cause = error if error.__cause__ is None else error.__cause__
+            warnings.warn(f"no pictures of the env: {shortened(str(cause))}", stacklevel=2)
             return None
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all envs."""
         for row in self.rows:
-            row.env.close()
+            row.gate.close()
         super().close(raise_if_closed=raise_if_closed)
 
     def encode(self, observation: Any, *, first: bool) -> TensorDict:
@@ -204,6 +231,11 @@ class GymnasiumEnv(SeededRows):
 
     def _decode(self, actions: NDArray[Any]) -> NDArray[Any]:
         if isinstance(self.space, spaces.Box) and not has_whole_numbers(self.space):
+            if not np.isfinite(actions).all():
+                raise ForeignError(
+                    f"the action for the env {self.rows[0].gate.name} holds a number that is not "
+                    "finite: the policy or its guide gave none"
+                )
             typed = actions.astype(self.space.dtype)
             if not self.space.shape:
                 typed = typed[..., 0]
@@ -221,13 +253,10 @@ class GymnasiumEnv(SeededRows):
             data[name] = torch.from_numpy(end)
         if stepped:
             data["reward"] = self._numbers([row.reward for row in rows])
-        for entry in self.entries:
-            data[entry.key] = torch.from_numpy(entry([row.observation for row in rows]))
+        for index, entry in enumerate(self.entries):
+            data[entry.key] = torch.from_numpy(np.stack([row.values[index] for row in rows]))
         for name in self.info:
-            try:
-                data["info", name] = self._numbers([row.info.get(name, 0) for row in rows])
-            except (TypeError, ValueError) as error:
-                raise ValueError(f"info entry {name!r} is not a number") from error
+            data["info", name] = self._numbers([row.number_of(name) for row in rows])
         for name in rows[0].controllers:
             advice = torch.from_numpy(np.array([row.advice[name] for row in rows]))
             spec = self.observation_spec["controller", name]
@@ -239,29 +268,63 @@ class GymnasiumEnv(SeededRows):
 
 
 class _Row:
-    """One Gymnasium env and the controllers beside it; see `rows` of `SeededRows`."""
+    """One Gymnasium env and the controllers beside it; see `rows` of `SeededRows`.
+
+    Args:
+        make: makes the env.
+        makers: make the controllers, by name.
+        fresh: whether every episode has a new env.
+        name: of the env, for messages.
+        number: of the row.
+        dtype: of numbers.
+
+    Attributes:
+        entries: of the observation.
+        observation: the last one, as the env returned it.
+        values: copies of its entries.
+    """
 
     def __init__(
-        self, make: Callable[[], Env], makers: Mapping[str, Callable[..., Any]], fresh: bool
+        self,
+        make: Callable[[], Env],
+        makers: Mapping[str, Callable[..., Any]],
+        fresh: bool,
+        name: str,
+        number: int,
+        dtype: np.dtype[Any],
     ) -> None:
         self.make, self.makers, self.fresh = make, makers, fresh
+        self.name, self.number, self.dtype = name, number, dtype
+        self.entries: Sequence[Entry] = ()
+        self.values: list[NDArray[Any]] = []
         self.advice: dict[str, NDArray[Any]] = {}
         self._open()
 
     def _open(self) -> None:
-        self.env = self.make()
+        env = self.make()
+        own = _alive.get(id(env.unwrapped))
+        if own is env.unwrapped:
+            raise ValueError(
+                f"the maker of {self.name} returned one env twice: its rows would disturb each "
+                "other; make a new env at each call"
+            )
+        with suppress(TypeError):  # an object without weak references
+            _alive[id(env.unwrapped)] = env.unwrapped
+        limit = None if _has_limit(env) else LIMIT
+        self.gate = EnvGate(env, self.name, self.number, self.dtype, limit)
         self.controllers = {
-            name: _controller(name, maker, self.env) for name, maker in self.makers.items()
+            name: _controller(name, maker, env) for name, maker in self.makers.items()
         }
 
     def begin(self, seed: int) -> None:
         if self.fresh:
-            self.env.close()
+            self.gate.close()
+            _alive.pop(id(self.gate.env.unwrapped), None)
             self._open()
-        self.observation, self.info = self.env.reset(seed=seed)
+        self.observation, self.info = self.gate.reset(seed)
+        self.values = self.gate.read(self.observation, self.entries)
         self.reward, self.terminated, self.truncated = 0.0, False, False
-        for _, reset in self.controllers.values():
-            reset()
+        self._reset_controllers()
         self._advise()
 
     def observe(self, observation: Any, *, first: bool) -> None:
@@ -269,36 +332,120 @@ class _Row:
         if not hasattr(self, "observation"):
             self.begin(0)  # controllers may read what an env has after its reset only
         self.observation, self.reward, self.info = observation, 0.0, {}
+        try:
+            self.values = [entry(observation) for entry in self.entries]
+        except ForeignError as error:
+            raise ValueError(f"it does not fit the env {self.name}: {error}") from error
         if first:
-            for _, reset in self.controllers.values():
-                reset()
+            self._reset_controllers()
         self._advise()
 
     def step(self, action: Any) -> None:
         if self.terminated or self.truncated:
             self.reward = 0.0
             return
-        self.observation, reward, self.terminated, self.truncated, self.info = self.env.step(action)
-        self.reward = float(reward)
+        self.observation, self.reward, self.terminated, self.truncated, self.info = self.gate.step(
+            action
+        )
+        self.values = self.gate.read(self.observation, self.entries)
         if not self.terminated:
             self._advise()
 
+    def number_of(self, name: str) -> float:
+        """Return a number of info, 0 where it is missing."""
+        value = self.info.get(name, 0)
+        if np.ndim(value) == 1 and np.size(value) == 1:
+            value = np.ravel(value)[0]
+        with self.gate.placed():
+            if isinstance(value, (str, bytes)) or np.ndim(value) > 0:
+                raise ForeignError(f"info entry {name!r} is {shown(value)}, which is not a number")
+            try:
+                return float(value)
+            except (TypeError, ValueError) as error:
+                raise ForeignError(
+                    f"info entry {name!r} is {shown(value)}, which is not a number"
+                ) from error
+
+    def _reset_controllers(self) -> None:
+        for name, (_, reset) in self.controllers.items():
+            with foreign(f"the controller {name}", "reset"):
+                reset()
+
     def _advise(self) -> None:
-        space = self.env.action_space
         for name, (act, _) in self.controllers.items():
-            advice = np.asarray(act(self.observation))
-            if has_whole_numbers(space):
-                whole = advice.astype(space.dtype)
-                fits = bool((whole == advice).all()) and space.contains(whole)
-            elif isinstance(space, spaces.Box):
-                fits = advice.shape == space.shape and np.isfinite(advice).all()
-            else:
-                fits = space.contains(advice)
+            with foreign(f"the controller {name} beside {self.gate.place}", "it"):
+                advice = act(self.observation)
+            self.advice[name] = self._fitted(name, advice)
+
+    def _fitted(self, name: str, advice: Any) -> NDArray[Any]:
+        """Return the action of a controller as an array, in the env's own numbering."""
+        space = self.gate.env.action_space
+        with self.gate.placed():
+            try:
+                array = plain_array(advice, "it")
+                if has_whole_numbers(space):
+                    whole = array.astype(space.dtype)
+                    fits = bool((whole == array).all()) and space.contains(whole)
+                elif isinstance(space, spaces.Box):
+                    fits = array.shape == space.shape and bool(np.isfinite(array).all())
+                else:
+                    fits = bool(space.contains(array))
+            except ForeignError:
+                fits = False
             if not fits:
-                raise ValueError(
-                    f"controller {name} gave {advice.tolist()}, not an action of {space}"
+                raise ForeignError(
+                    f"controller {name} gave {shown(advice)}, not an action of {space}"
                 )
-            self.advice[name] = advice
+        return np.array(array)
+
+
+# The envs of all rows of this process, to find one that two rows would share.
+_alive: MutableMapping[int, Any] = WeakValueDictionary()
+
+
+def _metadata(env: Env, key: str, default: Any) -> Any:
+    """Return an entry of the metadata of an env, which may have none."""
+    metadata = getattr(env, "metadata", None)
+    return (metadata.get(key) or default) if isinstance(metadata, Mapping) else default
+
+
+def _rate(env: Env) -> float:
+    """Return the pictures per second of an env; NaN if it does not say."""
+    rate = _metadata(env, "render_fps", math.nan)
+    return float(rate) if isinstance(rate, (int, float)) else math.nan
+
+
+def _has_limit(env: Env) -> bool:
+    """Return whether an env names the largest number of steps of an episode."""
+    spec = getattr(env, "spec", None)
+    if getattr(spec, "max_episode_steps", None):
+        return True
+    layer: Any = env
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, gymnasium.wrappers.TimeLimit):
+            return True
+        layer = layer.env
+    return any(isinstance(getattr(layer, name, None), int) for name in OWN_LIMITS)
+
+
+def _entries(name: str, env: Env, floats: np.dtype[Any]) -> list[Entry]:
+    """Return the entries of the observation of an env."""
+    if not isinstance(env.observation_space, spaces.Space):
+        raise ValueError(
+            f"the observation_space of {name} is {shown(env.observation_space)}, not a space of "
+            "Gymnasium: set it in its __init__"
+        )
+    return [Entry(name, path, leaf, floats) for path, leaf in leaves(env.observation_space)]
+
+
+def _check_same_spaces(name: str, row: int, env: Env, first: Env) -> None:
+    """Raise a `ValueError` for an env whose spaces are not those of the first one."""
+    for which in ("action_space", "observation_space"):
+        if getattr(env, which) != getattr(first, which):
+            raise ValueError(
+                f"the {which} of {name} is {getattr(env, which)} in row {row}, but "
+                f"{getattr(first, which)} in row 0: all envs of a run need the same spaces"
+            )
 
 
 def _maker(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
@@ -323,17 +470,29 @@ def _make(
     settings: Mapping[str, Any],
 ) -> Env:
     """Return an env in its wrappers; a `ValueError` says why it cannot be made."""
+    name = _name(maker)
     try:
         if isinstance(maker, str):
             env: Env = gymnasium.make(maker, **{"disable_env_checker": True, **settings})
         else:
             env = _called(maker, settings)
-    except (errors.Error, ImportError, TypeError, AssertionError, OSError, ValueError) as error:
-        name = _name(maker)
+        for wrapper in wrappers:
+            env = wrapper(env)
+        missing = [
+            which
+            for which in ("action_space", "observation_space")
+            if isinstance(env, gymnasium.Env) and getattr(env, which, None) is None
+        ]
+    except (Exception, SystemExit) as error:
         raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
-    for wrapper in wrappers:
-        env = wrapper(env)
-    _check_statistics(env, _name(maker))
+    if not isinstance(env, gymnasium.Env):
+        raise ValueError(
+            f"the env {name} is {shown(env)}, not an env of Gymnasium: derive its class from "
+            "gymnasium.Env"
+        )
+    if missing:
+        raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
+    _check_statistics(env, name)
     return env
 
 
@@ -368,7 +527,7 @@ def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
     return env if steps is None else gymnasium.wrappers.TimeLimit(env, steps)
 
 
-def _reason(id: str, error: Exception) -> str:
+def _reason(id: str, error: BaseException) -> str:
     """Return in a few words why an env cannot be made, with a remedy where one is known."""
     extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
     if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
@@ -400,18 +559,24 @@ def _controller(
 
     Args:
         name: of the controller, for messages.
-        maker: a class, a function or a `functools.partial` of either.
+        maker: a class, a function or a `functools.partial` of either; or an object with `act` or
+            `predict`.
         env: beside which the controller acts.
 
     Returns:
         What gives the action for an observation, and what to call at the start of an episode.
     """
     if not inspect.isclass(getattr(maker, "func", maker)):
-        return partial(maker, env), lambda: None
+        if not predicts(maker) and not callable(getattr(maker, "act", None)):
+            return partial(maker, env), lambda: None
+        controller = acting(maker)
+        return controller.act, getattr(controller, "reset", lambda: None)
     try:
         controller = maker(env)
     except TypeError as error:
         raise ValueError(f"controller {name} cannot be made with its env: {error}") from error
+    if predicts(controller):
+        controller = acting(controller)
     if not callable(getattr(controller, "act", None)):
         raise ValueError(
             f"controller {name}: {type(controller).__name__} needs a method act(observation)"

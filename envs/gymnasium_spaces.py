@@ -4,7 +4,7 @@ A guide or policy of this project reads tensors of numbers. So a choice becomes 
 and nested Dict and Tuple spaces become nested keys.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -20,6 +20,8 @@ from torchrl.data import (
     TensorSpec,
     Unbounded,
 )
+
+from coil_rl.envs.gate import ForeignError, plain_array, shown
 
 MOST_CHOICES = 32  # of a whole number that is an action
 
@@ -38,10 +40,13 @@ class Entry:
         self, id: str, path: tuple[str | int, ...], space: spaces.Space[Any], floats: np.dtype[Any]
     ) -> None:
         self.path, self.dtype, self.start = path, floats, start(space)
+        self.space, self.shape = space, tuple(space.shape or ())
+        self.binary = isinstance(space, spaces.MultiBinary)
         # Not the entry of a Dict space: the observation itself, or within a Tuple.
         whole = not path or isinstance(path[0], int)
         names = [str(part) for part in path]
         self.key: tuple[str, ...] = ("observation", *names) if whole else tuple(names)
+        self.title = ".".join(["the observation", *names])
         self.choices = _choices(space)
         dtype = torch.from_numpy(np.empty(0, floats)).dtype
         if self.choices:
@@ -60,18 +65,77 @@ class Entry:
                 f"the observation of {id} has a {type(space).__name__} space: replace it with a "
                 "wrapper"
             )
+        self.given = tuple(self.spec.shape)
 
-    def __call__(self, observations: Sequence[Any]) -> NDArray[Any]:
-        """Return this entry of observations, [B, *shape]."""
+    def __call__(self, observation: Any) -> NDArray[Any]:
+        """Return a copy of this entry of an observation, of the shape of `spec`.
+
+        Args:
+            observation: of one env, as it was returned.
+
+        Raises:
+            ForeignError: for an entry that is missing, of another shape than its space has, not of
+                numbers, not finite, or no choice of its space.
+        """
         for part in self.path:
-            observations = [observation[part] for observation in observations]
-        count = len(observations)
-        if not self.choices:
-            return np.array(observations, dtype=self.dtype).reshape(count, *self.spec.shape)
-        chosen = (np.array(observations) - self.start).reshape(count, -1) + self.first
-        vectors = np.zeros((count, *self.spec.shape), self.dtype)
-        np.put_along_axis(vectors, chosen, 1, 1)
-        return vectors
+            observation = self._part(observation, part)
+        value = plain_array(observation, self.title)
+        if value.shape != self.shape and not self._is_single(value):
+            raise ForeignError(
+                f"{self.title} has the shape {list(value.shape)}, but its space has "
+                f"{list(self.shape)}"
+            )
+        if self.choices:
+            return self._one_hot(value)
+        if self.dtype == np.uint8 and value.dtype != np.uint8:
+            self._check(value, (value >= 0) & (value <= 255) & (value == np.floor(value)))
+        if self.binary:
+            self._check(value, (value == 0) | (value == 1))
+        if value.dtype == self.dtype:
+            converted = value.copy().reshape(self.given)
+        else:
+            with np.errstate(over="ignore"):
+                converted = value.astype(self.dtype).reshape(self.given)
+        if converted.dtype.kind == "f" and not np.isfinite(converted).all():
+            wrong = float(value.reshape(-1)[~np.isfinite(converted.reshape(-1))][0])
+            raise ForeignError(f"{self.title} holds {wrong}, not a finite number of {self.dtype}")
+        return converted
+
+    def _is_single(self, value: NDArray[Any]) -> bool:
+        """Return whether a value is one number, which may have a dimension of its own."""
+        return value.size == 1 and value.ndim <= 1 and self.shape in ((), (1,))
+
+    def _part(self, observation: Any, part: str | int) -> Any:
+        """Return a part of an observation by the key of a Dict space or the index of a Tuple."""
+        if isinstance(part, int):
+            if not isinstance(observation, (tuple, list)) or len(observation) <= part:
+                raise ForeignError(
+                    f"{self.title} is missing: the observation is {shown(observation)}, not the "
+                    "tuple of its space"
+                )
+        elif not isinstance(observation, Mapping) or part not in observation:
+            keys = list(observation) if isinstance(observation, Mapping) else observation
+            raise ForeignError(
+                f"{self.title} is missing: the observation has {shown(keys)}, but its space has "
+                f"the key {part!r}"
+            )
+        return observation[part]
+
+    def _check(self, value: NDArray[Any], fits: NDArray[np.bool_] | np.bool_) -> None:
+        """Raise a `ForeignError` if a number does not fit the space."""
+        if not np.all(fits):
+            wrong = float(value[np.logical_not(fits)].reshape(-1)[0])
+            raise ForeignError(f"{self.title} holds {wrong:g}, which is not in {self.space}")
+
+    def _one_hot(self, value: NDArray[Any]) -> NDArray[Any]:
+        """Return choices as one-hot vectors side by side."""
+        chosen = np.ravel(value) - np.ravel(self.start)
+        sizes = np.array(self.choices)
+        fits = (chosen >= 0) & (chosen < sizes) & (chosen == np.floor(chosen))
+        self._check(value.reshape(-1), fits)
+        vector = np.zeros(self.given, self.dtype)
+        vector[chosen.astype(np.int64) + self.first] = 1
+        return vector
 
 
 def leaves(
@@ -154,3 +218,33 @@ def action_spec(id: str, space: spaces.Space[Any], dtype: torch.dtype) -> Tensor
     raise ValueError(
         f"the action of {id} is a {type(space).__name__} space: replace it with a wrapper"
     )
+
+
+def check_action_space(id: str, space: Any) -> None:
+    """Check that an action space leaves something to choose.
+
+    Args:
+        id: of the env, for the message.
+        space: of the action.
+
+    Raises:
+        ValueError: for what is no space of Gymnasium, for one without a number, and for bounds that
+            are NaN, equal or in the wrong order.
+    """
+    if not isinstance(space, spaces.Space):
+        raise ValueError(
+            f"the action_space of {id} is {shown(space)}, not a space of Gymnasium: set it in its "
+            "__init__"
+        )
+    if not isinstance(space, spaces.Box):
+        return
+    if 0 in space.shape:
+        raise ValueError(f"the action of {id} has the shape {list(space.shape)}: it has no number")
+    low, high = np.ravel(space.low), np.ravel(space.high)
+    wrong = np.flatnonzero(~(low < high))
+    if len(wrong):
+        index = int(wrong[0])
+        raise ValueError(
+            f"number {index} of the action of {id} has the bounds {low[index]} and {high[index]}: "
+            "the lower one must be smaller; leave a number without a choice out by a wrapper"
+        )

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cached_property, partial
+from typing import ClassVar
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
@@ -34,6 +35,8 @@ class UnfitActionError(ValueError):
         guide: name of the guide.
         problem: says why, as the end of a sentence.
     """
+
+    outside: ClassVar[bool] = True  # the cause is not in this program
 
     def __init__(self, guide: str, problem: str) -> None:
         super().__init__(f"the action of guide {guide!r} {problem}")
@@ -429,9 +432,13 @@ class GuideActions(ActionTransform):
         return self._advice(data, state), state
 
     def _fitted(self, name: str, action: Tensor, batch: torch.Size) -> Tensor:
-        """Return the action of a guide within the bounds; in the first step, check it."""
+        """Return the action of a guide within the bounds.
+
+        It is checked in the first step; that of a guide with the attribute `foreign`, the code of
+        somebody else, in every step.
+        """
         try:
-            if name not in self._checked:
+            if name not in self._checked or getattr(self.guides.guides[name], "foreign", False):
                 self.guide_space.check_advice(action, batch)
                 self._checked.add(name)
             advice = self.guide_space.advice(action, batch)

@@ -2,10 +2,12 @@
 
 import inspect
 import textwrap
-from collections.abc import Callable, Iterable, Mapping
-from types import NoneType
-from typing import Any, get_args
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from numbers import Number
+from types import NoneType, UnionType
+from typing import Any, Union, get_args, get_origin
 
+import numpy as np
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic.errors import PydanticUserError
 from pydantic_core import SchemaError
@@ -14,6 +16,7 @@ from coil_rl.config.hints import similar
 from coil_rl.errors import UserError
 
 PLAIN = (bool, int, float, str, NoneType)
+HOLDERS = (np.ndarray, tuple, list, Sequence)  # of numbers, in annotations
 STRICT = ConfigDict(strict=True, arbitrary_types_allowed=True, allow_inf_nan=False)
 
 
@@ -23,6 +26,10 @@ def check_arguments(
     """Check the arguments of a node.
 
     An unknown or missing argument, or one that does not fit its annotation, is a `UserError`.
+
+    Annotations of other people are often stricter than their code, and YAML has neither tuples nor
+    arrays. So their callables are given any numbers where the annotation is of numbers, arrays or
+    sequences; `converted` makes the tuples and arrays.
 
     Args:
         target: class or function.
@@ -53,7 +60,62 @@ def check_arguments(
             f"{name}: {title} needs {', '.join(missing)}; give {name}.{missing[0]}=VALUE"
         )
     for key in given.keys() & known:
-        _check_type(given[key], known[key].annotation, f"{name}.{key}")
+        annotation = known[key].annotation
+        if not is_foreign(target) or not _may_take(given[key], annotation):
+            _check_type(given[key], annotation, f"{name}.{key}")
+
+
+def is_foreign(target: Callable[..., Any]) -> bool:
+    """Return whether a class or function is not of this project."""
+    return not (getattr(target, "__module__", None) or "").startswith("coil_rl.")
+
+
+def converted(target: Callable[..., Any], node: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the node of a callable of other people with nodes for the tuples and arrays it wants.
+
+    Args:
+        target: class or function.
+        node: its checked arguments.
+    """
+    if not is_foreign(target):
+        return dict(node)
+    annotations = {each.name: each.annotation for each in _parameters(target) or ()}
+    arguments = dict(node)
+    for key, value in node.items():
+        if not isinstance(value, list) or not _holds_numbers(value):
+            continue
+        kinds = _kinds(annotations.get(key))
+        if kinds & {list, Sequence}:
+            continue
+        if tuple in kinds:
+            arguments[key] = {"_target_": "builtins.tuple", "_args_": [value]}
+        elif np.ndarray in kinds:
+            arguments[key] = {"_target_": "numpy.array", "_args_": [value]}
+    return arguments
+
+
+def _holds_numbers(value: Any) -> bool:
+    """Return whether a value is a finite number, or a nested list of such."""
+    if isinstance(value, list):
+        return all(map(_holds_numbers, value))
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return False
+    return abs(value) < 2**63
+
+
+def _may_take(value: Any, annotation: Any) -> bool:
+    """Return whether the code behind an annotation of numbers may take a value from YAML."""
+    kinds = _kinds(annotation) - {bool, int, str, bytes}
+    wanted = HOLDERS if isinstance(value, list) else (Number, np.generic, *HOLDERS)
+    return _holds_numbers(value) and any(issubclass(kind, wanted) for kind in kinds)
+
+
+def _kinds(annotation: Any) -> set[type]:
+    """Return the classes of an annotation, those of a union one by one."""
+    if get_origin(annotation) in (Union, UnionType):
+        return {kind for part in get_args(annotation) for kind in _kinds(part)}
+    kind = get_origin(annotation) or annotation
+    return {kind} if isinstance(kind, type) else set()
 
 
 def _check_type(value: Any, annotation: Any, name: str) -> None:

@@ -4,6 +4,7 @@ A mistake is found in seconds. Nothing is written except the folder of the run, 
 """
 
 import os
+import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
@@ -24,6 +25,8 @@ from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
+from coil_rl.envs.env_batch import SeededRows
+from coil_rl.envs.gate import ForeignError
 from coil_rl.errors import UserError, did_you_mean
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
@@ -107,6 +110,7 @@ def _check_env(
     check_measures(config, env)
     for key in recorded:
         _check_entry(env, key, "evaluation.pictures")
+    _check_repeats(env)
     advises = config.method.needs_guide or "advice" in config.method.transforms
     if not config.guide and not advises:
         return
@@ -116,6 +120,23 @@ def _check_env(
     build_all(config.degrade, "degrade")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
+
+
+def _check_repeats(env: EnvBase) -> None:
+    """Warn if an env does not obey its seed.
+
+    The run is right all the same, but its cases differ from one evaluation to the next.
+    """
+    if not isinstance(env, SeededRows):
+        return
+    key = env.unrepeated()
+    if key is not None:
+        warnings.warn(
+            f"the env does not obey its seed: {_dotted(key)} differs when an episode is repeated, "
+            "so the cases of an evaluation are not the same for each policy; draw random numbers "
+            "from self.np_random, or give env.fresh=true if a reset leaves something of the past",
+            stacklevel=2,
+        )
 
 
 def check_measures(config: DictConfig, env: EnvBase) -> None:
@@ -163,6 +184,8 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         advised.state_dict()  # a state that no checkpoint can hold is refused before the training
     except UnfitActionError as error:
         raise UserError(f"{name}: its action {error.problem}") from error
+    except ForeignError as error:  # its sentence says whether the env or the guide is at fault
+        raise UserError(str(error)) from error
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{name}: {error.args[0] if error.args else error}") from error
     except RuntimeError as error:

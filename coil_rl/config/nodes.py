@@ -11,7 +11,7 @@ import hydra.utils
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torchrl.envs import Transform
 
-from coil_rl.config.arguments import check_arguments, yaml_text
+from coil_rl.config.arguments import check_arguments, converted, yaml_text
 from coil_rl.errors import UserError
 
 # Largest numbers of arguments of other libraries, by class: memory grows with them, and the
@@ -42,7 +42,7 @@ def build(node: Any, name: str, expected: type | None = None, **arguments: Any) 
         expected: type of the result.
         arguments: added by the program.
     """
-    node = check_node(node, name, arguments)
+    node = _converted(check_node(node, name, arguments))
     try:
         built = hydra.utils.instantiate(node, **arguments, _convert_="all")
     except hydra.errors.InstantiationException as error:
@@ -112,6 +112,18 @@ def _check_size(target: Callable[..., Any], node: Mapping[str, Any], name: str) 
                     f"{name}.{key}={yaml_text(value)} must be at most {largest}: memory grows "
                     "with it"
                 )
+
+
+def _converted(node: Any) -> Any:
+    """Return a checked node with nodes for the tuples and arrays that callables of others want."""
+    if isinstance(node, list):
+        return [_converted(value) for value in node]
+    if not isinstance(node, Mapping):
+        return node
+    node = {key: _converted(value) for key, value in node.items()}
+    if "_target_" not in node:
+        return node
+    return converted(hydra.utils.get_object(node["_target_"]), node)
 
 
 def find_target(path: Any, name: str) -> Callable[..., Any]:

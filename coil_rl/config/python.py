@@ -5,7 +5,7 @@ Where a name is not enough, an object may be given.
 
 import os
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -25,6 +25,7 @@ from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
 from coil_rl.config.written import keep_written
+from coil_rl.envs.gate import foreign
 from coil_rl.errors import UserError
 from coil_rl.run.controller import Controller
 from coil_rl.run.run import Run
@@ -57,6 +58,7 @@ def train(
 
     Raises:
         UserError: for a mistake in an argument, with one sentence that says what to do.
+        ValueError: for what the env or the guide raises, or returns that does not fit.
 
     Example:
         >>> import coil_rl
@@ -186,8 +188,10 @@ def _env(env: Any, name: str) -> Words:
             "conf/env, or a class or function that makes an env"
         )
     path = import_path(env)
-    made = env()
-    made.close()
+    with foreign(f"the env {path or getattr(env, '__name__', 'of the maker')}", "its maker"):
+        made = env()
+    with suppress(Exception):  # nothing depends on it
+        made.close()
     if isinstance(made, gymnasium.Env):
         if path is not None:
             return _gym_words(path), {}

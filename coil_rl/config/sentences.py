@@ -18,7 +18,7 @@ from omegaconf.errors import (
 )
 
 from coil_rl.config import hints
-from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError
+from coil_rl.errors import IN_THE_WAY, NO_SPACE, UserError, is_outside
 from coil_rl.run.folder import is_begun
 
 # Launchers of Hydra, and the extra of the package that installs each.
@@ -40,9 +40,9 @@ NO_INTEGER = re.compile(
 def is_no_bug(error: BaseException) -> bool:
     """Return whether an error has a cause outside of the program.
 
-    That is the input, the configuration or the disk.
+    That is the input, the configuration, an env or controller of somebody else, or the disk.
     """
-    outside = isinstance(error, (UserError, OmegaConfBaseException))
+    outside = is_outside(error) or isinstance(error, OmegaConfBaseException)
     return outside or getattr(error, "errno", None) in (*NO_SPACE, *IN_THE_WAY)
 
 

@@ -9,6 +9,7 @@ import copy
 import importlib
 import inspect
 import io
+import math
 import os
 import pickle
 import warnings
@@ -18,16 +19,22 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from coil_rl.envs.gate import ForeignError, Predictor, action_array, foreign, predicts
 from coil_rl.errors import did_you_mean
 from coil_rl.files import LARGEST_TABLE, read_text
 from coil_rl.guides.functions import FunctionGuide
 from coil_rl.transforms.action_space import nested_key
+
+# Other minus signs, as text programs write them: hyphens, the sign itself, and dashes.
+MINUS = str.maketrans(dict.fromkeys("\u2010\u2011\u2212\u2013\u2014\ufe63\uff0d", "-"))
 
 
 class PerRow(TensorDictModuleBase):
@@ -40,10 +47,13 @@ class PerRow(TensorDictModuleBase):
     episodes begin when a run is resumed. They are called one after the other: a batched guide is
     many times faster.
 
+    What an object raises, or returns that is no action, is a `ForeignError` with its row and step.
+
     Args:
         make: makes an object; called without arguments.
         in_keys: entries to read, [*batch, ...].
         out_key: entry for the action, [*batch, A].
+        title: name of the controller for messages; by default that of what makes it.
 
     Example:
         >>> from torchrl.envs import GymEnv, TransformedEnv
@@ -56,16 +66,21 @@ class PerRow(TensorDictModuleBase):
         torch.Size([3, 1, 2])
     """
 
+    foreign = True
+
     def __init__(
         self,
         make: Callable[[], Any],
         in_keys: Sequence[NestedKey] = ("observation",),
         out_key: NestedKey = "action",
+        title: str = "",
     ) -> None:
         self.read = [nested_key(key) for key in in_keys]
         self.in_keys, self.out_keys = [*self.read, "row", "is_init"], [nested_key(out_key)]
         super().__init__()
         self.make, self.objects = make, dict[int, Any]()
+        self.title = title or getattr(getattr(make, "func", make), "__name__", repr(make))
+        self.steps = dict[int, int]()  # of the running episode, by row
         # whether the last restored state held those of the objects; else new episodes begin
         self.continues = True
 
@@ -74,19 +89,45 @@ class PerRow(TensorDictModuleBase):
         flat = tensordict.reshape(-1)
         rows, starts = (flat[key].flatten().tolist() for key in ("row", "is_init"))
         observations = zip(*(flat[key].cpu().numpy().copy() for key in self.read), strict=True)
-        actions = []
+        actions: list[NDArray[Any]] = []
         for row, start, observed in zip(rows, starts, observations, strict=True):
-            actions.append(np.atleast_1d(self._object(row, start).act(*observed)))
+            actions.append(self._action(row, start, observed))
+            if actions[-1].shape != actions[0].shape:
+                raise ForeignError(
+                    f"{self._place(row)}: the action has the shape {list(actions[-1].shape)}, but "
+                    f"that of row {rows[0]} has {list(actions[0].shape)}"
+                )
         action = torch.as_tensor(np.stack(actions), device=tensordict.device)
         shape = (*tensordict.batch_size, *action.shape[1:])
         return tensordict.set(self.out_keys[0], action.reshape(shape))
 
+    def _action(self, row: int, start: bool, observed: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        """Return the action of the object of a row, which begins an episode at a `start`."""
+        if start:
+            self.steps[row] = 0
+        elif row in self.steps:  # unknown after a resume
+            self.steps[row] += 1
+        with foreign(self._place(row), "act"):
+            thing = self._object(row, start)
+            answer = thing.act(*observed)
+        try:
+            return action_array(answer)
+        except ForeignError as error:
+            raise ForeignError(f"{self._place(row)}: {error}") from error
+
+    def _place(self, row: int) -> str:
+        """Return the class of the controller, with the row and the step."""
+        step = f", step {self.steps[row]}" if row in self.steps else ""
+        return f"the controller {self.title} (row {row}{step})"
+
     def _object(self, row: int, start: bool) -> Any:
         """Return the object of a row, made anew or reset if this is the `start` of an episode."""
         if row not in self.objects or (start and not hasattr(self.objects[row], "reset")):
-            self.objects[row] = self.make()
+            with foreign(self._place(row), "the constructor"):
+                self.objects[row] = self.make()
         if start and hasattr(self.objects[row], "reset"):
-            self.objects[row].reset()
+            with foreign(self._place(row), "reset"):
+                self.objects[row].reset()
         return self.objects[row]
 
     def get_extra_state(self) -> dict[int, Any] | None:
@@ -97,15 +138,18 @@ class PerRow(TensorDictModuleBase):
         names = ("state_dict", "load_state_dict")
         if not all(hasattr(thing, name) for thing in self.objects.values() for name in names):
             return None
+        states = {}
+        for row, thing in self.objects.items():
+            with foreign(self._place(row), "state_dict"):
+                states[row] = thing.state_dict()
         file = io.BytesIO()
-        torch.save({row: thing.state_dict() for row, thing in self.objects.items()}, file)
+        torch.save(states, file)
         file.seek(0)
         try:
             return dict(torch.load(file, weights_only=True))
         except pickle.UnpicklingError as error:
-            name = type(next(iter(self.objects.values()))).__name__
             raise ValueError(
-                f"state_dict() of the controller {name} may hold numbers, texts, lists, "
+                f"state_dict() of the controller {self.title} may hold numbers, texts, lists, "
                 "dictionaries and tensors only; convert NumPy arrays by tolist()"
             ) from error
 
@@ -113,16 +157,17 @@ class PerRow(TensorDictModuleBase):
         """Make objects with these states."""
         self.continues = state is not None
         if state is None:
-            name = getattr(self.make, "func", self.make).__name__
             warnings.warn(
-                f"the controller {name} has no state_dict() and load_state_dict(state), so new "
-                "episodes begin",
+                f"the controller {self.title} has no state_dict() and load_state_dict(state), so "
+                "new episodes begin",
                 stacklevel=2,
             )
             state = {}
+        self.steps.clear()
         self.objects = {row: self.make() for row in state}
         for row, thing in self.objects.items():
-            thing.load_state_dict(state[row])
+            with foreign(self._place(row), "load_state_dict"):
+                thing.load_state_dict(state[row])
 
 
 class ControllerGuide(TensorDictModuleBase):
@@ -134,6 +179,7 @@ class ControllerGuide(TensorDictModuleBase):
     | another `nn.Module`, or a class of such | a network: entries [B, N] to actions [B, A] |
     | a class with a method `act` | `PerRow`: one object for each row of the env |
     | an object with a method `act` | `PerRow`: one copy for each row of the env |
+    | a trained model with `predict`, as of Stable-Baselines3 | `PerRow`: one state for each row |
     | a function | `FunctionGuide`: of one observation, or of a batch of them |
 
     Args:
@@ -145,6 +191,8 @@ class ControllerGuide(TensorDictModuleBase):
         ValueError: for what cannot be imported, is nothing of the above, or takes other arguments.
     """
 
+    foreign = True
+
     def __init__(
         self,
         of: Any,
@@ -152,17 +200,19 @@ class ControllerGuide(TensorDictModuleBase):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         thing = load(of) if isinstance(of, str) else of
-        title = of if isinstance(of, str) else type(of).__name__
+        title = of if isinstance(of, str) else getattr(of, "__name__", type(of).__name__)
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
         make = _of_class if inspect.isclass(thing) else _of_object
         guide = make(thing, title, keys, dict(options or {}))
         self.in_keys, self.out_keys = guide.in_keys, guide.out_keys
         super().__init__()
         self.guide, self.pure = guide, getattr(thing, "pure", False)
+        self.title = title
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action."""
-        return self.guide(tensordict)
+        """Write the action; what the controller raises is a `ForeignError`."""
+        with foreign(f"the controller {self.title}", "it"):
+            return self.guide(tensordict)
 
 
 def _of_class(
@@ -172,6 +222,9 @@ def _of_class(
     if issubclass(kind, nn.Module):
         _check_call(kind, title, [], options)
         return _of_module(kind(**options), title, keys)
+    if predicts(kind):
+        _check_call(kind, title, [], options)
+        return _of_model(partial(kind, **options), title, keys)
     act = getattr(kind, "act", None)
     if not callable(act):
         raise ValueError(
@@ -181,7 +234,7 @@ def _of_class(
     read = keys or ["observation"]
     _check_call(kind, title, [], options)
     _check_call(act, f"{title}.act", ["self", *read], {})
-    return PerRow(partial(kind, **options), read)
+    return PerRow(partial(kind, **options), read, title=title)
 
 
 def _of_object(
@@ -189,21 +242,93 @@ def _of_object(
 ) -> TensorDictModuleBase:
     """Return the guide of a function, or of an object that is made already."""
     is_module, acts = isinstance(thing, nn.Module), callable(getattr(thing, "act", None))
-    if (is_module or acts) and options:
+    if (is_module or acts or predicts(thing)) and options:
         raise ValueError(f"of={title} is an object, which takes no options; leave options out")
+    if predicts(thing) and not isinstance(thing, TensorDictModuleBase):
+        return _of_model(lambda: thing, title, keys)
     if is_module:
         return _of_module(thing, title, keys)
     read = keys or ["observation"]
     if acts:
         _check_call(thing.act, f"{title}.act", read, {})
-        return PerRow(partial(copy.deepcopy, thing), read)
+        return PerRow(partial(copy.deepcopy, thing), read, title=title)
     if not callable(thing):
         raise ValueError(
-            f"of={title} is {type(thing).__name__}; name a class, a function or an object with "
-            "act(observation)"
+            f"of={title} is {type(thing).__name__}; name a class, a function, an object with "
+            "act(observation), or a model with predict(observation, deterministic=True)"
         )
     _check_call(thing, title, read, options)
-    return FunctionGuide(partial(thing, **options), read)
+    return FunctionGuide(partial(thing, **options), read, title)
+
+
+def _of_model(
+    make: Callable[[], Any], title: str, keys: list[NestedKey] | None
+) -> TensorDictModuleBase:
+    """Return the guide of a trained model with `predict`.
+
+    Args:
+        make: returns the model, which has no state of its own; called once.
+        title: name of the model, for messages.
+        keys: entries to read; None for those of the model's observation space.
+    """
+    with foreign(f"the controller {title}", "the constructor"):
+        model = make()
+    parts = getattr(getattr(model, "observation_space", None), "spaces", None)
+    if keys is None:
+        keys = [nested_key(key) for key in parts] if isinstance(parts, Mapping) else ["observation"]
+    return PerRow(partial(_ModelOfRow, model, keys), keys, title=title)
+
+
+class _ModelOfRow(Predictor):
+    """A trained model that gets the entries of a row as its observation space has them.
+
+    Args:
+        model: the model.
+        keys: of the entries.
+    """
+
+    def __init__(self, model: Any, keys: Sequence[NestedKey]) -> None:
+        super().__init__(model)
+        self.keys = keys
+        self.space = getattr(model, "observation_space", None)
+
+    def act(self, *entries: NDArray[Any]) -> Any:
+        """Return the deterministic action for the entries of a row."""
+        parts = getattr(self.space, "spaces", None)
+        if isinstance(parts, Mapping):
+            named = zip(self.keys, entries, strict=True)
+            return super().act({key: _in_space(entry, parts.get(key)) for key, entry in named})
+        (entry,) = entries
+        return super().act(_in_space(entry, self.space))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next actions of the episode depend on."""
+        return {"first": self.first, "state": _mapped(torch.from_numpy, np.ndarray, self.state)}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.first = state["first"]
+        self.state = _mapped(torch.Tensor.numpy, torch.Tensor, state["state"])
+
+
+def _mapped(convert: Callable[[Any], Any], kind: type, value: Any) -> Any:
+    """Convert what is of a kind in nested tuples."""
+    if isinstance(value, tuple):
+        return tuple(_mapped(convert, kind, part) for part in value)
+    return convert(value) if isinstance(value, kind) else value
+
+
+def _in_space(entry: NDArray[Any], space: Any) -> Any:
+    """Return an entry as an observation of a Gymnasium space: choices are indices there."""
+    if isinstance(space, spaces.Discrete):
+        return int(entry.argmax()) + int(space.start)
+    if isinstance(space, spaces.MultiDiscrete):
+        parts = np.split(entry, np.cumsum(space.nvec.ravel())[:-1])
+        indices = np.array([part.argmax() for part in parts]).reshape(space.nvec.shape)
+        return indices + space.start
+    if isinstance(space, spaces.Box) and entry.size == math.prod(space.shape):
+        return entry.reshape(space.shape)
+    return entry
 
 
 def _of_module(module: nn.Module, title: str, keys: list[NestedKey] | None) -> TensorDictModuleBase:
@@ -236,9 +361,9 @@ class RecordedGuide(TensorDictModuleBase):
     The last one is held after the end of the file.
 
     Args:
-        file: a CSV of numbers, [T, A] in the env's unit, one line for each step; a first line with
-            names is left out. A file that cannot be read, or without finite numbers, is a
-            `ValueError`.
+        file: a CSV of numbers, [T, A] in the env's unit, one line for each step, separated by
+            commas, semicolons or white space. A first line with names is left out, and so is what
+            follows a #. A file that cannot be read, or without finite numbers, is a `ValueError`.
     """
 
     in_keys, out_keys = ["recorded_step"], ["action", ("next", "recorded_step")]
@@ -321,19 +446,49 @@ def _check_call(
 
 
 def _read_actions(file: str | os.PathLike[str]) -> torch.Tensor:
-    """Return the actions of a CSV file, [T, A]."""
+    """Return the actions of a CSV file, [T, A].
+
+    Numbers are separated by commas, semicolons, tabs or spaces. A line that begins with # is a
+    comment, and the first other one may hold names.
+    """
+    name = os.fspath(file)
     try:
-        text = read_text(file, LARGEST_TABLE)
-        rows = [line.strip().split(",") for line in text.splitlines() if line.strip()]
-        try:
-            np.array(rows[:1], dtype=np.float32)
-        except ValueError:
-            del rows[0]
-        actions = np.array(rows, dtype=np.float32)
-    except (OSError, ValueError) as error:
+        text = read_text(file, LARGEST_TABLE).removeprefix("\ufeff")  # as Excel writes it
+        lines = [line.partition("#")[0].translate(MINUS).strip() for line in text.splitlines()]
+    except (OSError, UnicodeError, ValueError) as error:
+        raise ValueError(f"file={name} cannot be read as numbers with commas ({error})") from error
+    rows = [_fields(line) for line in lines if line]
+    if rows and not any(map(_is_number, rows[0])):
+        del rows[0]
+    widths = sorted({len(row) for row in rows})
+    if len(widths) > 1:
         raise ValueError(
-            f"file={os.fspath(file)} cannot be read as numbers with commas ({error})"
-        ) from error
+            f"file={name} cannot be read as numbers with commas (its lines have "
+            f"{' and '.join(map(str, widths))} of them)"
+        )
+    try:
+        actions = np.array(rows, dtype=np.float32)
+    except ValueError as error:
+        raise ValueError(f"file={name} cannot be read as numbers with commas ({error})") from error
     if not actions.size or not np.isfinite(actions).all():
-        raise ValueError(f"file={os.fspath(file)} must hold at least one line of finite numbers")
+        raise ValueError(f"file={name} must hold at least one line of finite numbers")
     return torch.from_numpy(actions)
+
+
+def _fields(line: str) -> list[str]:
+    """Return the fields of a line; a semicolon, a comma, or else white space separates them.
+
+    With semicolons, a comma is the decimal point of a number.
+    """
+    if ";" in line:
+        return [field.strip().strip('"').replace(",", ".") for field in line.split(";")]
+    separator = "," if "," in line else None
+    return [field.strip().strip('"') for field in line.split(separator)]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -5,10 +5,12 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
+from coil_rl.envs.gate import ForeignError, action_array, foreign
 from coil_rl.transforms.action_space import nested_key
 
 
@@ -26,18 +28,26 @@ class FunctionGuide(TensorDictModuleBase):
         function: takes one value for each of `in_keys`; it must give the same action for the same
             observation.
         in_keys: entries to read, [*batch, ...].
+        title: name of the function for messages; by default its own.
 
     Raises:
-        Exception: at a call, what the function raises for a batch, if it can take neither.
+        ForeignError: at a call, for what the function raises, for a batch if it can take neither,
+            and for what it returns that is no action.
     """
 
+    foreign = True
+
     def __init__(
-        self, function: Callable[..., Any], in_keys: Sequence[NestedKey] = ("observation",)
+        self,
+        function: Callable[..., Any],
+        in_keys: Sequence[NestedKey] = ("observation",),
+        title: str = "",
     ) -> None:
         self.in_keys: list[NestedKey] = [nested_key(key) for key in in_keys]
         self.out_keys = ["action"]
         super().__init__()
         self.function = function
+        self.title = title or getattr(function, "__name__", type(function).__name__)
         self.for_batch: bool | None = None  # unknown before the first call
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -47,15 +57,36 @@ class FunctionGuide(TensorDictModuleBase):
         if self.for_batch is None:
             self.for_batch = self._takes_batch(entries)
         if self.for_batch:
-            whole = [tensordict[key] for key in self.in_keys]
-            return tensordict.set("action", self.function(*whole))
+            action = self._of_batch([tensordict[key] for key in self.in_keys])
+            return tensordict.set("action", action)
         rows = [self._alone(entries, row) for row in range(len(flat))]
+        if len({row.shape for row in rows}) > 1:
+            shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
+            raise ForeignError(
+                f"the controller {self.title} returned actions of the shapes {shapes} in one step"
+            )
         action = torch.as_tensor(np.stack(rows), device=tensordict.device)
         return tensordict.set("action", action.reshape(*tensordict.batch_size, *action.shape[1:]))
 
-    def _alone(self, entries: Sequence[Tensor], row: int) -> Any:
+    def _of_batch(self, entries: Sequence[Tensor]) -> Tensor:
+        """Return the actions for all rows."""
+        with foreign(f"the controller {self.title}", "it"):
+            action = self.function(*(entry.clone() for entry in entries))
+        if isinstance(action, Tensor):
+            return action  # checked on its device by `GuideActions`
+        try:
+            return torch.as_tensor(action_array(action), device=entries[0].device)
+        except ForeignError as error:
+            raise ForeignError(f"the controller {self.title}: {error}") from error
+
+    def _alone(self, entries: Sequence[Tensor], row: int) -> NDArray[Any]:
         """Return the action for one row, as an array of at least one dimension."""
-        return np.atleast_1d(self.function(*(entry[row].cpu().numpy().copy() for entry in entries)))
+        with foreign(f"the controller {self.title} (row {row})", "it"):
+            action = self.function(*(entry[row].cpu().numpy().copy() for entry in entries))
+        try:
+            return action_array(action)
+        except ForeignError as error:
+            raise ForeignError(f"the controller {self.title} (row {row}): {error}") from error
 
     def _takes_batch(self, entries: Sequence[Tensor]) -> bool:
         """Return whether the function takes a batch, see the class."""

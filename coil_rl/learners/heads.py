@@ -56,7 +56,8 @@ class GaussianHead(nn.Module):
 class ChoicesHead(nn.Module):
     """Logits of several choices at once from a network.
 
-    They are padded with minus infinity to the longest choice.
+    They are padded to the longest choice with a number so low that its probability is exactly 0. It
+    is finite, because a number that is not in recorded data is a fault.
 
     Args:
         network: gives logits for all choices, of each as many as the longest one has.
@@ -72,7 +73,8 @@ class ChoicesHead(nn.Module):
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """Return the logits, [*batch, *event, n]."""
-        return shaped(self.network(*inputs), self.valid.shape).masked_fill(~self.valid, -torch.inf)
+        logits = shaped(self.network(*inputs), self.valid.shape)
+        return logits.masked_fill(~self.valid, torch.finfo(logits.dtype).min / 2)
 
 
 class Choices(Independent):

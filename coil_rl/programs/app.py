@@ -48,6 +48,7 @@ from coil_rl.config.written import keep_written, key_of
 from coil_rl.errors import UserError
 from coil_rl.files import FAILED_JOBS
 from coil_rl.output import SafeStream, say
+from coil_rl.programs.folders import spelled
 from coil_rl.run.stopping import STOP
 
 COMMON_KEYS = ("seed", "device", "threads", "trust", "run_dir")  # of all programs that drive
@@ -191,6 +192,7 @@ def run_program(
             raise
 
     with program(config_name):
+        sys.argv[1:] = map(spelled, sys.argv[1:])
         _check_options(config_name)
         try:
             hydra.main(version_base="1.3", config_path=config_path, config_name=config_name)(

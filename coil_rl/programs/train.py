@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
-from coil_rl.programs import app
+from coil_rl.programs import app, folders
 
 # What may be given beside resume=FOLDER.
 BESIDE_RESUME = ("trust=", "budget.frames=")
@@ -96,7 +96,7 @@ def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:
     given = OmegaConf.merge(OmegaConf.structured(TrainConfig), OmegaConf.from_dotlist(list(others)))
     trust_packages(given.trust)
     lengthens = any(argument.startswith("budget.frames=") for argument in others)
-    folder = Path(resumed.removeprefix("resume=")).expanduser()
+    folder = folders.folder(resumed.removeprefix("resume="))
     resume(folder, given.budget.frames if lengthens else None)
 
 

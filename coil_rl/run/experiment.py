@@ -12,7 +12,7 @@ import torch
 from tensordict import NestedKey, TensorDictBase
 from torchrl.envs import EnvBase
 
-from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.errors import UserError, file_of_a_run, is_outside
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, say
 from coil_rl.run import checkpoint
@@ -240,10 +240,12 @@ class Experiment:
 
     @contextmanager
     def resume_hint(self) -> Iterator[None]:
-        """Add to a `UserError` how the run is continued."""
+        """Add to an error with a cause outside of the program how the run is continued."""
         try:
             yield
-        except UserError as error:
+        except Exception as error:
+            if not is_outside(error):
+                raise
             raise UserError(
                 f"{error}; the last good checkpoint is kept: correct the cause and continue with "
                 f"{resume_command(self.folder)}, or train again with other values"

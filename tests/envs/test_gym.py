@@ -141,3 +141,52 @@ def test_returned_arrays_are_copies_and_info_is_optional():
     assert not (envs.unwrapped.env.pose == 7).any()
     again, _ = envs.reset(seed=0)
     assert not (again == 7).any()
+
+
+def test_some_cars_are_reset_and_the_others_go_on():
+    straight, mask = np.zeros((4, 1), np.float32), np.array([True, False, False, True])
+    envs, alone = (gymnasium.make_vec(gym.ID, num_envs=4) for _ in range(2))
+    for each in (envs, alone):
+        each.reset(seed=np.int64(3))
+        for _ in range(5):
+            before = each.step(straight)[0]
+    observation, info = envs.reset(options={"reset_mask": mask})
+    assert observation.shape == before.shape
+    np.testing.assert_array_equal(observation[~mask], before[~mask])
+    assert (observation[mask] != before[mask]).any(-1).all()
+    assert info["track"].shape == (4,)
+    np.testing.assert_array_equal(envs.step(straight)[0][~mask], alone.step(straight)[0][~mask])
+
+
+def test_reset_of_some_cars_obeys_its_seed():
+    mask, starts = np.array([False, True] * 4), []
+    for steps in (1, 7):
+        envs = gymnasium.make_vec(gym.ID, num_envs=8)
+        envs.reset(seed=steps)
+        for _ in range(steps):
+            envs.step(np.zeros((8, 1), np.float32))
+        starts.append(envs.reset(seed=11, options={"reset_mask": mask})[0][mask])
+    np.testing.assert_array_equal(*starts)
+
+
+def test_seed_among_the_options_determines_the_first_tracks():
+    first, second = (gymnasium.make_vec(gym.ID, num_envs=16, seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.reset()[0], second.reset()[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"seed": [1, 2, 3, 4]}, r"seed=\[1, 2, 3, 4\] must be one whole number"),
+        ({"seed": 1.5}, "seed=1.5 must be one whole number"),
+        ({"seed": "1"}, "seed='1' must be one whole number"),
+        ({"options": {"reset_mask": np.zeros(4, bool)}}, "reset_mask must be 4 flags, .* at least"),
+        ({"options": {"reset_mask": np.ones(3, bool)}}, "reset_mask must be 4 flags"),
+        ({"options": {"reset_mask": [1, 0, 0, 1]}}, "reset_mask must be 4 flags"),
+        ({"options": {"mask": [True] * 4}}, "options has mask, but can only hold reset_mask"),
+    ],
+)
+def test_reset_that_cannot_be_is_refused(arguments, message):
+    envs = gymnasium.make_vec(gym.ID, num_envs=4)
+    with pytest.raises(ValueError, match=message):
+        envs.reset(**arguments)

@@ -328,7 +328,7 @@ def test_pictures_show_the_first_row():
     assert env.rate == 20
     assert env.render().tolist() == np.full((2, 2, 3), 3).tolist()
     assert build("Echo-v0").render() is None
-    assert [row.env.render_mode for row in env.rows] == ["rgb_array", None, None]
+    assert [row.gate.env.render_mode for row in env.rows] == ["rgb_array", None, None]
 
 
 def test_env_that_cannot_draw_runs_on_without_pictures(monkeypatch):

@@ -4,6 +4,7 @@ from typing import Any, Literal, Protocol
 import pytest
 
 from coil_rl.config.arguments import check_arguments
+from coil_rl.config.nodes import build
 from coil_rl.envs import Track
 from coil_rl.errors import UserError
 
@@ -40,6 +41,7 @@ def test_value_is_checked_against_the_annotation(annotation, good, bad):
         pass
 
     function.__annotations__["value"] = annotation
+    function.__module__ = "coil_rl.part"
     for value in good:
         check_arguments(function, {"value": value}, "part")
     for value in bad:
@@ -85,3 +87,56 @@ def test_wrong_arguments_are_refused(node, program, message):
 def test_arguments_without_annotations_are_not_checked():
     check_arguments(Part, {"needed": 1, "free": object()}, "part")
     check_arguments(dict, {"anything": 1}, "part")
+
+
+WRAPPERS = "gymnasium.wrappers."
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "arguments", "shape"),
+    [
+        ("RescaleAction", {"min_action": -1, "max_action": 1}, [3]),
+        ("RescaleAction", {"min_action": [-1.0], "max_action": [1]}, [3]),
+        ("RescaleObservation", {"min_obs": -1, "max_obs": 1}, [3]),
+        ("ClipReward", {"min_reward": -1, "max_reward": 0}, [3]),
+        ("FrameStackObservation", {"stack_size": 2, "padding_type": "zero"}, [2, 3]),
+        ("ReshapeObservation", {"shape": [3, 1]}, [3, 1]),
+        ("TimeLimit", {"max_episode_steps": 7}, [3]),
+        ("DtypeObservation", {"dtype": "float64"}, [3]),
+        ("DiscretizeAction", {"bins": [5]}, [3]),
+        ("DiscretizeObservation", {"bins": [2, 2, 2]}, [8]),
+        (
+            "StickyAction",
+            {"repeat_action_probability": 0.5, "repeat_action_duration": [1, 3]},
+            [3],
+        ),
+        ("TimeAwareObservation", {}, [4]),
+        ("RepeatAction", {"num_repeats": 2}, [3]),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_wrappers_of_gymnasium_are_used_from_yaml(wrapper, arguments, shape):
+    node = {"_target_": WRAPPERS + wrapper, "_partial_": True, **arguments}
+    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
+    built = build(env, "env")
+    assert list(built.rollout(3)["observation"].shape[2:]) == shape
+
+
+@pytest.mark.parametrize(
+    ("wrapper", "arguments", "message"),
+    [
+        ("RescaleAction", {"min_action": -1, "max_acton": 1}, "takes no max_acton; .* max_action?"),
+        ("RescaleAction", {"min_action": -1}, "cannot be made: .*missing.*'max_action'"),
+        ("RescaleAction", {"min_action": "low", "max_action": 1}, r"min_action='low' must be "),
+        ("ResizeObservation", {"shape": ["a", "b"]}, r"shape=\['a', 'b'\] must be"),
+        ("ReshapeObservation", {"shape": [3, 2]}, "cannot be made: .*product of the new shape"),
+        ("TimeLimit", {"max_episode_steps": True}, "max_episode_steps=true must be"),
+        ("TransformReward", {"func": 3}, "func=3 must be callable"),
+        ("RescaleObservatio", {}, "there is no 'gymnasium.wrappers.RescaleObservatio'"),
+    ],
+)
+def test_wrapper_that_cannot_be_is_refused_in_one_sentence(wrapper, arguments, message):
+    node = {"_target_": WRAPPERS + wrapper, "_partial_": True, **arguments}
+    env = {"_target_": "coil_rl.GymnasiumEnv", "id": "Pendulum-v1", "wrappers": [node]}
+    with pytest.raises(UserError, match=message):
+        build(env, "env")

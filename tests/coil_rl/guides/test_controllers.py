@@ -195,11 +195,7 @@ def test_new_episodes_begin_if_a_controller_cannot_save_its_state():
             r"my_broken cannot be imported \(ZeroDivisionError: division by zero\)",
         ),
         ("my_control:Conter", {}, "my_control has no Conter; did you mean Counter"),
-        (
-            "my_control:number",
-            {},
-            "of=my_control:number is int; name a class, a function or an object",
-        ),
+        ("my_control:number", {}, "my_control:number is int; name a class, a function, an object"),
         (
             "my_control:Other",
             {},
@@ -275,7 +271,7 @@ def test_recording_begins_with_each_episode_and_holds_its_last_action(header, tm
         ),
         ("", "must hold at least one line of finite numbers"),
         ("a,b\n", "must hold at least one line of finite numbers"),
-        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(setting an array element"),
+        ("0.1\n0.1,0.2\n", r"cannot be read as numbers with commas \(its lines have 1 and 2"),
         ("nan\n0.1\n", "must hold at least one line of finite numbers"),
     ],
 )

@@ -1,0 +1,74 @@
+"""One spelling of a folder on the command line, with or without the quotes of Hydra.
+
+Hydra reads `run=a=b` or `run=~/x` as a mistake and wants quotes, and `resume=` is read without
+Hydra. Here the same text means the same folder in both: what the shell passes on is the name, and
+the quotes of Hydra may be around it.
+"""
+
+import re
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+# Keys that hold one folder or file.
+KEYS = ("run", "hydra.run.dir", "run_dir", "init", "guide.learned.run", "proxy.folder")
+
+
+def spelled(argument: str) -> str:
+    """Return an argument of a program as Hydra reads it: a folder has the quotes that it needs.
+
+    Args:
+        argument: as the shell passed it on; it may be anything.
+    """
+    key, equals, text = argument.partition("=")
+    if not equals or key.lstrip("+") not in KEYS:
+        return argument
+    if not _exists(text) and _as_hydra(text) is not None:
+        return argument
+    return f"{key}={_quoted(str(_path(text)))}"
+
+
+def folder(text: str) -> Path:
+    """Return the folder that a text on the command line names.
+
+    Args:
+        text: its name, or the name in the quotes of Hydra.
+    """
+    if _exists(text):
+        return _path(text)
+    value = _as_hydra(text)
+    return _path(value if isinstance(value, str) else text)
+
+
+def _path(text: str) -> Path:
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:  # ~NAME without such a user
+        return Path(text)
+
+
+def _exists(text: str) -> bool:
+    try:
+        return bool(text) and _path(text).exists()
+    except (OSError, ValueError):  # a name that is too long, or holds a zero
+        return False
+
+
+def _as_hydra(text: str) -> object | None:
+    """Return the value that Hydra reads; None for what it cannot read, or would change."""
+    if text.startswith("~"):
+        return None
+    try:
+        override = OverridesParser.create().parse_override(f"run={text}")
+    except HydraException:
+        return None
+    if override.is_sweep_override() or text == "null":
+        return override
+    return override.value()
+
+
+def _quoted(text: str) -> str:
+    """Return a text in quotes of Hydra, where a backslash is special before a quote only."""
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
+    return f"'{escaped}'"

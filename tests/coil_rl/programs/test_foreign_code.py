@@ -1,0 +1,182 @@
+"""A fault in an env or controller of somebody else ends every program with one sentence."""
+
+import textwrap
+import warnings
+
+import numpy as np
+import pytest
+from programs import called
+
+import coil_rl
+
+SOURCE = """
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+
+
+class Plant(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    observation_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+    steps = 0  # of all envs of this process
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.x = 0, self.np_random.uniform(-1, 1, 2)
+        return self.x.astype(np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        self.x = 0.9 * self.x + 0.1 * action[0]
+        reward = -float(np.abs(self.x).sum())
+        return self.x.astype(np.float32), reward, False, self.time == 12, {}
+
+    def render(self):
+        return np.zeros((4, 4, 3))  # not uint8
+
+
+class NoReward(Plant):
+    def step(self, action):
+        observation, reward, *rest = super().step(action)
+        return observation, None if self.time == 11 else reward, *rest
+
+
+class Raises(Plant):
+    def step(self, action):
+        assert self.time < 11, "the pump is off"
+        return super().step(action)
+
+
+class TrainingOnly(Plant):
+    seeds = set()
+
+    def reset(self, *, seed=None, options=None):
+        self.seed = seed
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        answer = super().step(action)
+        return answer[:4] if self.seed < 1_000_000_000 and self.time == 11 else answer
+
+
+class Unseeded(Plant):
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.x = 0, np.random.uniform(-1, 1, 2)
+        return self.x.astype(np.float32), {}
+
+
+class P:
+    def act(self, observation):
+        return [-observation[0]]
+
+
+class Late(P):
+    calls = 0
+
+    def act(self, observation):
+        self.calls += 1
+        return None if self.calls == 11 else super().act(observation)
+"""
+TINY = [
+    "env=gym",
+    "budget.num_envs=2",
+    "budget.steps=16",
+    "budget.frames=64",
+    "evaluation.cases=2",
+    "evaluation.curve.num_envs=2",
+    "evaluation.curve.points=1",
+    "learner.minibatches=2",
+    "logger=none",
+    "hydra.run.dir=run",
+]
+
+
+@pytest.fixture(autouse=True)
+def plants(tmp_path, monkeypatch):
+    (tmp_path / "odd_plants.py").write_text(textwrap.dedent(SOURCE))
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+def guided(of="P"):
+    return ["method=coil", "guide=controller", f"guide.controller.of=odd_plants:{of}"]
+
+
+@pytest.mark.parametrize(
+    ("program", "env", "words", "message"),
+    [
+        ("train", "NoReward", ["method=ppo"], r"the reward is None, not one number"),
+        ("train", "Raises", ["method=ppo"], "step raised AssertionError: the pump is off"),
+        ("train", "Raises", guided(), "the env Raises (row 0, seed 11"),  # not the guide
+        ("train", "TrainingOnly", ["method=ppo"], "step returned 4 values, not the five"),
+        ("train", "Plant", guided("Late"), "the controller odd_plants:Late (row 0, step 10)"),
+        ("evaluate", "NoReward", guided()[1:], "the reward is None, not one number"),
+        (
+            "evaluate",
+            "Plant",
+            guided("Late")[1:],
+            "the controller odd_plants:Late (row 0, step 10)",
+        ),
+    ],
+)
+def test_fault_ends_a_program_with_one_sentence(program, env, words, message, tmp_path):
+    tiny = TINY if program == "train" else ["env=gym", "evaluation.cases=2", "hydra.run.dir=run"]
+    words = [*tiny, *words, f"env.id=odd_plants:{env}", "evaluation.gif=false"]
+    done = called(program, *words, cwd=tmp_path, code=2)
+    lines = [line for line in done.stderr.splitlines() if line.startswith(f"{program}: ")]
+    lines = [line for line in lines if "frame/s" not in line]  # of the progress bar
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert "Traceback" not in done.stderr
+
+
+def test_fault_in_training_says_how_to_go_on(tmp_path):
+    words = [*TINY, "method=ppo", "env.id=odd_plants:TrainingOnly", "evaluation.gif=false"]
+    done = called("train", *words, cwd=tmp_path, code=2)
+    assert "the last good checkpoint is kept" in done.stderr
+
+
+def test_env_that_ignores_its_seed_and_cannot_draw_is_trained_with_warnings(tmp_path):
+    words = [*TINY, "method=ppo", "env.id=odd_plants:Unseeded", "evaluation.gif=true"]
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        called("train", *words, cwd=tmp_path)
+    said = " ".join(str(each.message) for each in caught)
+    assert "does not obey its seed: observation differs" in said
+    assert "no pictures of the env: render returned" in said
+    assert (tmp_path / "run" / "evaluation.csv").exists()
+
+
+class Model:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.float32(-observation[:1]), state
+
+
+def test_model_of_another_library_is_a_guide_in_one_line(tmp_path):
+    words = [word for word in TINY[1:] if not word.startswith(("hydra", "budget.frames"))]
+    words.append("evaluation.gif=false")
+    folder = tmp_path / "a=b c"
+    run = coil_rl.train(
+        "odd_plants:Plant", guide=Model(), frames=64, folder=folder, overrides=words
+    )
+    table = run.evaluate()
+    opened = coil_rl.open_run(folder, guide=Model(), trust=["odd_plants"]).evaluate()
+    assert table["reward"].tolist() == opened["reward"].tolist()
+    assert (table["driver"] == "guide").any()
+
+
+@pytest.mark.parametrize("quotes", ["", "'", '"'])
+def test_run_and_resume_take_one_spelling(quotes, tmp_path):
+    words = [word for word in TINY if not word.startswith("hydra")]
+    words += ["method=ppo", "env.id=odd_plants:Plant", "evaluation.gif=false"]
+    name = f"{quotes}a=b ü{quotes}"
+    called("train", *words, f"hydra.run.dir={name}", cwd=tmp_path)
+    assert (tmp_path / "a=b ü" / "evaluation.csv").exists()
+    called("train", f"resume={name}", "trust=[odd_plants]", cwd=tmp_path)
+    words = ["trust=[odd_plants]", "hydra.run.dir=evaluated", "evaluation.gif=false"]
+    called("evaluate", f"run={name}", *words, cwd=tmp_path)
+    assert (tmp_path / "evaluated" / "evaluation.csv").exists()
