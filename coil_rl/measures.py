@@ -159,12 +159,11 @@ def with_denominators(
     partial = [name for name in names if any(count[name] < count["episodes"] for count in counts)]
     if not partial:
         return [dict(row) for row in rows]
-    return [
-        dict(row)
-        | {"episodes": count["episodes"]}
-        | {f"{name}_episodes": count[name] for name in partial}
-        for row, count in zip(rows, counts, strict=True)
-    ]
+    result = []
+    for row, count in zip(rows, counts, strict=True):
+        of_measures = {f"{name}_episodes": count[name] for name in partial}
+        result.append({**row, "episodes": count["episodes"], **of_measures})
+    return result
 
 
 def with_shares(

@@ -17,6 +17,7 @@ import torch
 from numpy.typing import NDArray
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import Tensor
+from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.envs.cone_track import SeededEnv
@@ -115,7 +116,7 @@ class SeededRows(SeededEnv):
         """
         with torch.random.fork_rng():
             torch.manual_seed(0)
-            actions = [self.action_spec.rand().cpu().numpy() for _ in range(steps)]
+            actions = [_probe(self.action_spec).cpu().numpy() for _ in range(steps)]
         episodes = [self._driven(seed, actions) for seed in (0, 1, 0)]
         self.seeds, self.ages[:] = [], 0
         for first, again in zip(episodes[0], episodes[-1], strict=True):
@@ -174,6 +175,17 @@ class SeededRows(SeededEnv):
                 f"{self.remedy}",
                 stacklevel=2,
             )
+
+
+def _probe(spec: TensorSpec) -> Tensor:
+    """Return a random action; a number without a lower or upper bound is near 0, or its bound."""
+    action: Tensor = spec.rand()
+    if not isinstance(spec, Bounded) or action.isfinite().all():
+        return action
+    near = torch.rand(spec.shape, dtype=spec.dtype, device=spec.device).clamp(
+        spec.space.low, spec.space.high
+    )
+    return torch.where(action.isfinite(), action, near)
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from coil_rl.errors import UserError
 
 # Where the files are whose order of composition is meant.
-SHIPPED = ("pkg://coil_rl.", "pkg://coil_paper.", "pkg://hydra", "structured://")
+SHIPPED = ("pkg://coil_rl.", "pkg://hydra", "structured://")
 # Keys that other values refer to, and that nothing else reads.
 REFERRED = (
     "preset",

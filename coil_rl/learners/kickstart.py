@@ -89,7 +89,7 @@ class KickstartLoss(Extension):
         if isinstance(distribution, Choices):
             # The advice is one-hot for each choice, one beside the other.
             logits = distribution.base_dist.logits
-            return -(advice * logits[:, logits[0].isfinite()]).sum(-1)
+            return -(advice * logits[:, distribution.valid]).sum(-1)
         if isinstance(distribution, TanhNormal):
             return self._each_squashed(distribution, advice)
         if self.kind == "likelihood":

@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import hydra
 import yaml
@@ -104,15 +104,27 @@ def _record(config: DictConfig, key: str) -> None:
 
 def overrides() -> list[tuple[str, str]]:
     """Return the full key and the text of each override on the command line."""
-    texts = HydraConfig.get().overrides.task
-    return [(key_of(text), text) for text in texts]
+    return [(key_of(text), text) for text in typed().task]
+
+
+class Typed(NamedTuple):
+    """The arguments of the command line, as typed: references in them stay."""
+
+    task: list[str]  # for the program
+    hydra: list[str]  # for Hydra
+
+
+def typed() -> Typed:
+    """Return the arguments of the command line."""
+    given: Any = OmegaConf.to_container(HydraConfig.get().overrides, resolve=False)
+    return Typed(given["task"], given["hydra"])
 
 
 def command_line() -> list[str]:
     """Return the command that makes this run alone, also where it is a job of a sweep."""
     if not HydraConfig.initialized():
         return []
-    given = HydraConfig.get().overrides
+    given = typed()
     # Files of another package, such as an experiment, are found only with this one.
     places = [word for word in given.hydra if word.startswith("hydra.searchpath=")]
     return ["coil-train", *places, *given.task]
@@ -221,8 +233,7 @@ def _do(
     _listen()
     if Jobs.is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
-    given = HydraConfig.get()
-    keep_written(config, str(given.job.config_name), given.overrides.task, given.overrides.hydra)
+    keep_written(config, str(HydraConfig.get().job.config_name), *typed())
     trust_packages(config.get("trust", []), config)
     check(config)
     if _interrupts:

@@ -4,7 +4,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from coil_rl.config.schema import TrainConfig
@@ -33,8 +32,7 @@ def check(config: DictConfig) -> None:
     from coil_rl.config.written import check_read
 
     app.check_run(config)
-    task = HydraConfig.get().overrides.task
-    check_read(config, task, trains_guides=trains_guides(config))
+    check_read(config, app.typed().task, trains_guides=trains_guides(config))
 
 
 def resume(folder: Path, frames: int | None = None) -> float:

@@ -220,12 +220,11 @@ class Comparison:
 
     def _partial(self, group: Group) -> dict[str, int]:
         """Return in how many results each measure is known, unless it is in all results of all."""
-        names = dict.fromkeys(
-            name
-            for each in self.groups
-            for name in each.measures
-            if 0 < each.known(name) < len(each.table)
-        )
+        names: dict[str, None] = {}
+        for each in self.groups:
+            for name in each.measures:
+                if 0 < each.known(name) < len(each.table):
+                    names[name] = None
         return {f"{name}_results": group.known(name) for name in names}
 
     def case_table(self) -> list[dict[str, Any]]:

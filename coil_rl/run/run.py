@@ -261,7 +261,9 @@ class Run:
         """
         if is_evaluated(self.folder):
             self.check_unchanged()
-            return report_outcome(self.folder)
+            reward = report_outcome(self.folder)
+            self._say_next()
+            return reward
         return self.finish(resumed=True)
 
     def check_unchanged(self) -> None:
@@ -298,10 +300,14 @@ class Run:
                 f"{error.filename or self.folder} cannot be written ({error.strerror}); make room, "
                 f"and continue with {resume_command(self.folder)}"
             ) from error
-        if policy is not None:
-            rows = read_curve(self.folder / "metrics.csv")
-            print(next_step(self.folder, self.budget.frames, rows))
+        self._say_next()
         return reward
+
+    def _say_next(self) -> None:
+        """Print the command that usually follows a training."""
+        if self.make_learner is not None:
+            rows = read_curve(self.folder / "metrics.csv")
+            say(next_step(self.folder, self.budget.frames, rows))
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""

@@ -157,7 +157,7 @@ def test_torchrl_env_is_an_env(tmp_path):
     ("arguments", "message"),
     [
         ({"env": 3}, "env is int; give the id of a Gymnasium env"),
-        ({"env": ENV, "guide": 3}, "name a class, a function or an object"),
+        ({"env": ENV, "guide": 3}, "name a class, a function, an object"),
         ({"env": ENV, "method": "coill"}, "there is no method=coill"),
         ({"env": "NoSuchEnv-v3"}, "NoSuchEnv-v3 cannot be made"),
         ({"env": ENV, "overrides": ["learner.lr=1"]}, "did you mean learning_rate"),

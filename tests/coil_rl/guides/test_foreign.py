@@ -85,7 +85,7 @@ def test_fault_of_a_controller_is_one_sentence_with_its_place(answer, message):
         ("Pendulum-v1", lambda x: x[..., :1] * np.nan, "is not finite"),
         ("Pendulum-v1", lambda x: x, r"has the shape \[2, 3\], but must have \[2, 1\]"),
         ("CartPole-v1", lambda x: 2, "is neither an index below 2 nor a one-hot vector"),
-        ("CartPole-v1", lambda x: 0.5, "is neither an index below 2 nor a one-hot vector"),
+        ("CartPole-v1", lambda x: 0.5, "is no whole number, but must be the number of a choice"),
         ("CartPole-v1", lambda x: -1, "is neither an index below 2 nor a one-hot vector"),
     ],
 )

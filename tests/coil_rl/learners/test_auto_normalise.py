@@ -121,12 +121,12 @@ def test_raw_observations_far_out_of_scale_are_named(tmp_path):
 
 
 def test_cone_world_and_robot_are_not_normalised():
-    from coil_rl.config.python import _composed
+    from coil_rl import compose_train
 
     for env in ("cone_track", "driving_tasks", "simulated_robot"):
-        assert _composed([f"env={env}"]).learner.normalise is False
+        assert compose_train([f"env={env}"]).learner.normalise is False
     for env in ("lunar_lander", "cart_pole", "babyai"):
-        assert _composed([f"env={env}", "method=ppo"]).learner.normalise == "auto"
+        assert compose_train([f"env={env}", "method=ppo"]).learner.normalise == "auto"
 
 
 @pytest.mark.parametrize(

@@ -76,7 +76,7 @@ def refusal(name, *arguments):
         ),
         (
             "learner.learning_rat=1",
-            "+learner.learning_rat=VALUE adds it; did you mean learning_rate?",
+            "did you mean learning_rate?",
         ),
         ("+env.sped=3", "env: ConeTrackEnv takes no sped; it takes tracks, num_envs"),
         ("+evaluation.env.lap=3", "dtype; did you mean laps?"),

@@ -91,7 +91,7 @@ def test_claims_have_a_verdict_for_both_kinds_of_actions_and_in_each_world(made)
     assert claims["COIL earns more with its guide's advice than with another car's"][0] == "-"
     none = "0 of 3 (0% to 71%)"
     crashes = (
-        f"**did not hold up**: guide 0 of 2 cases, ppo {none}, coil {none}, "
+        f"**did not hold up**: guide 0 of 2 cases (0% to 84%), ppo {none}, coil {none}, "
         "oil 3 of 3 (29% to 100%)"
     )
     assert claims["Nobody crashes"][:2] == ["0%", crashes]
