@@ -19,6 +19,7 @@ TINY = [
     "budget.num_envs=8",
     "budget.steps=32",
     "evaluation.repeats=1",
+    "evaluation.curve.env.time_limit=1",
     "logger=none",
 ]
 

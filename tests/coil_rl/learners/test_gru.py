@@ -45,6 +45,7 @@ from coil_rl.transforms import DiscreteActions, Takeover
 DELAY = 5
 TINY = [
     "track=generated",
+    "evaluation.curve.env.time_limit=1",
     "track.train.count=1",
     "track.test.count=2",
     "env.laps=1",

@@ -17,6 +17,7 @@ DYNAMIC = [name for name in METHODS if name.startswith("dynamic")]
 IMITATION = ["dagger", "oil"]
 TINY = [
     "track=generated",
+    "evaluation.curve.env.time_limit=1",
     "track.train.count=1",
     "track.test.count=1",
     "budget.num_envs=4",

@@ -35,6 +35,7 @@ TINY = [
     "env.rate=12",
     "evaluation.repeats=1",
     "evaluation.gif=false",
+    "evaluation.curve.env.time_limit=1",
     "logger=none",
     "checkpoint_every=1",
     "budget.num_envs=4",
