@@ -38,11 +38,13 @@ class Written:
         key: its full key.
         value: as written, perhaps a reference.
         file: name of the file, for messages.
+        files: that file, and those whose defaults list leads to it.
     """
 
     key: str
     value: Any
     file: str
+    files: frozenset[str]
 
 
 def keep_written(
@@ -67,13 +69,14 @@ def keep_written(
     defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
     # A choice of a file, such as method=coil, gives no value.
     typed = [key for key in map(key_of, task) if not files.group_exists(key.replace(".", "/"))]
-    first: dict[str, Written] = {}
+    last: dict[str, Written] = {}
     with open_dict(config):
         for written in _written(defaults, files):
             if any(_covers(key, written.key) for key in typed):
                 continue
-            other = first.setdefault(written.key, written)
-            if other.value != written.value:
+            other = last.get(written.key, written)
+            last[written.key] = written
+            if other.value != written.value and not _lists(other, written):
                 raise UserError(
                     f"{written.key} is {other.value} in {other.file} and {written.value} in "
                     f"{written.file}; leave one out, or give it on the command line"
@@ -107,18 +110,34 @@ def _covers(one: str, other: str) -> bool:
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")
 
 
+def _lists(one: Written, other: Written) -> bool:
+    """Return whether one of two files has the other in its defaults list, whose order is meant."""
+    return one.file in other.files or other.file in one.files
+
+
 def _written(defaults: Iterable[Any], files: Any) -> Iterator[Written]:
     """Yield the values in the files of users, in the order of composition."""
+    defaults = [default for default in defaults if default.config_path is not None]
+    parents = {default.config_path: default.parent for default in defaults}
     for default in defaults:
-        if default.config_path is None:
-            continue
         found = files.load_config(default.config_path)
         if found is None or found.path.startswith(SHIPPED):
             continue
+        lists = frozenset(f"{path}.yaml" for path in _ancestors(default, parents))
         values: Any = OmegaConf.to_container(found.config, resolve=False)
         for key, value in _leaves(values, default.package or ""):
             if key.partition(".")[0] not in ("hydra", "defaults"):
-                yield Written(key, value, f"{default.config_path}.yaml")
+                yield Written(key, value, f"{default.config_path}.yaml", lists)
+
+
+def _ancestors(default: Any, parents: Mapping[str, str | None]) -> set[str]:
+    """Return the path of a file and of those whose defaults list leads to it."""
+    paths = {default.config_path}
+    path = default.parent
+    while path is not None and path not in paths:
+        paths.add(path)
+        path = parents.get(path)
+    return paths
 
 
 def _leaves(node: Any, name: str) -> Iterator[tuple[str, Any]]:
