@@ -29,7 +29,7 @@ class _Loader(yaml.SafeLoader):
     }
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return a mapping; a key that is given twice is a `ConstructorError`."""
+        """Return a mapping; raise a `ConstructorError` for a key that occurs twice."""
         seen: set[str] = set()
         for key, _ in node.value:
             if key.value in seen:

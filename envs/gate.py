@@ -160,7 +160,7 @@ def action_array(value: Any) -> NDArray[Any]:
 
 
 class EnvGate:
-    """A Gymnasium env of somebody else, whose answers are checked.
+    """A Gymnasium env from outside this project; what it returns is checked at every call.
 
     Args:
         env: the env.

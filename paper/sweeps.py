@@ -65,7 +65,7 @@ def planned(experiment: str, overrides: Sequence[str], seeds: Iterable[int]) -> 
 
 
 def choices(experiment: str, words: Sequence[str]) -> Iterator[Sequence[str]]:
-    """Yield the overrides of each run of a sweep but for its seed.
+    """Yield the overrides of each run of a sweep, without its seed.
 
     Args:
         experiment: name of the file, for the message.

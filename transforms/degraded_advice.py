@@ -68,7 +68,11 @@ class DegradedAdvice(Transform):
         return self._call(tensordict_reset)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Degrade the advice in stored data; RuntimeError if that takes previous steps."""
+        """Degrade the advice in stored data.
+
+        Raises:
+            RuntimeError: if the advice depends on previous steps, which stored data lacks.
+        """
         if self.needs_past:
             raise RuntimeError(
                 f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"

@@ -88,7 +88,11 @@ def budget(config: DictConfig) -> Budget:
 
 
 def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
-    """Return how the policy of a run is evaluated; no cases are a `UserError`."""
+    """Return how the policy of a run is evaluated.
+
+    Raises:
+        UserError: if the configuration names no cases.
+    """
     pictures = build_pictures(config)
     has_agent = config.method.observes is not None
     notes = [
@@ -137,9 +141,12 @@ def about_returns(sizes: Mapping[str, int]) -> list[str]:
 def build_evaluation(
     config: DictConfig, record: Mapping[str, NestedKey] | None = None
 ) -> Evaluation:
-    """Return the cases and measures of a configuration; no cases are a `UserError`.
+    """Return the cases and measures of a configuration.
 
     `record` names entries of every step that are kept.
+
+    Raises:
+        UserError: if the configuration names no cases.
     """
     cases = config.evaluation.cases
     names = build(cases, "evaluation.cases") if isinstance(cases, DictConfig) else cases

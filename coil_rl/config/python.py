@@ -24,7 +24,7 @@ from coil_rl.config.check import check
 from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
-from coil_rl.config.written import keep_written
+from coil_rl.config.written import keep_written, quoted
 from coil_rl.envs.gate import foreign
 from coil_rl.errors import UserError
 from coil_rl.run.controller import Controller
@@ -111,7 +111,7 @@ def prepare(
     if frames is not None:
         words.append(f"budget.frames={frames}")
     words += [f"seed={seed}", *overrides]
-    config = compose_train([*words, f"run_dir={_quoted(str(folder))}"])
+    config = compose_train([*words, f"run_dir={quoted(str(folder))}"])
     with open_dict(config):
         for place, node in (env_nodes | guide_nodes).items():
             OmegaConf.update(config, place, node, merge=False, force_add=True)
@@ -170,11 +170,6 @@ def _shipped(group: str) -> set[str]:
     return {file.name.removesuffix(".yaml") for file in folder.iterdir()}
 
 
-def _quoted(text: str) -> str:
-    """Return a text as a value on the command line."""
-    return "'" + text.replace("'", "\\'") + "'"
-
-
 Words = tuple[list[str], dict[str, Any]]  # of the command line, and nodes for objects by their key
 
 
@@ -206,7 +201,7 @@ def _env(env: Any, name: str) -> Words:
 
 
 def _gym_words(env: str) -> list[str]:
-    return ["env=gym", f"env.id={_quoted(env)}"]
+    return ["env=gym", f"env.id={quoted(env)}"]
 
 
 def _guide(guide: Any, name: str) -> Words:
@@ -218,7 +213,7 @@ def _guide(guide: Any, name: str) -> Words:
     if isinstance(guide, Controller):
         if guide.folder is None:
             raise UserError("guide: this controller has no run; give one of coil_rl.open_run")
-        return ["guide=learned", f"guide.learned.run={_quoted(str(guide.folder))}"], {}
+        return ["guide=learned", f"guide.learned.run={quoted(str(guide.folder))}"], {}
     path = guide if isinstance(guide, str) else import_path(guide)
-    words = ["guide=controller", f"guide.controller.of={_quoted(path or 'given')}"]
+    words = ["guide=controller", f"guide.controller.of={quoted(path or 'given')}"]
     return words, {} if path is not None else {"guide.controller.of": keep(name, guide)}

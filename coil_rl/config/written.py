@@ -105,6 +105,16 @@ def key_of(text: str) -> str:
     return text.lstrip("+~").partition("=")[0].rpartition("@")[2].replace("/", ".")
 
 
+def quoted(text: str) -> str:
+    """Return a text in quotes of Hydra, where a backslash is special before a quote only.
+
+    Args:
+        text: a value for an override on the command line.
+    """
+    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
+    return f"'{escaped}'"
+
+
 def _covers(one: str, other: str) -> bool:
     """Return whether one of two keys is the other, or is inside it."""
     return one == other or other.startswith(f"{one}.") or one.startswith(f"{other}.")

@@ -243,7 +243,7 @@ class AnchoredUpdate(Stateful, Extension):
 
     @torch.no_grad()
     def set_noise(self, progress: float) -> dict[str, float]:
-        """Set the standard deviation, and return the metrics of `finish`."""
+        """Set the standard deviation for the finished share of a run; see `finish`."""
         metrics = {"anchor": self.sign * self.weight}
         if isinstance(self.head.head, GlobalScaleHead):
             scale = self.head.head.log_scale

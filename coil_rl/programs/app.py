@@ -64,7 +64,7 @@ MOST_PROCESSES = 64  # of joblib, or four for each processor if those are more
 
 
 class NoSweepError(UserError):
-    """A program that has no sweeps was started as one, so that none of its jobs is to be done."""
+    """A program without sweeps was started with several values of a key; none of them is run."""
 
 
 class NewFolders(Callback):

@@ -5,11 +5,12 @@ Hydra. Here the same text means the same folder in both: what the shell passes o
 the quotes of Hydra may be around it.
 """
 
-import re
 from pathlib import Path
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+
+from coil_rl.config.written import quoted
 
 # Keys that hold one folder or file.
 KEYS = ("run", "hydra.run.dir", "run_dir", "init", "guide.learned.run", "proxy.folder")
@@ -26,7 +27,7 @@ def spelled(argument: str) -> str:
         return argument
     if not _exists(text) and _as_hydra(text) is not None:
         return argument
-    return f"{key}={_quoted(str(_path(text)))}"
+    return f"{key}={quoted(str(_path(text)))}"
 
 
 def folder(text: str) -> Path:
@@ -66,9 +67,3 @@ def _as_hydra(text: str) -> object | None:
     if override.is_sweep_override() or text == "null":
         return override
     return override.value()
-
-
-def _quoted(text: str) -> str:
-    """Return a text in quotes of Hydra, where a backslash is special before a quote only."""
-    escaped = re.sub(r"(\\*)('|$)", lambda found: found[1] * 2 + ("\\'" if found[2] else ""), text)
-    return f"'{escaped}'"

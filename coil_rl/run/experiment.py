@@ -111,9 +111,12 @@ class Experiment:
         say(f"{self.folder} continues {where}", error=True)
 
     def check_identity(self, saved: Mapping[str, Any], file: Path) -> None:
-        """Raise a `UserError` if a checkpoint belongs to a run with another configuration.
+        """Check that a checkpoint belongs to this run.
 
         A run that was made longer has the checkpoint of the shorter one.
+
+        Raises:
+            UserError: if it belongs to a run with another configuration.
         """
         length = ("budget.frames", "budget.stages")
         ours = {key: value for key, value in self.identity.items() if key not in length}

@@ -28,7 +28,7 @@ from coil_rl.run import checkpoint
 from coil_rl.run.cases import SelectionCases
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import EvaluationCurve, Watch, measures
-from coil_rl.run.experiment import Experiment, watched_keys
+from coil_rl.run.experiment import PUT_BACK, Experiment, watched_keys
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
     begin,
@@ -267,9 +267,10 @@ class Run:
         return self.finish(resumed=True)
 
     def check_unchanged(self) -> None:
-        """Check that the configuration of a trained run is that of its checkpoint.
+        """Check that the configuration of a finished run was not edited.
 
-        Another one is a `UserError`.
+        Raises:
+            UserError: if it differs from the one in the checkpoint.
         """
         state = checkpoint.load_newest(self.folder)
         if state is not None:
@@ -278,7 +279,7 @@ class Run:
                 state["identity"],
                 self.identity,
                 f"{newest} belongs to a run",
-                "put the files of the run back, or train again in another folder",
+                PUT_BACK,
             )
 
     def finish(self, *, resumed: bool = False) -> float:

@@ -75,6 +75,7 @@ def no_import(name, *_):
 @pytest.mark.parametrize("target", CODE)
 def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp_path, monkeypatch):
     trust._shipped_targets()
+    read(tmp_path, saved)  # the first reading of a process loads the codec of the text
     modules = set(sys.modules)
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)

@@ -1,6 +1,7 @@
 """What a person wrote in a file, or on the command line, is what runs, or is refused."""
 
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -124,6 +125,20 @@ def test_files_that_contradict_each_other_are_named(tmp_path):
         UserError, match=r"learner\.gamma is 0\.\d in (env|guide)/mine\.yaml and 0\.\d in "
     ):
         composed(tmp_path, "env=mine", "guide=mine", "method=coil")
+
+
+@pytest.mark.parametrize("between", [(), ("between",)], ids=["listed", "listed by a listed one"])
+def test_file_overrides_the_files_that_its_defaults_list_leads_to(between, tmp_path):
+    folder = tmp_path / "experiment"
+    folder.mkdir()
+    names = ["base", *between, "mine"]
+    (folder / "base.yaml").write_text("# @package _global_\nbudget: {frames: 3_000, steps: 5}\n")
+    for listed, name in pairwise(names):
+        frames = "budget: {frames: 2_000}\n" if name == "mine" else ""
+        text = f"# @package _global_\ndefaults: [{listed}, _self_]\n{frames}"
+        (folder / f"{name}.yaml").write_text(text)
+    config = composed(tmp_path, "env=gym", "+experiment=mine")
+    assert (config["budget"]["frames"], config["budget"]["steps"]) == (2_000, 5)
 
 
 def test_value_that_a_learner_does_not_take_is_refused_by_its_name(tmp_path):
