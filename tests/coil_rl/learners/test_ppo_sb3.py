@@ -23,8 +23,10 @@ CONFIG = OmegaConf.to_container(
     OmegaConf.load(Path(__file__).parents[3] / "conf/learner/ppo_sb3.yaml")
 )
 OPTIONS = {
-    key: value for key, value in CONFIG["learner"].items() if key not in ("_target_", "seed")
-}
+    key: value
+    for key, value in CONFIG["learner"].items()
+    if key not in ("_target_", "seed", "normalise")
+}  # without normaliser: the default of Stable-Baselines3 has none
 
 
 @pytest.mark.parametrize("deterministic", [False, True])
