@@ -1,8 +1,11 @@
+import gc
+import pickle
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from hypothesis import settings
 
 from coil_rl.envs import Track, load_track
@@ -13,6 +16,30 @@ LEVELS = Path(__file__).resolve().parents[2] / "shared" / "tracks"
 torch.set_num_threads(1)
 settings.register_profile("deterministic", derandomize=True, deadline=None)
 settings.load_profile("deterministic")
+
+
+def parse_each_text_once(load):
+    """Return `yaml.load` with a memory, because Hydra reads the same files for every test."""
+    known = {}
+
+    def load_known(stream, Loader):  # noqa: N803 the name of its argument
+        text = stream if isinstance(stream, (str, bytes)) else stream.read()
+        key = (text, Loader.__module__, Loader.__qualname__)
+        if key not in known:
+            if stream is not text:
+                stream.seek(0)  # errors name the file
+            known[key] = pickle.dumps(load(stream, Loader))
+        return pickle.loads(known[key])
+
+    return load_known
+
+
+yaml.load = parse_each_text_once(yaml.load)
+
+
+def pytest_collection_finish():
+    """Keep the garbage collector from visiting all imported modules in each of its rounds."""
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

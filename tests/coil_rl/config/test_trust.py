@@ -1,4 +1,5 @@
 import importlib.resources
+import json
 import sys
 from itertools import zip_longest
 
@@ -44,7 +45,12 @@ def forget():
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     """Return the configuration of a run as coil-train saves it."""
-    return composed(tmp_path_factory.mktemp("saved") / "run")
+    folder = tmp_path_factory.mktemp("saved") / "run"
+    config = composed(folder)
+    # The first reading of a process imports what the others need.
+    trust._shipped_targets()
+    read_config(folder, "run")
+    return config
 
 
 def composed(folder, *overrides):
@@ -62,9 +68,9 @@ def changed(saved, key, value):
 
 
 def read(folder, content):
-    (folder / "config.yaml").write_text(
-        content if isinstance(content, str) else OmegaConf.to_yaml(content)
-    )
+    if not isinstance(content, str):
+        content = json.dumps(OmegaConf.to_container(OmegaConf.create(content)))  # JSON is YAML
+    (folder / "config.yaml").write_text(content)
     return read_config(folder, "run")
 
 
@@ -74,8 +80,6 @@ def no_import(name, *_):
 
 @pytest.mark.parametrize("target", CODE)
 def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp_path, monkeypatch):
-    trust._shipped_targets()
-    read(tmp_path, saved)  # the first reading of a process loads the codec of the text
     modules = set(sys.modules)
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)
@@ -96,7 +100,6 @@ def test_target_outside_the_list_is_refused_before_any_import(target, saved, tmp
 def test_controller_outside_the_list_is_refused_before_any_import(
     key, path, saved, tmp_path, monkeypatch
 ):
-    trust._shipped_targets()
     monkeypatch.setattr(hydra.utils, "get_object", no_import)
     monkeypatch.setattr(importlib, "import_module", no_import)
     for value in (path, {"a.b": path} if "controllers" in key else path):
