@@ -17,15 +17,24 @@ METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
 STEPS = 20
 TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
 TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
+TINY += [f"env.max_steps={STEPS + 4}"]
 REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
-ON_POLICY = ["learner.minibatches=2", "learner.action_gain=1"]
+ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
 FOREST = ["learner.regressor.estimator.n_estimators=3"]
 # What makes a method small, and its policy do something before it has learned anything.
 OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
-OPTIONS |= {"dagger": FOREST, "oil": FOREST, "guide": [], "coil_anchored": ON_POLICY[:1]}
+OPTIONS |= {"dagger": FOREST, "oil": FOREST, "guide": [], "coil_anchored": ON_POLICY[:2]}
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
+# The parts of the other methods are also those of one that is tested here.
+SLOW = {"coil_multi", "coil_rfc", "imitate_then_ppo", "kickstart", "residual_coil", "wsrl"}
+SLOW |= {f"dynamic_coil_{name}" for name in ("agent_only", "guide_only", "joint", "stochastic")}
+FAST_WITH_MEMORY = {"coil", "coil_dropout", "jump_start", "mixing", "residual"}
+
+
+def cases(methods, slow):
+    return [pytest.param(name, marks=pytest.mark.slow if name in slow else []) for name in methods]
 
 
 @pytest.fixture(autouse=True)
@@ -78,14 +87,18 @@ def check_same(folder):
     return observations, actions, controller
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", cases(METHODS, SLOW))
 def test_controller_acts_as_the_policy_does_in_an_evaluation(method, tmp_path):
     _, actions, _ = check_same(learned(tmp_path / "run", method))
     assert np.ptp(actions) > 1e-3
 
 
 @pytest.mark.parametrize(
-    "method", [method for method in METHODS if method not in {*WITHOUT_MEMORY, "guide"}]
+    "method",
+    cases(
+        [name for name in METHODS if name not in {*WITHOUT_MEMORY, "guide"}],
+        {*METHODS} - FAST_WITH_MEMORY,
+    ),
 )
 def test_controller_has_the_memory_of_its_policy(method, tmp_path):
     observations, actions, controller = check_same(
