@@ -21,6 +21,7 @@ SMALL = [
     "budget.num_envs=8",
     "budget.steps=64",
     "evaluation.repeats=1",
+    "evaluation.gif=false",
     "logger=none",
 ]
 RUNS = {

@@ -76,7 +76,8 @@ def trained(env, learner, folder):
     overrides = [f"env={env}", *LEARNERS[learner], *TINY, *OWN[env]]
     called("train", *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
     assert (folder / ("lines.gif" if env in TRACKED else "returns.png")).exists()
-    again = ["evaluation.repeats=1", "trust=[torchrl]", "hydra.run.dir=again"]
+    again = ["evaluation.repeats=1", "evaluation.gif=false", "trust=[torchrl]"]
+    again += ["hydra.run.dir=again"]
     called("evaluate", f"run={folder}", *again, cwd=folder.parent)
     evaluation = (folder.parent / "again" / "evaluation.csv").read_bytes()
     assert evaluation == (folder / "evaluation.csv").read_bytes()
