@@ -20,7 +20,7 @@ METHODS = sorted(
     file.stem for file in (Path(__file__).parents[3] / "conf" / "method").glob("*.yaml")
 )
 # Their parts are also tested with another method.
-SLOW = ["coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc"]
+SLOW = ["coil_multi", "coil_rfc", "kickstart", "mixing", "residual", "residual_coil", "rfc", "wsrl"]
 SLOW += [
     "dynamic_coil_agent_only",
     "dynamic_coil_guide_only",
@@ -31,11 +31,11 @@ TRACKS = ["track=generated", "track.train.count=1", "track.test.count=2"]
 TINY = [
     *TRACKS,
     "env.laps=1",
-    "env.time_limit=1",
+    "env.time_limit=0.5",
     "env.rate=12",
     "evaluation.repeats=1",
     "evaluation.gif=false",
-    "evaluation.curve.env.time_limit=1",
+    "evaluation.curve.env.time_limit=0.5",
     "logger=none",
     "checkpoint_every=1",
     "budget.num_envs=4",
@@ -94,7 +94,7 @@ def proxies(tmp_path_factory):
     [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in METHODS],
 )
 def test_method_ends_with_the_same_files_after_a_resume(method, proxies, tmp_path, capsys):
-    run = trained(tmp_path / "run", method, proxies)
+    run = trained(tmp_path / "run", method, proxies, "track.test.count=1")
     stopped = tmp_path / "stopped"
     shutil.copytree(run, stopped)
     for name in ("evaluation.csv", "policy_last.pt", "checkpoint.pt"):
