@@ -18,6 +18,7 @@ ENV = "thermostat:Room-v0"
 SMALL = ["budget.num_envs=2", "budget.steps=16", "learner.minibatches=2", "logger=none"]
 SMALL += ["evaluation.cases=2", "evaluation.curve.num_envs=2", "evaluation.curve.points=2"]
 SMALL += ["checkpoint_every=1", "evaluation.gif=false"]
+SHORT = [*SMALL, "env.max_steps=20"]
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +37,7 @@ def test_nine_lines_of_the_docs(tmp_path):
     from thermostat.control import PI
 
     observation = np.array([-6.0, 3.0], np.float32)
-    small = ["learner.anchor.looks=1", "learner.anchor.cases=2", *SMALL]
+    small = ["learner.anchor.looks=1", "learner.anchor.cases=2", *SHORT]
 
     run = coil_rl.train(
         ENV,
@@ -107,7 +108,7 @@ def test_object_or_function_is_a_guide_and_acts_row_by_row(guide, tmp_path):
 def test_folder_made_with_an_object_is_opened_with_the_object(tmp_path, monkeypatch):
     folder = tmp_path / "run"
     guide = Held(0.7)
-    coil_rl.train(ENV, guide=guide, method="coil", frames=32, folder=folder, overrides=SMALL)
+    coil_rl.train(ENV, guide=guide, method="coil", frames=32, folder=folder, overrides=SHORT)
     observation = np.array([-6.0, 3.0], np.float32)
     expected = coil_rl.open_run(folder).controller().act(observation)
     monkeypatch.setattr(given, "_objects", {})  # as in another process
@@ -136,7 +137,7 @@ def test_maker_of_an_env_is_an_env(tmp_path):
             method="ppo",
             frames=32,
             folder=tmp_path / str(number),
-            overrides=[*SMALL, "env.max_steps=20"],
+            overrides=SHORT,
         )
         run.begin()
         run.learn()
@@ -171,7 +172,7 @@ def test_mistake_is_one_sentence(arguments, message, tmp_path):
 
 def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
     folder = tmp_path / "run"
-    run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SMALL)
+    run = coil_rl.train(ENV, frames=64, folder=folder, overrides=SHORT)
     first = rows(folder / "metrics.csv")
     with pytest.raises(coil_rl.UserError, match=r"has budget\.frames=64, more than 32"):
         run.train(frames=32)
@@ -196,9 +197,9 @@ def test_longer_run_goes_on_and_says_what_its_schedules_mean(tmp_path, capsys):
 
 def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
     first = coil_rl.train(
-        ENV, frames=64, folder=tmp_path / "first", overrides=[*SMALL, "learner.normalise=true"]
+        ENV, frames=64, folder=tmp_path / "first", overrides=[*SHORT, "learner.normalise=true"]
     )
-    words = [*SMALL, "learner.normalise=true", "learner.learning_rate=0", f"init={first.folder}"]
+    words = [*SHORT, "learner.normalise=true", "learner.learning_rate=0", f"init={first.folder}"]
     second = coil_rl.train(ENV, frames=32, seed=5, folder=tmp_path / "second", overrides=words)
     before = checkpoint.load(first.folder / "policy_last.pt")
     after = checkpoint.load(second.folder / "policies" / f"{0:012d}.pt")
@@ -208,7 +209,7 @@ def test_run_begins_from_the_policy_and_normaliser_of_another(tmp_path):
             ENV,
             frames=32,
             folder=tmp_path / "third",
-            overrides=[*SMALL, "learner.hidden=[8]", f"init={first.folder}"],
+            overrides=[*SHORT, "learner.hidden=[8]", f"init={first.folder}"],
         )
 
 
@@ -240,7 +241,7 @@ def test_run_from_parts_is_trained_resumed_and_reported(tmp_path):
 
 
 def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
-    run = coil_rl.train(ENV, frames=32, folder=tmp_path / "run", overrides=SMALL)
+    run = coil_rl.train(ENV, frames=32, folder=tmp_path / "run", overrides=SHORT)
     file = run.folder / "config.yaml"
     file.write_text(file.read_text().replace("gamma: 0.99", "gamma: 0.9"))
     refused = called("train", f"resume={run.folder}", "trust=[thermostat]", code=2).stderr
