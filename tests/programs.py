@@ -15,6 +15,7 @@ TRACK = ["track=folder", f"track.dir={ROOT / 'tests' / 'ring.csv'}"]
 LAP = [*TRACK, "env.laps=1", "env.rate=6"]
 TINY = [
     *LAP,
+    "env.time_limit=2",
     "budget.frames=512",
     "budget.num_envs=8",
     "budget.steps=32",

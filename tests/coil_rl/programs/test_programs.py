@@ -49,7 +49,8 @@ def test_guide_alone_can_be_trained_and_evaluated(tmp_path):
     )
     assert "guide: mean test reward" in done.stdout
     assert not (tmp_path / "run" / "metrics.csv").exists()
-    alone = called("evaluate", "guide=zero", *LAP, STILL, "hydra.run.dir=alone", cwd=tmp_path)
+    given = [*LAP, STILL, "env.time_limit=2"]
+    alone = called("evaluate", "guide=zero", *given, "hydra.run.dir=alone", cwd=tmp_path)
     assert alone.stdout.splitlines()[:-1] == done.stdout.splitlines()[:-1]
 
 
@@ -154,11 +155,11 @@ def test_part_of_another_package_is_used_by_its_name(tmp_path, monkeypatch):
     experiments.mkdir(parents=True)
     (experiments.parent / "guide").mkdir()
     (experiments.parent / "guide" / "theirs.yaml").write_text(
-        "# @package guide.theirs\n_target_: their_package.TheirGuide\nangle: 8\n"
+        "# @package guide.theirs\n_target_: their_package.TheirGuide\nangle: 80\n"
     )
     (experiments / "mine.yaml").write_text(
         "# @package _global_\ndefaults:\n  - override /method: guide\n  - override /guide: theirs\n"
     )
     mine = ["--config-dir", "conf", *TINY, STILL, "+experiment=mine", "hydra.run.dir=run"]
     done = called("train", *mine, cwd=tmp_path)
-    assert "100%" in done.stdout, "a constant steering of 8 degrees crashes every car"
+    assert "100%" in done.stdout, "a constant steering of 80 degrees crashes every car"
