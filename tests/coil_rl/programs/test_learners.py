@@ -104,6 +104,7 @@ FAST = [
     ("coil_anchored", "dqn"),
     ("coil_anchored", "sac"),
     ("coil_dropout", "sac"),
+    ("wsrl", "sac"),
 ]
 
 
@@ -157,6 +158,9 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
 def test_other_incompatible_choices_are_refused(overrides, sentence, tmp_path):
     with pytest.raises(UserError, match=sentence):
         check(composed(tmp_path, *overrides.split()))
+
+
+def test_learner_with_replay_may_mix_with_a_weight_that_does_not_change(tmp_path):
     check(composed(tmp_path, "method=mixing", "learner=sac", "method.transforms.mixing.weight=0.5"))
 
 
