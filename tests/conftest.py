@@ -22,7 +22,7 @@ def parse_each_text_once(load):
     """Return `yaml.load` with a memory, because Hydra reads the same files for every test."""
     known = {}
 
-    def load_known(stream, Loader):  # noqa: N803 the name of its argument
+    def load_known(stream, Loader):
         text = stream if isinstance(stream, (str, bytes)) else stream.read()
         key = (text, Loader.__module__, Loader.__qualname__)
         if key not in known:

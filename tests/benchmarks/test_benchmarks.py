@@ -70,6 +70,7 @@ def test_other_learners_are_measured_without_yardsticks(tmp_path):
         "learner=dqn",
         "learner.starts=300",
         "learner.ratio=1",
+        "learner.batch_size=8",
     ]
     main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())

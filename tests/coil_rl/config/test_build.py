@@ -41,7 +41,7 @@ def choices(group):
 # Each method with the first preset, and each preset with one method.
 PRESETS = [
     pytest.param(
-        *(method, preset), marks=[] if "default" == preset or method == "coil" else pytest.mark.slow
+        *(method, preset), marks=[] if preset == "default" or method == "coil" else pytest.mark.slow
     )
     for method in choices("method")
     for preset in choices("preset")

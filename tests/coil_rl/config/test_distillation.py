@@ -86,6 +86,8 @@ def test_run_trains_missing_proxies_and_copies_all_of_them(proxies, tmp_path):
         "guide=[spline,zero]",
         f"proxy.folder={proxies}",
         "budget.frames=64",
+        "learner.epochs=1",
+        "learner.minibatches=2",
         f"run_dir={tmp_path / 'run'}",
     ]
     config = composed(*overrides)

@@ -43,7 +43,7 @@ def guided(
 
 @both_guides
 def test_guide_agrees_with_the_oracle(world: dict[str, Any], options: dict[str, Any]) -> None:
-    tracks, steps = random_tracks(2, seed=5), 500
+    tracks, steps = random_tracks(2, seed=5), 300
     env = guided(tracks, 2, world, options)
     cars = [OneCar(track.left, track.right, track.start, **world) for track in tracks]
     guides = [RememberingGuide((track.left, track.right), **options) for track in tracks]

@@ -58,7 +58,8 @@ def test_controller_of_an_env_is_evaluated(env, tmp_path):
 )
 def test_lunar_lander_trains_with_discrete_actions_and_without_a_guide(options, tmp_path):
     pytest.importorskip("Box2D")
-    called("train", "env=lunar_lander", *SMALL, *options, "hydra.run.dir=run", cwd=tmp_path)
+    short = [*SMALL, "budget.frames=128", "env.max_steps=60", *options]
+    called("train", "env=lunar_lander", *short, "hydra.run.dir=run", cwd=tmp_path)
     assert (tmp_path / "run" / "evaluation.csv").exists()
 
 

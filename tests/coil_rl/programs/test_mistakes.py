@@ -388,9 +388,17 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
     assert "config.yaml: guide.spline={'spline': 'cubic', " in refusal("train", "resume=.")
 
 
-@pytest.mark.parametrize("name", ["evaluate", "listen"])
+# Both programs ask the same function.
 @pytest.mark.parametrize(
-    "change", ["env.laps=2", "preset=authors", "guide=random", "method=ppo", "+action.x=1"]
+    ("name", "change"),
+    [
+        ("evaluate", "env.laps=2"),
+        ("evaluate", "preset=authors"),
+        ("evaluate", "guide=random"),
+        ("evaluate", "method=ppo"),
+        ("evaluate", "+action.x=1"),
+        ("listen", "guide=random"),
+    ],
 )
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
