@@ -104,7 +104,8 @@ class ConeTrackEnv(SeededEnv):
             driven from the finish at full speed. None for the starts of the tracks.
         assignment: "random" draws a place at each reset; with `starts` it also draws at the first
             reset how much of `time_limit` is over, so that the episodes do not end together.
-            "cyclic" keeps car i on place i mod places.
+            "drawn" draws a place at each reset, and leaves each episode the whole limit. "cyclic"
+            keeps car i on place i mod places.
         sight: m, range of view.
         hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It
             is then made without cones that share their x or y with a nearer one; a side with fewer
@@ -147,7 +148,7 @@ class ConeTrackEnv(SeededEnv):
         time_limit: float = 200.0,
         held_steps: int = 0,
         starts: int | None = None,
-        assignment: Literal["random", "cyclic"] = "random",
+        assignment: Literal["random", "drawn", "cyclic"] = "random",
         sight: float = SIGHT,
         hold_boundary: bool = False,
         late_observation: bool = False,
@@ -162,7 +163,7 @@ class ConeTrackEnv(SeededEnv):
         dtype: torch.dtype = torch.float32,
     ) -> None:
         check_choice(("first_sighting", "every_sighting"), cone_bonus=cone_bonus)
-        check_choice(("random", "cyclic"), assignment=assignment)
+        check_choice(("random", "drawn", "cyclic"), assignment=assignment)
         check_range(
             0,
             above=True,
@@ -328,7 +329,7 @@ class ConeTrackEnv(SeededEnv):
         # One draw per car, reset or not, keeps the random sequence independent of the data.
         drawn = torch.randint(count, self.batch_size, generator=self.generator)
         place = drawn.to(self.device).index_select(0, cars)
-        if first and self.staggered:
+        if first and self.staggered and self.assignment == "random":
             over = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
             steps = over.to(steps)
         return place, steps

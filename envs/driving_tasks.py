@@ -113,7 +113,7 @@ class DrivingTasksEnv(ConeTrackEnv):
         time_limit: float = 200.0,
         held_steps: int = 0,
         starts: int | None = None,
-        assignment: Literal["random", "cyclic"] = "random",
+        assignment: Literal["random", "drawn", "cyclic"] = "random",
         sight: float = SIGHT,
         hold_boundary: bool = False,
         late_observation: bool = False,

@@ -366,7 +366,7 @@ class Fuzzer:
         if draw.random() < 0.2:
             given.append(f"+degrade@evaluation.advice.other={draw.choice(self.groups['degrade'])}")
         if draw.random() < 0.2:
-            given.append("evaluation.policy=best")
+            given.append("delivery=tested")
         return Case("choices", f"train {usual}", given)
 
     def _run(self, draw: random.Random, here: Path) -> Case:

@@ -105,7 +105,8 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
         config = compose("train", [*overrides, f"run_dir={folder}"])
     if config.method.observes is not None:
         policy = build_learner(config, env_maker(config)()).policy
-        checkpoint.save(policy.state_dict(), folder / "policy_last.pt")
+        for which in ("last", "best"):
+            checkpoint.save(policy.state_dict(), folder / f"policy_{which}.pt")
     saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     saved.logger = None
     OmegaConf.save(saved, folder / "config.yaml")

@@ -271,6 +271,7 @@ class GuideActions(ActionTransform):
         pure = all(getattr(guide, "pure", False) for guide in guides.values())
         self._cache = GuideCache() if pure and not self.needs_past else None
         self._checked: set[str] = set()
+        self.calls = 0  # number of actions that guides were asked for
 
     @cached_property
     def given_space(self) -> ActionSpace:
@@ -393,6 +394,7 @@ class GuideActions(ActionTransform):
     @torch.no_grad()
     def _advice(self, tensordict: TensorDictBase, memory: TensorDictBase | None = None) -> Tensor:
         """Return the advice within the bounds of the action; the memory is replaced by the next."""
+        self.calls += tensordict.numel() * len(self.names)
         if not self._checked:
             self.guides.match_dtypes(tensordict)
             self.guides.tell(self.guide_space)

@@ -21,7 +21,7 @@ from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
-from coil_rl.run.parts import TEST, TRAIN, EnvMaker
+from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.run.run import Budget, GuideReturns, Run
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
@@ -62,8 +62,9 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         noise_correlation=config.training.noise_correlation,
         logger=partial(build, config.logger, "logger") if config.logger else None,
         callbacks=guide_returns,
-        prepare=partial(distil, config, folder) if trains else lambda: None,
+        prepare=partial(distil, config, folder) if trains else lambda: 0,
         init=Path(config.init).expanduser() if config.init else None,
+        delivery=config.delivery,
         which=config.evaluation.policy,
         fallback=config.evaluation.fallback,
         compiled=config.compile,
@@ -100,7 +101,8 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         for name, what in what_guides_see(config).items()
     ]
     if has_agent:
-        notes += about_returns(make_env.sizes)
+        tested = OmegaConf.select(config, "delivery") == "tested"
+        notes += about_returns(make_env.sizes, tested=tested)
     return Trial(
         OmegaConf.select(config, "label") or "",  # the programs without an agent have none
         build_evaluation(config, recorded(pictures)),
@@ -117,11 +119,12 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
     )
 
 
-def about_returns(sizes: Mapping[str, int]) -> list[str]:
+def about_returns(sizes: Mapping[str, int], *, tested: bool = False) -> list[str]:
     """Return what the return of the progress bar, of the curve and of the table counts.
 
     Args:
         sizes: number of cases of each set.
+        tested: whether a test at the end of the run decides what is handed over.
     """
     sentences = [
         "All returns are sums of the env's own rewards: `training` beside the progress bar is the "
@@ -130,7 +133,7 @@ def about_returns(sizes: Mapping[str, int]) -> list[str]:
     ]
     if EVALUATION in sizes:
         chosen = ""
-        if SELECTION in sizes:
+        if SELECTION in sizes and not tested:
             chosen = f", and policy_best was chosen in {sizes[SELECTION]} others"
         sentences.append(
             f"The curve rests on {sizes[EVALUATION]} cases{chosen}; none of them is in the table."
@@ -223,12 +226,14 @@ def cases_node(
     Args:
         config: with `env`, `training` and `evaluation`.
         rows: number of rows; None for that of the training.
-        cases: name of the set: TRAIN, TEST, or one of `evaluation.curve.cases`.
+        cases: name of the set: TRAIN, TESTS, TEST, or one of `evaluation.curve.cases`.
         count: number of different cases, instead of that of the set.
     """
     own = {} if rows is None else {"num_envs": rows}
     if cases == TRAIN:
         return {**config.training.env, **own}
+    if cases == TESTS:
+        return {**config.training.env, **config.training.tests, **own}
     if cases == TEST:
         number = {} if count is None else {"cases": count}
         return {**config.evaluation.env, **number, **own}

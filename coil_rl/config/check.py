@@ -33,6 +33,7 @@ from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.run import HANDED_OVER
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_actions import UnfitActionError
 
@@ -62,6 +63,8 @@ def check_parts(config: DictConfig) -> None:
     has_agent = trains and config.method.observes is not None
     if has_agent:
         _check_kind(config)
+    if trains:
+        _check_delivery(config, has_agent=has_agent)
     make_env = build.env_maker(config)
     cases = len(build.build_evaluation(config).cases)
     recorded = build.recorded(build.build_pictures(config))
@@ -85,6 +88,21 @@ def _check_kind(config: DictConfig) -> None:
         raise UserError(
             f"method={config.method.name} needs a learner that {purpose}, such as "
             f"learner={example}, but {learner} is one that {KINDS[kind][0]}"
+        )
+
+
+def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
+    """Raise a `UserError` if a run would evaluate another policy than it hands over."""
+    if config.delivery == "tested" and not has_agent:
+        raise UserError(
+            f"delivery=tested has no effect: method={config.method.name} trains no policy; leave "
+            "it out"
+        )
+    if has_agent and config.evaluation.policy != HANDED_OVER:
+        raise UserError(
+            f"evaluation.policy={config.evaluation.policy}: a training evaluates what it hands "
+            "over; give delivery=tested or delivery=last, or evaluate another policy afterwards: "
+            f"coil-evaluate run=FOLDER evaluation.policy={config.evaluation.policy}"
         )
 
 

@@ -55,16 +55,19 @@ def proxy_config(config: DictConfig, name: str) -> DictConfig:
     return merged
 
 
-def distil(config: DictConfig, folder: Path) -> None:
-    """Put a proxy of each guide without parameters into the folder of a run, unless it is there."""
-    if (folder / load.PROXIES).is_dir():
-        return
-    proxies = {}
-    for name in guides_without_parameters(build_guides(config)):
-        proxy = proxy_config(config, name)
-        run_configured(proxy, wait=True)
-        proxies[name] = Path(proxy.run_dir)
-    copy_proxies(proxies, folder)
+def distil(config: DictConfig, folder: Path) -> int:
+    """Put a proxy of each guide without parameters into the folder of a run, unless it is there.
+
+    Returns:
+        The frames that the proxies were trained for, now or earlier.
+    """
+    names = guides_without_parameters(build_guides(config))
+    proxies = {name: proxy_config(config, name) for name in names}
+    if not (folder / load.PROXIES).is_dir():
+        for proxy in proxies.values():
+            run_configured(proxy, wait=True)
+        copy_proxies({name: Path(proxy.run_dir) for name, proxy in proxies.items()}, folder)
+    return sum(proxy.budget.frames for proxy in proxies.values())
 
 
 def copy_proxies(runs: Mapping[str, Path], folder: Path) -> None:

@@ -42,7 +42,7 @@ class LearnedGuide(TensorDictModuleBase):
 
     Args:
         run: folder of a run of `coil-train`.
-        which: the last policy, or the best of the kept ones.
+        which: the policy that the run hands over, the last, or the best one.
         device: of the networks.
 
     Raises:
@@ -51,7 +51,10 @@ class LearnedGuide(TensorDictModuleBase):
     """
 
     def __init__(
-        self, run: str, which: Literal["last", "best"] = "last", device: str = "cpu"
+        self,
+        run: str,
+        which: Literal["handed_over", "last", "best"] = "handed_over",
+        device: str = "cpu",
     ) -> None:
         super().__init__()
         folder = Path(os.path.expanduser(run))

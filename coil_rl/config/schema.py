@@ -45,7 +45,7 @@ Threads = Annotated[int, Field(ge=1, le=1024)]
 Envs = Annotated[int, Field(ge=1, le=2**20)]
 Steps = Annotated[int, Field(ge=1, le=2**16)]
 Repeats = Annotated[int, Field(ge=1, le=10_000)]
-WhichPolicy = Annotated[str, one_of("last", "best")]
+WhichPolicy = Annotated[str, one_of("handed_over", "last", "best")]
 
 
 class NodeConfig:
@@ -89,7 +89,8 @@ class CurveConfig(NodeConfig):
 class TrainingConfig(NodeConfig):
     """Training values for an env, and overrides of `env` in training.
 
-    `imitation_env` is for methods that imitate.
+    `imitation_env` is for methods that imitate, `tests` for the cases in which a training compares
+    policies.
     """
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
@@ -99,6 +100,7 @@ class TrainingConfig(NodeConfig):
     )
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
+    tests: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -126,7 +128,7 @@ class EvaluationConfig(NodeConfig):
     curve: CurveConfig = field(default_factory=CurveConfig)
     advice: dict[str, Any] = field(default_factory=dict)
     repeats: Repeats = 5
-    policy: WhichPolicy = "last"
+    policy: WhichPolicy = "handed_over"
     guides: Annotated[str, one_of("phases", "ends")] = "phases"
     gif: bool = True
     fallback: bool = False
@@ -208,6 +210,7 @@ class TrainConfig(DrivingConfig):
     logger: dict[str, Any] | None = None
     proxy: ProxyConfig | None = None
     checkpoint_every: Positive = 10
+    delivery: Annotated[str, one_of("last", "tested")] = "last"
     existing: Annotated[str, one_of("refuse", "resume")] = "refuse"
     resume: str | None = None
     init: str | None = None
@@ -234,7 +237,7 @@ class ReplayConfig(ProgramConfig):
 
     recording: Any = MISSING
     runs: list[str] = field(default_factory=list)
-    policy: WhichPolicy = "last"
+    policy: WhichPolicy = "handed_over"
     frame: str | None = None
     strict: bool = False
     preset: dict[str, Any] = MISSING

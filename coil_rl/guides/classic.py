@@ -90,18 +90,32 @@ def linear_feedback(observation: Tensor, weights: Sequence[float] = (0.1, 0.3, 1
     return ((observation * observation.new_tensor(weights)).sum(-1) > 0).long()
 
 
+def swing_tip(observation: Tensor) -> Tensor:
+    """Swing the links of Acrobot-v1 up: push the joint between them the way it turns.
+
+    Args:
+        observation: [*batch, 6]; the last number is the spin of the second link.
+
+    Returns:
+        The index of a torque, [*batch].
+    """
+    return 2 * (observation[..., 5] > 0).long()
+
+
 class ClassicGuide(TensorDictModule):
     """Guide that acts by one of the functions above.
 
     Args:
-        controller: "lander", "energy_pump", "swing_up" or "linear_feedback"; else a `ValueError`.
+        controller: "lander", "energy_pump", "swing_up", "linear_feedback" or "swing_tip"; else a
+            `ValueError`.
         options: arguments of the function after the observation, by name.
     """
 
     pure = True
 
     def __init__(self, controller: str, options: Mapping[str, Any] | None = None) -> None:
-        known = {each.__name__: each for each in (lander, energy_pump, swing_up, linear_feedback)}
+        functions = (lander, energy_pump, swing_up, linear_feedback, swing_tip)
+        known = {each.__name__: each for each in functions}
         check_choice(tuple(known), controller=controller)
         super().__init__(
             partial(known[controller], **(options or {})),

@@ -128,7 +128,7 @@ class Advisor(PPO):
         make_actor: Callable[..., ProbabilisticTensorDictSequential],
     ) -> ProbabilisticTensorDictSequential:
         """Return the policy, and make the auxiliary one."""
-        self.imitator = networks.actor(env, in_keys, network, normaliser=self.normaliser)
+        self.imitator = networks.actor(env, in_keys, network, inputs=self.inputs)
         return super().build_policy(env, in_keys, network, make_actor)
 
     def parameter_groups(self) -> list[list[nn.Parameter]]:

@@ -1,405 +1,407 @@
-"""Anchored COIL: a policy that starts as its guide, and lets go of it with a brake.
+"""Anchored COIL: a policy that starts as its guide, if the guide is worth it, and else as PPO's.
 
 COIL's first policy is that of plain reinforcement learning, whatever the guide advises. An anchored
-policy adds the advice g to what its network f gives, before squashing:
+policy executes, in normalised actions,
 
-    mean = w atanh(clip(g, -0.97, 0.97)) + f(s, g)
+    a = clip(w g + r x),  x from the learner's own distribution, with mean 0 at first
 
-The last layer of f starts at zero, so with w = 1 the first policy is the guide. For discrete
-actions w kappa is added to the logit of the advised action. Residual policies start the same way
-(Silver et al. 2018; Johannink et al. 2019), but here f is unbounded, and w falls: a policy that
-keeps w = 1 never loses the guide's habits. A guide that is always wrong is of use too: with w = -1
-the first policy does the opposite, and |w| falls.
+so that its first deterministic action is w times the guide's action g, and the learner changes it
+by at most r. This is a residual policy (Silver et al. 2018; Johannink et al. 2019) that also
+observes the advice. For choices a constant is added to the logit of the advised option instead, and
+to the value of the advised action in DQN. The weight w does not change during the training.
 
-Falling too far breaks the policy, and any update may, so there is a brake. At a few check-ups over
-the run the policy is evaluated deterministically in fixed cases, with its present weight and with
-one that is lower by a margin. If the present one has become worse, the policy is rolled back to
-that of the best check-up. Else the weight falls, if the lower one fails in no further case: by a
-step, which is shorter than the margin, if it loses next to nothing; by the margin if it gains much.
+Before the training a start test decides w, in a few new cases whose steps are counted as frames:
+the guide, or its opposite, is held if it is clearly and materially better than the new policy as it
+acts in training; perhaps with a lower gain, if that is better still. If none is, w is 0, r is 1,
+the advice is hidden from the networks, and the training is plain PPO. The test at the end of the
+training, which may hand over the guide itself, is in `coil_rl.run.delivery`.
 
-The parts are `AnchoredHead` in the policy, `AnchoredUpdate` in the updates, and `Brake` between
-them; `Anchor` has the numbers that a user chooses.
+The parts are `Anchor`, the numbers that a user chooses; `Hold`, the weights, which are a part of
+the policy; what acts by them (`ShownAdvice`, `AnchoredSample`, `AnchoredHead`, `AnchoredValues`);
+and `StartTest`, which sets them.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from tensordict import NestedKey, TensorDictBase
+from tensordict import NestedKey, TensorDictBase, unravel_key
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
 from coil_rl.envs.limits import check_range
-from coil_rl.learners.extension import Extension
-from coil_rl.learners.heads import GlobalScaleHead
-from coil_rl.learners.learner import Callback, CaseResults, Cases
-from coil_rl.learners.state import Stateful
-from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.learners.learner import Callback, Cases
+from coil_rl.learners.normaliser import Normaliser
+from coil_rl.learners.sampling import UNCLIPPED, Sample
+from coil_rl.transforms.action_space import ActionSpace
 
-LIMIT = 0.97  # of advice before atanh, as a fraction of half the range of the action
 TIE = 1e-6  # decides between equal values
-FIRST = 0.9  # probability of the advised one of several actions at weight 1
-# A policy is rolled back if it loses more than both: this many tolerances, and this many standard
-# errors of the difference from the best check-up.
-ROLL_BACK_TOLERANCES, ROLL_BACK_ERRORS = 3, 2
-LARGE_GAIN_TOLERANCES = 3  # gain from which on the weight falls by the whole margin
-# Losses that do not train a policy, but values or, in SAC, the temperature; `loss` is that of DQN.
-NOT_OF_THE_POLICY = ("loss", "loss_critic", "loss_qvalue", "loss_alpha")
-
-
-class AnchoredHead(nn.Module):
-    """Head of a policy whose mean, or logits, are pulled to the weighted actions of guides.
-
-    Args:
-        head: gives the mean and the standard deviation, or the logits.
-        pull: turns advice [*batch, n_guides, A] into means or logits [*batch, n_guides, *event].
-        guides: number of guides.
-        device: of the weights; None: PyTorch's default.
-
-    Attributes:
-        weight: of each guide, [n_guides]; at first 1 for the first guide and 0 for the others.
-    """
-
-    def __init__(
-        self,
-        head: nn.Module,
-        pull: Callable[[Tensor], Tensor],
-        guides: int,
-        device: torch.device | None = None,
-    ) -> None:
-        super().__init__()
-        self.head, self.pull = head, pull
-        self.weight: Tensor = nn.Buffer(torch.eye(guides, device=device)[0])
-
-    def forward(self, advice: Tensor, *inputs: Tensor) -> Any:
-        """Return what `head` returns for the inputs, with the pull added."""
-        outputs = self.head(*inputs)
-        first = outputs[0] if isinstance(outputs, tuple) else outputs
-        pull = self.weight.to(first.dtype) @ self.pull(advice).to(first.dtype)
-        pulled = first + pull.view_as(first)
-        return (pulled, *outputs[1:]) if isinstance(outputs, tuple) else pulled
-
-
-class AnchoredValues(AnchoredHead):
-    """Values of actions with a bonus for the advised one: the weight times the range of the values.
-
-    So the advised action is taken unless its value is worse than the best one by more than this.
-    With weight 1 it is taken always.
-
-    Args:
-        guides: number of guides.
-        device: of the weights; None: PyTorch's default.
-    """
-
-    def __init__(self, guides: int, device: torch.device | None = None) -> None:
-        super().__init__(nn.Identity(), nn.Identity(), guides, device)
-
-    def forward(self, advice: Tensor, *inputs: Tensor) -> Tensor:
-        """Return values [*batch, n] with the bonus; advice is one-hot, [*batch, n_guides, n]."""
-        (values,) = inputs
-        span = values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)
-        return values + (self.weight @ advice.to(self.weight.dtype)).to(values.dtype) * (span + TIE)
-
-
-def pull_to_number(advice: Tensor, bounds: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """Return the pull to advised numbers: themselves, or what tanh maps near them.
-
-    Args:
-        advice: [*batch, n_guides, *event].
-        bounds: lower and upper ones, [*event] each, of a policy that is squashed; None: it is not.
-    """
-    if bounds is None:
-        return advice
-    low, high = bounds
-    return ((2 * advice - high - low) / (high - low)).clamp(-LIMIT, LIMIT).atanh()
-
-
-def pull_to_choice(valid: Tensor) -> Callable[[Tensor], Tensor]:
-    """Return the pull to advised choices, which are one-hot for each choice, one beside the other.
-
-    `valid` is [*event, n], whether a choice has an option.
-    """
-    options = valid.sum(-1, keepdim=True).clamp_min(2)
-    gain = (math.log(FIRST / (1 - FIRST)) + (options - 1).log()).expand(valid.shape).flatten()
-    places = valid.flatten().nonzero().squeeze(-1)
-
-    def pull(advice: Tensor) -> Tensor:
-        padded = torch.zeros(
-            *advice.shape[:-1], valid.numel(), dtype=gain.dtype, device=advice.device
-        )
-        return padded.index_copy(-1, places, advice.to(gain.dtype)) * gain
-
-    return pull
-
-
-def anchored_head(policy: nn.Module) -> tuple[str, AnchoredHead]:
-    """Return the anchored head of a policy, and its name among the modules of the policy."""
-    (found,) = [
-        (name, module)
-        for name, module in policy.named_modules()
-        if isinstance(module, AnchoredHead)
-    ]
-    return found
+ADVISED = 0.9  # probability of the advised one of several options at a choice weight of 1
+# Numbers of cases after which the start test may end, with the t value that a difference must
+# exceed: quantiles of the t distribution, 0.5 % of one tail up to 8 cases, and 1 % at the last.
+BARS = {2: 63.7, 4: 5.8, 8: 3.5, 12: 2.7}
+GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may end
 
 
 @dataclass(frozen=True, kw_only=True)
 class Anchor:
-    """Settings of anchored COIL: the start of a policy at its guide, and how it lets go of it.
-
-    A value out of range is a `ValueError`.
+    """Settings of anchored COIL.
 
     Args:
-        looks: number of check-ups over the run, besides the one before training.
-        cases: number of cases of a check-up; None: as many as the run has for this: 96 where
-            failures, often rare, are counted, else 24.
-        step: by which the weight falls at a check-up.
-        margin: by which the candidate weight of a check-up is lower; at least `step`.
-        tolerance: share of the guide's return that may be lost for a step; at least half a standard
-            error of that return may be. Three times as much below the best check-up, and two
-            standard errors of the difference, the policy is rolled back to that.
-        warmup: share of the run, from its start, in which only the critic learns.
-        noise: standard deviation of a policy that has one of its own, as that of PPO; with DQN
-            probability of a random action. A number or a schedule.
+        reach: r, how far the learner may go from the guide, as a share of the range from the centre
+            of the action to its bound.
+        gains: further values of w that the start test tries, from the highest to the lowest.
+        choice_weight: of an advised option: 0 for none; with 1 the option has a probability of 0.9
+            at first. In DQN the share of the range of the values that the advised action gains.
+        share: of the frames of the run that the start test may take. Its first cases may take more.
         advice_key: entry with the advice, [*batch, n_guides, A].
+
+    Raises:
+        ValueError: for a value out of range.
     """
 
-    looks: int = 32
-    cases: int | None = None
-    step: float = 0.05
-    margin: float = 0.3
-    tolerance: float = 0.01
-    warmup: float = 0.05
-    noise: float | Schedule = Linear(0.3, 0.06, until=0.95, since=0.5)
+    reach: float = 0.5
+    gains: Sequence[float] = (0.75, 0.5)
+    choice_weight: float = 0.5
+    share: float = 0.05
     advice_key: NestedKey = "guide_action"
 
     def __post_init__(self) -> None:
-        check_range(1, looks=self.looks)
-        check_range(2, cases=2 if self.cases is None else self.cases)
-        check_range(0, 1, step=self.step, tolerance=self.tolerance, warmup=self.warmup)
-        check_range(self.step, 1, margin=self.margin)
-        check_range(0, above=True, noise=self.noise_at(0))
-
-    def noise_at(self, progress: float) -> float:
-        """Return the noise at this progress of the run, in [0, 1]."""
-        return schedule(self.noise)(progress)
+        check_range(0, above=True, reach=self.reach, choice_weight=self.choice_weight)
+        check_range(0, 1, share=self.share)
+        for gain in self.gains:
+            check_range(0, 1, above=True, gains=gain)
 
 
-class AnchoredUpdate(Stateful, Extension):
-    """What an anchor changes in the updates of a learner, and the state of the anchor.
+class Hold(nn.Module):
+    """The weights with which an anchored policy holds its guides.
 
-    At first only the critic learns, because it knows nothing about the returns of the guide.
-    The noise of the policy follows a schedule.
+    Args:
+        guides: number of guides.
+        space: of the actions.
+        device: of the weights; None: PyTorch's default.
+
+    Attributes:
+        weight: w of each guide, [n_guides], below 0 for its opposite; all 0: none is held.
+    """
+
+    def __init__(self, guides: int, space: ActionSpace, device: torch.device | None = None) -> None:
+        super().__init__()
+        self.weight: Tensor = nn.Buffer(torch.eye(guides, device=device)[0])
+        self.space = space
+
+    @property
+    def held(self) -> Tensor:
+        """Whether a guide is held, a scalar."""
+        return (self.weight != 0).any()
+
+    def set(self, weight: Tensor | Sequence[float]) -> None:
+        """Set the weights, [n_guides], in place."""
+        self.weight.copy_(torch.as_tensor(weight))
+
+    def pull(self, advice: Tensor) -> Tensor:
+        """Return the weighted sum [*batch, A] of advice [*batch, n_guides, A].
+
+        The opposite of an option is the option at its place in reverse order.
+        """
+        advice, weight = self.space.normalise(advice), self.weight.to(advice.dtype)
+        if self.space.continuous:
+            return weight @ advice
+        return weight.clamp(min=0) @ advice + (-weight).clamp(min=0) @ self.space.mirrored(advice)
+
+
+class ShownAdvice(TensorDictModuleBase):
+    """The advice as networks see it: 0 if no guide is held. It is written as `("shown", KEY)`.
+
+    Args:
+        hold: the weights.
+        key: entry with the advice.
+    """
+
+    def __init__(self, hold: Hold, key: NestedKey) -> None:
+        self.in_keys: list[NestedKey] = [key]
+        self.out_keys: list[NestedKey] = [unravel_key(("shown", key))]
+        super().__init__()
+        self.hold = hold
+
+    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
+        """Return the keys that a network reads in place of `keys`."""
+        return [self.out_keys[0] if key == self.in_keys[0] else key for key in keys]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the shown advice."""
+        advice = tensordict[self.in_keys[0]]
+        return tensordict.set(self.out_keys[0], advice * self.hold.held.to(advice.dtype))
+
+
+class AnchoredInputs(TensorDictModuleBase):
+    """What the networks of an anchored learner read: normalised entries, and shown advice.
+
+    Args:
+        normaliser: of some entries; None: of none.
+        shown: the advice.
+    """
+
+    def __init__(self, normaliser: Normaliser | None, shown: ShownAdvice) -> None:
+        parts: list[Normaliser | ShownAdvice] = [] if normaliser is None else [normaliser]
+        parts.append(shown)
+        self.in_keys = [key for part in parts for key in part.in_keys]
+        self.out_keys = [key for part in parts for key in part.out_keys]
+        super().__init__()
+        self.parts, self.shown = nn.ModuleList(parts), (shown,)  # a tuple: it is no part twice
+
+    @property
+    def hold(self) -> Hold:
+        """The weights."""
+        return self.shown[0].hold
+
+    def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
+        """Return the keys that a network reads in place of `keys`."""
+        for part in self.parts:
+            keys = part.reads(keys)  # type: ignore[operator]
+        return list(keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the entries."""
+        for part in self.parts:
+            tensordict = part(tensordict)
+        return tensordict
+
+
+class AnchoredSample(Sample):
+    """Sample of numbers that is added to the action of a held guide.
+
+    It writes `unclipped_action`, the learner's own part x, with `action_log_prob`, and the action,
+    which the env executes.
+
+    Args:
+        sample: of the learner's own part.
+        hold: the weights.
+        anchor: the settings.
+        action_key: entry for the action.
+    """
+
+    def __init__(self, sample: Sample, hold: Hold, anchor: Anchor, action_key: NestedKey) -> None:
+        super().__init__(sample.read, UNCLIPPED, sample.distribution, sample.options)
+        self.hold, self.anchor, self.action_key = hold, anchor, action_key
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Keys of the entries that `forward` writes."""
+        return [*super().out_keys, self.action_key]
+
+    def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
+        """Write the own part and the action."""
+        tensordict = super().forward(tensordict, *args, **options)
+        space, own = self.hold.space, tensordict[UNCLIPPED]
+        pull = self.hold.pull(tensordict[self.anchor.advice_key]).to(own.dtype)
+        reach = torch.where(self.hold.held, self.anchor.reach, 1.0).to(own.dtype)
+        action = space.denormalise(pull + reach * space.normalise(own))
+        return tensordict.set(self.action_key, space.clamp(action))
+
+
+class AnchoredHead(nn.Module):
+    """Head of a policy over options, with a bonus in the logits of the advised ones.
+
+    Args:
+        head: gives the logits.
+        hold: the weights.
+        valid: whether a choice has an option, [*event, n].
+        weight: see `Anchor.choice_weight`.
+    """
+
+    def __init__(self, head: nn.Module, hold: Hold, valid: Tensor, weight: float) -> None:
+        super().__init__()
+        self.head, self.hold = head, hold
+        options = valid.sum(-1, keepdim=True).clamp_min(2)
+        bonus = weight * (math.log(ADVISED / (1 - ADVISED)) + (options - 1).log())
+        # Plain tensors, as they are no state of the policy.
+        self.bonus = bonus.expand(valid.shape).flatten()
+        self.places = valid.flatten().nonzero().squeeze(-1)
+
+    def forward(self, advice: Tensor, *inputs: Tensor) -> Tensor:
+        """Return the logits of `head` for the inputs, with the bonus added."""
+        logits: Tensor = self.head(*inputs)
+        pull = self.hold.pull(advice)
+        padded = torch.zeros(
+            *pull.shape[:-1], self.bonus.numel(), dtype=pull.dtype, device=pull.device
+        )
+        bonus = padded.index_copy(-1, self.places, pull) * self.bonus
+        return logits + bonus.to(logits.dtype).view_as(logits)
+
+
+class AnchoredValues(nn.Module):
+    """Values of actions with a bonus for the advised one: a share of the range of the values.
+
+    So the advised action is taken unless its value is worse than the best one by more than this.
+
+    Args:
+        hold: the weights.
+        weight: the share, see `Anchor.choice_weight`.
+    """
+
+    def __init__(self, hold: Hold, weight: float) -> None:
+        super().__init__()
+        self.hold, self.weight = hold, weight
+
+    def forward(self, advice: Tensor, values: Tensor) -> Tensor:
+        """Return values [*batch, n] with the bonus; advice is one-hot, [*batch, n_guides, n]."""
+        span = values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)
+        return values + self.weight * self.hold.pull(advice).to(values.dtype) * (span + TIE)
+
+
+def hold_of(policy: nn.Module) -> Hold | None:
+    """Return the weights of an anchored policy; None for another policy."""
+    for module in policy.modules():
+        if isinstance(module, Hold):
+            return module
+    return None
+
+
+def start_tests(anchor: Anchor | None, policy: nn.Module, cases: Cases) -> list[Callback]:
+    """Return the start test of an anchored policy; nothing for another policy.
+
+    Args:
+        anchor: the settings; None: the policy is not anchored.
+        policy: of the learner.
+        cases: in which policies are tested.
+    """
+    hold = hold_of(policy)
+    return [] if anchor is None or hold is None else [StartTest(anchor, policy, hold, cases)]
+
+
+class StartTest:
+    """The test before the training that decides which guide a policy holds, a `Callback`.
+
+    All compared policies act in the same new cases: each guide alone and its opposite, both
+    deterministically; and the new policy without a guide as it acts in training. A guide or
+    opposite is held if its mean return is better by more than one standard deviation of the new
+    policy's returns, and the paired t value exceeds its bar (`BARS`). The best one that passes is
+    held. Opposites are tried only where no guide passes. More cases are added until one passes, or
+    the test would take more than its share of the frames.
+
+    Then lower gains of it are tried in the same way. One is taken if it is better, by the same bar,
+    than the gain above it.
 
     Args:
         anchor: the settings.
-        policy: has an `AnchoredHead`.
-
-    Attributes:
-        active: whether the policy is anchored; otherwise the weight is 0 and training is COIL.
-        guide: index of the guide to which it is anchored.
-        sign: 1, or -1 for the opposite of the guide.
-        guide_failures: number of cases in which the guide failed before training.
-        tolerance: return that may be lost for a step of the weight; NaN before training.
-        best_returns: of the best check-up, [C].
-        best_state: state of the policy at the best check-up.
-    """
-
-    parts: ClassVar[tuple[str, ...]] = (
-        "active",
-        "guide",
-        "sign",
-        "guide_failures",
-        "tolerance",
-        "best_returns",
-        "best_state",
-    )
-
-    def __init__(self, anchor: Anchor, policy: nn.Module) -> None:
-        self.anchor = anchor
-        _, self.head = anchored_head(policy)
-        self.active = True
-        self.guide, self.sign = 0, 1
-        self.guide_failures, self.tolerance = 0, math.nan
-        self.best_returns = torch.empty(0)
-        self.best_state: dict[str, Tensor] = {}
-
-    def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
-        """Return the weights of the losses; those of the policy are 0 during the warm-up."""
-        if not (self.active and progress < self.anchor.warmup):
-            return weights
-        return {
-            name: weight if name in NOT_OF_THE_POLICY else 0.0 for name, weight in weights.items()
-        }
-
-    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
-        """Set the standard deviation of an anchored policy that has one of its own.
-
-        Returns:
-            `anchor`, the weight of the guide, below 0 of its opposite; and `noise`, the standard
-            deviation.
-        """
-        return self.set_noise(progress)
-
-    @torch.no_grad()
-    def set_noise(self, progress: float) -> dict[str, float]:
-        """Set the standard deviation for the finished share of a run; see `finish`."""
-        metrics = {"anchor": self.sign * self.weight}
-        if isinstance(self.head.head, GlobalScaleHead):
-            scale = self.head.head.log_scale
-            if self.active:
-                scale.fill_(math.log(self.anchor.noise_at(progress)))
-            metrics["noise"] = float(scale.exp().mean())
-        return metrics
-
-    def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
-        """Return the brake."""
-        return [Brake(self, policy, cases)]
-
-    @property
-    def weight(self) -> float:
-        """Weight of the guide, or of its opposite; 0 without an anchor."""
-        return self.sign * float(self.head.weight.sum())
-
-    def set_weight(self, value: float) -> None:
-        """Set the weight of the guide, or of its opposite."""
-        self.head.weight.copy_(self.weights_of_guides(value))
-
-    def weights_of_guides(self, value: float) -> Tensor:
-        """Return the weights of all guides, [n_guides]: a value for the anchor's, 0 for others."""
-        return self.first_candidates()[self.guide] * (self.sign * value)
-
-    def first_candidates(self) -> list[Tensor]:
-        """Return the weights, [n_guides] each, to compare before training.
-
-        They are for each guide alone, for none, and for the opposite of each guide.
-        """
-        guides = torch.eye(len(self.head.weight), device=self.head.weight.device)
-        return [*guides, guides[0] * 0, *-guides]
-
-    def candidates(self) -> list[Tensor]:
-        """Return the two weights of a check-up, [n_guides] each: the present and the lower one."""
-        lower = max(self.weight - self.anchor.margin, 0.0)
-        return [self.weights_of_guides(self.weight), self.weights_of_guides(lower)]
-
-    def begin(self, results: CaseResults, random: Tensor, policy: nn.Module) -> None:
-        """Choose the best guide, or the opposite of one, as the anchor of the policy, or none.
-
-        The anchor is active if the best guide or opposite is better than a new policy without a
-        guide, and than random actions, by more than a standard error of the difference.
-
-        Args:
-            results: with the weights of `first_candidates`.
-            random: returns of random actions in the same cases, [C].
-            policy: with the head.
-        """
-        guides = len(self.head.weight)
-        anchors = [index for index in range(2 * guides + 1) if index != guides]
-        best = max(anchors, key=results.mean_return)
-        others = torch.stack([results.returns[guides], random])
-        differences = results.returns[best] - others
-        self.active = bool((differences.mean(1) > standard_error(differences)).all())
-        self.guide, self.sign = best % (guides + 1), 1 if best < guides else -1
-        self.set_weight(float(self.active))
-        self.set_noise(0.0)
-        self.guide_failures = results.failures[best]
-        guide_return = abs(results.mean_return(best))
-        if self.active:
-            self._keep(policy, results.returns[best])
-        chance = float(standard_error(results.returns[best])) / 2
-        self.tolerance = max(self.anchor.tolerance * guide_return, chance)
-
-    def decide(self, results: CaseResults, policy: nn.Module) -> bool:
-        """Lower the weight of the guide, keep it, or roll the policy back to the best check-up.
-
-        Args:
-            results: with the weights of `candidates`.
-            policy: with the head.
-
-        Returns:
-            Whether the policy was rolled back.
-        """
-        if self._has_become_worse(results):
-            policy.load_state_dict(self.best_state)
-            return True
-        present, lower = results.mean_return(0), results.mean_return(1)
-        best = float(self.best_returns.mean())
-        if present >= best:
-            self._keep(policy, results.returns[0])
-        if self._may_fall(results):
-            large_gain = lower > max(present, best) + LARGE_GAIN_TOLERANCES * self.tolerance
-            fall = self.anchor.margin if large_gain else self.anchor.step
-            self.set_weight(max(self.weight - fall, 0.0))
-        return False
-
-    def _has_become_worse(self, results: CaseResults) -> bool:
-        """Return whether the policy with the present weight fails more often or lost too much."""
-        if results.failures[0] > self.guide_failures:
-            return True
-        error = float(standard_error(self.best_returns - results.returns[0]))
-        accepted = max(ROLL_BACK_TOLERANCES * self.tolerance, ROLL_BACK_ERRORS * error)
-        return results.mean_return(0) < float(self.best_returns.mean()) - accepted
-
-    def _may_fall(self, results: CaseResults) -> bool:
-        """Return whether the lower weight fails in no further case and loses next to nothing."""
-        steps = self.anchor.margin / self.anchor.step if self.anchor.step else 1.0
-        accepted = results.mean_return(0) - steps * self.tolerance
-        return results.failures[1] <= results.failures[0] and results.mean_return(1) >= accepted
-
-    def _keep(self, policy: nn.Module, returns: Tensor) -> None:
-        self.best_returns = returns
-        self.best_state = {name: value.clone() for name, value in policy.state_dict().items()}
-
-
-class Brake:
-    """The check-ups of an anchored policy, a `Callback`: they decide how strongly it is anchored.
-
-    Args:
-        anchored: the anchor of the policy.
         policy: of the learner.
-        cases: in which copies of the policy are evaluated.
+        hold: its weights.
+        cases: in which policies are tested.
     """
 
     names: Sequence[str] = (
-        "look/return",
-        "look/lower_return",
-        "look/failures",
-        "look/lower_failures",
-        "look/back",
+        "start/guide",
+        "start/opposite",
+        "start/new",
+        "start/cases",
+        "start/weight",
     )
 
-    def __init__(self, anchored: AnchoredUpdate, policy: nn.Module, cases: Cases) -> None:
-        self.anchored, self.policy = anchored, policy
-        count = anchored.anchor.cases
-        self.cases = cases if count is None else cases.take(count)
+    def __init__(self, anchor: Anchor, policy: nn.Module, hold: Hold, cases: Cases) -> None:
+        self.anchor, self.policy, self.hold, self.cases = anchor, policy, hold, cases
+        self.returns: dict[tuple[float, ...], Tensor] = {}  # by the weights
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether there is a check-up: before training, then evenly over the run."""
-        if update == 0:
-            return True
-        looks = self.anchored.anchor.looks
-        return self.anchored.active and update in {
-            round(updates * number / looks) for number in range(1, looks + 1)
-        }
+        """Return whether the training has not begun."""
+        return update == 0
 
     def after_update(self, update: int) -> dict[str, float]:
-        """Evaluate the candidate weights, decide, and return numbers of the first two by name."""
-        rolled_back = False
-        if update == 0:
-            results = self._evaluate(self.anchored.first_candidates())
-            self.anchored.begin(results, self.cases.evaluate_random(), self.policy)
-        else:
-            results = self._evaluate(self.anchored.candidates())
-            rolled_back = self.anchored.decide(results, self.policy)
-        returns = results.mean_return(0), results.mean_return(1)
-        numbers = (*returns, *results.failures[:2], rolled_back)
-        return dict(zip(self.names, map(float, numbers), strict=True))
+        """Test, set the weights, and return the mean returns and the weight by name."""
+        self.cases.begin()
+        guides = [tuple(row) for row in torch.eye(len(self.hold.weight)).tolist()]
+        opposites = [tuple(-value for value in row) for row in guides]
+        new = tuple(0.0 for _ in guides)
+        held = self._first_held(guides, opposites, new)
+        if held != new and self.hold.space.continuous:
+            held = self._best_gain(held)
+        self.hold.set(held)
+        numbers = (
+            self._best(guides),
+            self._best(opposites),
+            self._mean(new),
+            float(len(self.returns[new])),
+            sum(held),
+        )
+        return dict(zip(self.names, numbers, strict=True))
 
-    def _evaluate(self, weights: Sequence[Tensor]) -> CaseResults:
-        """Evaluate the policy in all cases with each of some weights of the guides."""
-        name, _ = anchored_head(self.policy)
-        state = self.policy.state_dict()
-        return self.cases.evaluate([{**state, f"{name}.weight": weight} for weight in weights])
+    def _first_held(
+        self, guides: Sequence[Any], opposites: Sequence[Any], new: tuple[float, ...]
+    ) -> tuple[float, ...]:
+        """Return the weights of the best guide or opposite that passes; those of none else."""
+        done = 0
+        for total in BARS:
+            before = self.cases.steps
+            self.cases.renew(total - done)
+            done = total
+            for each in (new, *guides):
+                self._act(each)
+            if found := self._passing(guides, new):
+                return found
+            for each in opposites:
+                self._act(each)
+            if found := self._passing(opposites, new):
+                return found
+            if not self._affordable(self.cases.steps - before):
+                break
+        return new
+
+    def _best_gain(self, held: tuple[float, ...]) -> tuple[float, ...]:
+        """Return the best gain of held weights."""
+        scaled = {gain: tuple(gain * value for value in held) for gain in (1.0, *self.anchor.gains)}
+        tried = {weights: torch.empty(0) for weights in scaled.values()}
+        self.returns = {key: value for key, value in self.returns.items() if key not in tried}
+        done, best = 0, held
+        for total in GAIN_CASES:
+            before = self.cases.steps
+            self.cases.renew(total - done)
+            done = total
+            for each in tried:
+                self._act(each)
+            best = held
+            for each in list(tried)[1:]:
+                if self._clear(each, best):
+                    best = each
+            if not self._affordable((self.cases.steps - before) * (GAIN_CASES[-1] / done - 1)):
+                break
+        return best
+
+    def _affordable(self, steps: float) -> bool:
+        """Return whether the test may take that many further steps."""
+        return self.cases.steps + steps <= self.anchor.share * self.cases.frames
+
+    def _act(self, weights: tuple[float, ...]) -> None:
+        """Add the returns of the policy with some weights in the present cases."""
+        self.hold.set(weights)
+        returns = self.cases.returns(self.policy, sampled=not any(weights))
+        known = self.returns.get(weights)
+        self.returns[weights] = returns if known is None else torch.cat([known, returns])
+
+    def _passing(self, candidates: Sequence[Any], new: tuple[float, ...]) -> Any:
+        """Return the best of some weights that pass; None if none does."""
+        spread = float(self.returns[new].std())
+        passing = [
+            each
+            for each in candidates
+            if self._mean(each) - self._mean(new) > spread and self._clear(each, new)
+        ]
+        return max(passing, key=self._mean, default=None)
+
+    def _clear(self, better: tuple[float, ...], worse: tuple[float, ...]) -> bool:
+        """Return whether a paired difference exceeds the bar of its number of cases."""
+        differences = self.returns[better] - self.returns[worse]
+        mean = float(differences.mean())
+        return mean > 0 and mean > BARS[len(differences)] * float(standard_error(differences))
+
+    def _mean(self, weights: tuple[float, ...]) -> float:
+        return float(self.returns[weights].mean())
+
+    def _best(self, candidates: Sequence[Any]) -> float:
+        """Return the highest mean return of some weights, NaN if none of them was tried."""
+        means = [self._mean(each) for each in candidates if each in self.returns]
+        return max(means, default=math.nan)
 
 
 def standard_error(values: Tensor) -> Tensor:

@@ -19,11 +19,13 @@ from torchrl.objectives import DQNLoss
 
 from coil_rl.envs.limits import check_range
 from coil_rl.learners import networks
-from coil_rl.learners.anchor import Anchor, AnchoredValues
-from coil_rl.learners.encoders import Mlp, ObservationNetwork, entry_specs, without_memory
+from coil_rl.learners.anchor import Anchor, AnchoredInputs, AnchoredValues, hold_of
+from coil_rl.learners.encoders import Mlp, ObservationNetwork, without_memory
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.action_space import nested_key
+
+HELD_EPSILON = 0.3  # largest probability of a random action of a policy that holds a guide
 
 
 class DQN(OffPolicy):
@@ -124,12 +126,13 @@ class DQN(OffPolicy):
         numbers = ObservationNetwork(
             env, in_keys, network, single.space.n, action_gain, dtype=env.reward_spec.dtype
         )
-        keys = in_keys if self.normaliser is None else self.normaliser.reads(in_keys)
+        keys = in_keys if self.inputs is None else self.inputs.reads(in_keys)
         values = networks.FastTensorDictModule(numbers, keys, ["action_value"])
         self.network = TensorDictSequential(values, QValueModule(spec=single))
-        self.explorer = EGreedyModule(
-            single, eps_init=float(self.epsilon(0)), eps_end=0.0, device=env.device
-        )
+        first = float(self.epsilon(0))
+        if anchor is not None:  # of the first batch; whether a guide is held is not known yet
+            first = min(first, HELD_EPSILON)
+        self.explorer = EGreedyModule(single, eps_init=first, eps_end=0.0, device=env.device)
         self.policy = self.build_policy(env)
         # Huber's loss estimates medians. These ignore the rare step that ends an episode, unless
         # rewards are tiny.
@@ -142,16 +145,15 @@ class DQN(OffPolicy):
                 loss_function="l2",
             )
         )
-        self.extend([], self.policy)
+        self.extend([])
 
     def build_policy(self, env: EnvBase) -> TensorDictSequential:
         """Return the policy: values, perhaps a bonus for the advised action, choice and noise."""
-        modules: list[TensorDictModuleBase] = [] if self.normaliser is None else [self.normaliser]
+        modules: list[TensorDictModuleBase] = [] if self.inputs is None else [self.inputs]
         values, choice = self.network.module
         modules.append(values)
-        if self.anchor is not None:
-            (advice,) = entry_specs(env, [self.anchor.advice_key])
-            bonus = AnchoredValues(advice.shape[-2], env.device)
+        if self.anchor is not None and isinstance(self.inputs, AnchoredInputs):
+            bonus = AnchoredValues(self.inputs.hold, self.anchor.choice_weight)
             keys = [self.anchor.advice_key, "action_value"]
             modules.append(networks.FastTensorDictModule(bonus, keys, ["action_value"]))
         return TensorDictSequential(*modules, choice, self.explorer)
@@ -165,8 +167,9 @@ class DQN(OffPolicy):
         """
         metrics = super().update(batch, progress)
         epsilon = self.epsilon(progress)
-        if self.anchored is not None and self.anchored.active:
-            epsilon = self.anchored.anchor.noise_at(progress)
+        hold = hold_of(self.policy)
+        if hold is not None and hold.held:
+            epsilon = min(epsilon, HELD_EPSILON)
         self.explorer.eps.fill_(epsilon)
         return metrics | {"epsilon": epsilon}
 

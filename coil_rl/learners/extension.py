@@ -1,13 +1,11 @@
-"""What is not part of an algorithm but changes its updates: anchors, statistics, further losses."""
+"""What is not part of an algorithm but changes its updates: statistics, further losses."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import Tensor, nn
-
-from coil_rl.learners.learner import Callback, Cases
+from torch import Tensor
 
 
 class Extension:
@@ -44,10 +42,6 @@ class Extension:
     def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
         """Act after an update with a batch [B, T], and return metrics by name."""
         return {}
-
-    def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
-        """Return what the run calls between updates, for a policy; see `Learner.callbacks`."""
-        return []
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the next update depends on; nothing by default."""

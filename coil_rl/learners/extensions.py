@@ -5,12 +5,10 @@ from typing import Any
 
 from tensordict import NestedKey, TensorDictBase, unravel_key
 from tensordict.nn import ProbabilisticTensorDictSequential
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.learners.anchor import Anchor, AnchoredUpdate
 from coil_rl.learners.extension import Extension
-from coil_rl.learners.learner import Callback, Cases
 from coil_rl.learners.normaliser import Normaliser, RawObservations, RunningStatistics
 from coil_rl.learners.several_agents import SummedRewards
 
@@ -60,10 +58,6 @@ class Extensions(Extension):
             self.raw.look(batch)
         return metrics
 
-    def callbacks(self, policy: nn.Module, cases: Cases) -> Sequence[Callback]:
-        """Return the callbacks of all."""
-        return [callback for each in self.each for callback in each.callbacks(policy, cases)]
-
     def state_dict(self) -> dict[str, Any]:
         """Return the states of all, by their numbers."""
         return {str(number): each.state_dict() for number, each in enumerate(self.each)}
@@ -76,22 +70,17 @@ class Extensions(Extension):
 
 def extensions_of(
     env: EnvBase,
-    policy: nn.Module,
-    *,
     in_keys: Sequence[NestedKey],
     normaliser: Normaliser | None,
     auxiliary: Sequence[Extension],
-    anchor: Anchor | None,
 ) -> Extensions:
     """Return the extensions of an on-policy learner, in their order.
 
     Args:
         env: the env; the rewards of several agents are summed.
-        policy: of the learner.
         in_keys: entries that the policy observes.
         normaliser: of the policy; None: it has none.
         auxiliary: extensions that a user adds.
-        anchor: of the policy; None: it has none.
     """
     extensions: list[Extension] = []
     if (reward_key := unravel_key(("next", env.reward_key))) != ("next", "reward"):
@@ -99,6 +88,4 @@ def extensions_of(
     if normaliser is not None:
         extensions.append(RunningStatistics(normaliser))
     extensions += auxiliary
-    if anchor is not None:  # the last one, because it delays the losses of the others too
-        extensions.append(AnchoredUpdate(anchor, policy))
     return Extensions(extensions, RawObservations(env, in_keys, normaliser))

@@ -25,7 +25,6 @@ from torchrl.envs import EnvBase, ExplorationType, exploration_type, set_explora
 from torchrl.objectives import LossModule, SACLoss
 
 from coil_rl.envs.limits import check_range
-from coil_rl.learners.anchor import Anchor
 from coil_rl.learners.critics import Critics
 from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.extension import Extension
@@ -80,7 +79,6 @@ class IBRL(SAC):
             stored apart: the symmetric sampling of RLPD (Ball et al. 2023) with 0.5. With 0 all
             steps are sampled alike.
         compile: whether to compile the update, see `GradientStep`.
-        anchor: makes the policy start as its guide.
         seed: of the samples.
     """
 
@@ -116,7 +114,6 @@ class IBRL(SAC):
         starts: int = 5_000,
         prior: float = 0.0,
         compile: bool | Literal["auto"] = "auto",
-        anchor: Anchor | None = None,
         seed: int = 0,
     ) -> None:
         check_range(0, sharpness=sharpness or 0, edit=edit)
@@ -151,7 +148,6 @@ class IBRL(SAC):
             starts=starts,
             prior=prior,
             compile=compile,
-            anchor=anchor,
             seed=seed,
         )
         self.also_store(ADVICE)
@@ -179,7 +175,7 @@ class IBRL(SAC):
 
     def build_policy(self) -> TensorDictSequential:
         """Return the policy that collects the batches: it chooses between the proposals."""
-        before = [] if self.normaliser is None else [self.normaliser]
+        before = [] if self.inputs is None else [self.inputs]
         return TensorDictSequential(*before, self.loss.proposals)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:

@@ -1,8 +1,7 @@
 """What every learner has: the base class `Learner`, and what a run calls between its updates."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, Protocol
@@ -60,7 +59,7 @@ class Learner(ABC):
         """Return what a run calls between the updates.
 
         Args:
-            cases: evaluates the policy of this learner in the same cases each time.
+            cases: in which policies can be compared.
         """
         return []
 
@@ -95,42 +94,30 @@ class Callback(Protocol):
         """Act after an update, 0 is before the first, and return numbers for the log by name."""
 
 
-@dataclass(frozen=True)
-class CaseResults:
-    """Results of S policies in the same C cases.
+class Cases(Protocol):
+    """Cases of a training in which policies are compared: the same new ones for all of them.
+
+    Their steps steer the training, so they are frames of it. A comparison changes neither the
+    policy of the learner nor the random numbers of the run.
 
     Attributes:
-        returns: [S, C], return of each episode.
-        failures: for each policy, the number of cases in which it failed.
+        frames: of the whole run.
+        steps: that all comparisons have taken so far.
     """
 
-    returns: Tensor
-    failures: Sequence[int]
+    frames: int
+    steps: int
 
-    def mean_return(self, index: int) -> float:
-        """Return the mean return of a policy."""
-        return float(self.returns[index].mean())
+    def begin(self) -> None:
+        """Begin a comparison, which does not depend on those before."""
 
+    def renew(self, count: int) -> None:
+        """Draw that many new cases."""
 
-class Cases(Protocol):
-    """The fixed cases of a run in which policies are selected: an episode of the env in each.
-
-    An evaluation changes neither the policy of the learner nor the random numbers of the run.
-    """
-
-    @property
-    def count(self) -> int:
-        """C, number of cases."""
-
-    def take(self, count: int) -> "Cases":
-        """Return that many cases."""
-
-    def evaluate(self, states: Sequence[dict[str, Any]]) -> CaseResults:
-        """Evaluate copies of the learner's policy deterministically in all cases.
+    def returns(self, policy: Callable[..., Any], *, sampled: bool = False) -> Tensor:
+        """Return the return of a policy in each of the present cases, [C].
 
         Args:
-            states: state of each copy, as from the `state_dict` of the policy.
+            policy: writes the action.
+            sampled: whether its actions are sampled, as in training.
         """
-
-    def evaluate_random(self) -> Tensor:
-        """Return the returns of random actions, [C], which are the same at each call."""

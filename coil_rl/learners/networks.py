@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -31,7 +30,14 @@ from torchrl.modules import (
     TanhNormal,
 )
 
-from coil_rl.learners.anchor import AnchoredHead, pull_to_choice, pull_to_number
+from coil_rl.learners.anchor import (
+    Anchor,
+    AnchoredHead,
+    AnchoredInputs,
+    AnchoredSample,
+    Hold,
+    ShownAdvice,
+)
 from coil_rl.learners.encoders import (
     STATE,
     ConcatObservations,
@@ -44,11 +50,12 @@ from coil_rl.learners.encoders import (
 from coil_rl.learners.heads import Choices, ChoicesHead, GaussianHead, GlobalScaleHead
 from coil_rl.learners.normaliser import Normaliser
 from coil_rl.learners.sampling import ClippedNormal, Sample
-from coil_rl.transforms.action_space import choices_of
+from coil_rl.transforms.action_space import ActionSpace, choices_of
 from coil_rl.transforms.normalised_action import units_of
 
 REMEMBERED = "remembered"  # what a memory gives to the layers after it
 DEFAULT = Mlp()
+Inputs = Normaliser | AnchoredInputs  # what networks read in place of entries of the env
 
 
 class FastTensorDictModule(TensorDictModuleBase):
@@ -121,8 +128,8 @@ def actor(
     shapes: Shapes | None = None,
     state_dependent_scale: bool = False,
     squash: bool = True,
-    normaliser: Normaliser | None = None,
-    anchored_to: NestedKey | None = None,
+    inputs: Inputs | None = None,
+    anchor: Anchor | None = None,
 ) -> ProbabilisticTensorDictSequential:
     """Return a stochastic policy for the actions of an env.
 
@@ -143,17 +150,16 @@ def actor(
         state_dependent_scale: whether the standard deviation is an output of the network; otherwise
             it is the same in every state.
         squash: whether bounded actions are squashed by tanh; otherwise samples are clipped.
-        normaliser: normalises some of `in_keys`; it becomes the first module of the policy.
-        anchored_to: entry with advice, [*batch, n_guides, A], that pulls the mean or the logits,
-            see `AnchoredHead`; None: nothing does.
+        inputs: what networks read in place of some of `in_keys`; the first module of the policy.
+        anchor: the settings of an anchored policy, which needs `AnchoredInputs`; None: it is none.
 
     Raises:
         ValueError: if no policy can choose such actions, or the env does not carry the memory.
         KeyError: if the env does not have one of the entries.
     """
     spec = action_spec(env)
-    keys = in_keys if normaliser is None else normaliser.reads(in_keys)
-    before: list[TensorDictModuleBase] = [] if normaliser is None else [normaliser]
+    keys = in_keys if inputs is None else inputs.reads(in_keys)
+    before: list[TensorDictModuleBase] = [] if inputs is None else [inputs]
     if isinstance(network, Gru):
         before += memory(env, in_keys, keys, network, shapes)
         in_keys = keys = [REMEMBERED]
@@ -164,13 +170,34 @@ def actor(
         return ObservationNetwork(env, in_keys, network, outputs, gain, shapes, dtype)
 
     part = _action_part(env, spec, network_of, scale, state_dependent_scale, squash)
-    head = part.head
-    if anchored_to is not None:
-        (advice,) = entry_specs(env, [anchored_to])
-        head = AnchoredHead(head, part.pull, advice.shape[-2], env.device)
-        keys = [anchored_to, *keys]
+    head, sample = part.head, part.sample
+    if anchor is not None and isinstance(inputs, AnchoredInputs):
+        if spec.dtype.is_floating_point:
+            sample = AnchoredSample(sample, inputs.hold, anchor, env.action_key)
+        else:
+            head = AnchoredHead(head, inputs.hold, part.valid, anchor.choice_weight)
+            keys = [anchor.advice_key, *keys]
     module = FastTensorDictModule(head, keys, part.parameters)
-    return ProbabilisticTensorDictSequential(*before, module, part.sample)
+    return ProbabilisticTensorDictSequential(*before, module, sample)
+
+
+def inputs_of(env: EnvBase, normaliser: Normaliser | None, anchor: Anchor | None) -> Inputs | None:
+    """Return what the networks of a learner read in place of entries of the env, if anything.
+
+    Args:
+        env: the env, for its specs.
+        normaliser: of some entries; None: of none.
+        anchor: the settings of an anchored policy; None: it is none.
+
+    Raises:
+        KeyError: if the env does not have the advice.
+    """
+    if anchor is None:
+        return normaliser
+    (advice,) = entry_specs(env, [anchor.advice_key])
+    space = ActionSpace(env.full_action_spec[env.action_key], len(env.batch_size))
+    hold = Hold(advice.shape[-2], space, env.device)
+    return AnchoredInputs(normaliser, ShownAdvice(hold, anchor.advice_key))
 
 
 NetworkOf = Callable[[int], ObservationNetwork]  # makes a network with that many outputs
@@ -184,13 +211,13 @@ class _ActionPart:
         head: gives the parameters of a distribution from what is observed.
         parameters: their names.
         sample: samples from the distribution.
-        pull: turns advice into numbers that are added to the first parameter, see `AnchoredHead`.
+        valid: whether each choice has an option, [*event, n]; empty for numbers.
     """
 
     head: nn.Module
     parameters: list[str]
     sample: Sample
-    pull: Callable[[Tensor], Tensor]
+    valid: Tensor
 
 
 def _action_part(
@@ -226,7 +253,7 @@ def _one_choice(env: EnvBase, spec: TensorSpec, network_of: NetworkOf) -> _Actio
         network_of(spec.space.n),
         ["logits"],
         Sample(["logits"], env.action_key, distribution),
-        pull_to_choice(valid),
+        valid,
     )
 
 
@@ -240,7 +267,7 @@ def _several_choices(
         head,
         ["logits"],
         Sample(["logits"], env.action_key, Choices, {"event_dims": len(event)}),
-        pull_to_choice(head.valid),
+        head.valid,
     )
 
 
@@ -257,21 +284,20 @@ def _normal_head(
 def _unbounded(env: EnvBase, head: nn.Module, event: torch.Size) -> _ActionPart:
     """Return the part for numbers of shape `event` without bounds."""
     sample = Sample(["loc", "scale"], env.action_key, IndependentNormal, {"event_dim": len(event)})
-    return _ActionPart(head, ["loc", "scale"], sample, pull_to_number)
+    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
 def _squashed(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
     """Return the part for numbers that tanh squashes to their bounds."""
     options = {"low": low, "high": high, "event_dims": low.ndim, "tanh_loc": False}
     sample = Sample(["loc", "scale"], env.action_key, TanhNormal, options)
-    pull = partial(pull_to_number, bounds=(low, high))
-    return _ActionPart(head, ["loc", "scale"], sample, pull)
+    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
 def _clipped(env: EnvBase, head: nn.Module, low: Tensor, high: Tensor) -> _ActionPart:
     """Return the part for numbers that are clipped to their bounds."""
     sample = ClippedNormal(low, high, env.action_key)
-    return _ActionPart(head, ["loc", "scale"], sample, pull_to_number)
+    return _ActionPart(head, ["loc", "scale"], sample, torch.empty(0))
 
 
 def memory(
@@ -328,7 +354,7 @@ def critic(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
     network: Mlp = DEFAULT,
-    normaliser: Normaliser | None = None,
+    inputs: Inputs | None = None,
 ) -> TensorDictModuleBase:
     """Return a state-value network; it writes `state_value` [*batch, 1].
 
@@ -336,17 +362,17 @@ def critic(
         env: the env, for its specs.
         in_keys: entries that it observes; with a memory it also reads the stored state.
         network: architecture, perhaps with a memory.
-        normaliser: normalises some of `in_keys`.
+        inputs: what it reads in place of some of `in_keys`.
     """
     if isinstance(network, Gru):
         in_keys, network = [*in_keys, STATE], network.after
     values = ObservationNetwork(
         env, in_keys, network, 1, gain=1.0, dtype=env.full_reward_spec[env.reward_key].dtype
     )
-    if normaliser is None:
+    if inputs is None:
         return FastTensorDictModule(values, in_keys, ["state_value"])
     return TensorDictSequential(
-        normaliser, FastTensorDictModule(values, normaliser.reads(in_keys), ["state_value"])
+        inputs, FastTensorDictModule(values, inputs.reads(in_keys), ["state_value"])
     )
 
 
@@ -354,7 +380,8 @@ def action_critic(
     env: EnvBase,
     in_keys: Sequence[NestedKey],
     network: Mlp = DEFAULT,
-    normaliser: Normaliser | None = None,
+    inputs: Inputs | None = None,
+    action_key: NestedKey = "action",
 ) -> FastTensorDictModule:
     """Return an action-value network for numbers; it writes `state_action_value` [*batch, 1].
 
@@ -362,17 +389,18 @@ def action_critic(
         env: the env, for its specs.
         in_keys: entries that it observes, besides the action.
         network: architecture.
-        normaliser: has normalised some of `in_keys` already.
+        inputs: has written what the network reads in place of some of `in_keys` already.
+        action_key: entry of the action.
     """
-    keys: list[NestedKey] = [*in_keys, "action"]
+    keys: list[NestedKey] = [*in_keys, action_key]
     values = ObservationNetwork(
         env,
         keys,
         network,
         1,
         1.0,
-        {"action": action_shape(env)},
+        {action_key: action_shape(env)},
         env.full_reward_spec[env.reward_key].dtype,
     )
-    read = keys if normaliser is None else normaliser.reads(keys)
+    read = keys if inputs is None else inputs.reads(keys)
     return FastTensorDictModule(values, read, ["state_action_value"])

@@ -6,19 +6,20 @@ from typing import Any, ClassVar, Literal
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, unravel_key
 from tensordict.utils import expand_as_right
-from torch import nn
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 from torchrl.envs import EnvBase
 from torchrl.objectives import LossModule, SoftUpdate
 
 from coil_rl.envs.limits import LARGEST_SEED, check_range
-from coil_rl.learners.anchor import Anchor, AnchoredUpdate
+from coil_rl.learners import networks
+from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import Extensions
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.guided_steps import AGENT_ACTS, guide_may_act
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.normaliser import RawObservations, normaliser
+from coil_rl.learners.sampling import UNCLIPPED
 from coil_rl.learners.state import Stateful
 from coil_rl.schedules import Linear, Schedule, schedule
 from coil_rl.transforms.combined_actions import EXECUTED, CombinedAction
@@ -69,7 +70,7 @@ class OffPolicy(Stateful, Learner):
     Attributes:
         keys: entries that a batch must have.
         extensions: what is added to the algorithm.
-        anchored: the extension of an anchored policy, if it is one.
+        action_key: entry of the learner's own action.
     """
 
     compilable: ClassVar[bool] = True
@@ -115,9 +116,17 @@ class OffPolicy(Stateful, Learner):
         check_range(0, LARGEST_SEED, seed=seed)
         check_replay(env, type(self).__name__)
         self.normaliser = normaliser(env, in_keys, normalise)
+        self.inputs = networks.inputs_of(env, self.normaliser, anchor)
+        numbers = env.action_spec.dtype.is_floating_point
+        self.action_key = UNCLIPPED if anchor is not None and numbers else "action"
         self.raw = RawObservations(env, in_keys, self.normaliser)
         self.gamma, self.tau, self.max_grad_norm = gamma, tau, max_grad_norm
         self.guide_may_act = guide_may_act(env)
+        if self.guide_may_act and anchor is not None:
+            raise ValueError(
+                "anchor: a guide acts in place of the agent in some steps of this env, which an "
+                "anchored policy cannot learn from; leave anchor out"
+            )
         self.of_guide = stored_of_guide(env)
         if prior and self.of_guide == "nothing":
             raise ValueError(
@@ -127,7 +136,7 @@ class OffPolicy(Stateful, Learner):
         after = (*in_keys, "reward", "done", "terminated")
         self.stored_keys: list[NestedKey] = [
             *in_keys,
-            "action",
+            self.action_key,
             *(unravel_key(("next", key)) for key in after),
         ]
         self.keys = [*self.stored_keys]
@@ -135,6 +144,8 @@ class OffPolicy(Stateful, Learner):
             self.keys.append(AGENT_ACTS)
         if self.of_guide == "executed":
             self.keys.append(("next", EXECUTED))
+        if anchor is not None:
+            self.also_store(anchor.advice_key)
         self.capacity, self.batch_size = capacity, batch_size
         self.ratio, self.starts = ratio, starts
         self.pending_updates = 0.0
@@ -143,7 +154,6 @@ class OffPolicy(Stateful, Learner):
         self.buffer, self.guide_buffer = self._new_buffer(), self._new_buffer()
         self.prior = round(prior * batch_size)
         self.extensions = Extensions([], self.raw)
-        self.anchored: AnchoredUpdate | None = None
 
     def _new_buffer(self) -> ReplayBuffer:
         # TorchRL's OfflineToOnlineReplayBuffer takes no generator, so a resumed run would draw
@@ -163,6 +173,8 @@ class OffPolicy(Stateful, Learner):
         """Set TorchRL's loss, and make its target networks and the optimiser."""
         self.loss = loss
         self.loss.make_value_estimator(gamma=self.gamma)
+        if self.action_key != "action":
+            self.loss.set_keys(action=self.action_key)
         self.target = SoftUpdate(self.loss, tau=self.tau)
         self.gradient = GradientStep(
             self.losses,
@@ -176,13 +188,9 @@ class OffPolicy(Stateful, Learner):
             compilable=self.compilable,
         )
 
-    def extend(self, extensions: Sequence[Extension], policy: nn.Module) -> None:
-        """Add extensions, and that of an anchored policy if the learner has an `anchor`."""
-        every = [*extensions]
-        if self.anchor is not None:
-            self.anchored = AnchoredUpdate(self.anchor, policy)
-            every.append(self.anchored)
-        self.extensions = Extensions(every, self.raw)
+    def extend(self, extensions: Sequence[Extension]) -> None:
+        """Add extensions."""
+        self.extensions = Extensions(extensions, self.raw)
         self.also_store(*self.extensions.keys)
 
     def update(self, batch: TensorDictBase, progress: float = 0.0) -> dict[str, float]:
@@ -262,9 +270,9 @@ class OffPolicy(Stateful, Learner):
             buffer.sample(due * size).view(due, size) for buffer, size in sizes.items() if size
         ]
         minibatches: TensorDictBase = torch.cat(parts, 1)
-        if self.normaliser is not None:
-            minibatches["next"] = self.normaliser(minibatches["next"])
-            minibatches = self.normaliser(minibatches)
+        if self.inputs is not None:
+            minibatches["next"] = self.inputs(minibatches["next"])
+            minibatches = self.inputs(minibatches)
         return minibatches.unbind(0)
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:
@@ -276,8 +284,8 @@ class OffPolicy(Stateful, Learner):
         return self.extensions.weights(dict.fromkeys(self.minimised, 1.0), progress)
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
-        """Return the callbacks of the extensions."""
-        return self.extensions.callbacks(self.policy, cases)
+        """Return the start test of an anchored policy."""
+        return start_tests(self.anchor, self.policy, cases)
 
     def describe(self, minibatch: TensorDictBase | None) -> dict[str, float]:
         """Return further metrics of the last minibatch, which is None before learning starts."""
@@ -297,7 +305,7 @@ class OffPolicy(Stateful, Learner):
         for buffer, stored in zip((self.buffer, self.guide_buffer), state["buffers"], strict=True):
             buffer.empty()
             if entries := stored["steps"]:
-                steps = TensorDict.from_dict(entries, batch_size=entries["action"].shape[:1])
+                steps = TensorDict.from_dict(entries, batch_size=entries[self.action_key].shape[:1])
                 buffer.extend(steps.to(self.device))
             buffer.writer.load_state_dict(stored["writer"])
 

@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule
 from coil_rl.envs.limits import LARGEST_SEED, check_range
 from coil_rl.learners import networks
 from coil_rl.learners.advantages import Advantages
-from coil_rl.learners.anchor import Anchor
+from coil_rl.learners.anchor import Anchor, start_tests
 from coil_rl.learners.clipped_loss import ClippedLoss
 from coil_rl.learners.encoders import Mlp, without_memory
 from coil_rl.learners.extension import Extension
@@ -132,26 +132,20 @@ class PPO(Stateful, Learner):
         if not self.with_memory:
             without_memory(network, type(self).__name__)
 
-        self.normaliser = normaliser(env, in_keys, normalise)
+        self.anchor, self.normaliser = anchor, normaliser(env, in_keys, normalise)
+        self.inputs = networks.inputs_of(env, self.normaliser, anchor)
         make_actor = partial(
             networks.actor,
             scale=action_scale,
             gain=action_gain,
             squash=squash,
-            normaliser=self.normaliser,
-            anchored_to=None if anchor is None else anchor.advice_key,
+            inputs=self.inputs,
+            anchor=anchor,
         )
         self.policy = self.build_policy(env, in_keys, network, make_actor)
         self.critic = self.build_critic(env, in_keys, network)
         memory, self.head = networks.split_memory(self.policy)
-        self.extensions = extensions_of(
-            env,
-            self.policy,
-            in_keys=in_keys,
-            normaliser=self.normaliser,
-            auxiliary=auxiliary,
-            anchor=anchor,
-        )
+        self.extensions = extensions_of(env, in_keys, self.normaliser, auxiliary)
 
         self.advantage = Advantages(self.critic, gamma, gae_lambda)
         self.loss = self.build_loss(clip, critic)
@@ -187,7 +181,7 @@ class PPO(Stateful, Learner):
         self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp
     ) -> TensorDictModuleBase:
         """Return the critic."""
-        return networks.critic(env, in_keys, network, self.normaliser)
+        return networks.critic(env, in_keys, network, self.inputs)
 
     def build_loss(self, clip: float, critic: float) -> LossModule:
         """Return TorchRL's loss of policy and critic; `critic` is the coefficient of the latter."""
@@ -274,8 +268,8 @@ class PPO(Stateful, Learner):
         return self.loss(minibatch)
 
     def callbacks(self, cases: Cases) -> Sequence[Callback]:
-        """Return the callbacks of the extensions."""
-        return self.extensions.callbacks(self.policy, cases)
+        """Return the start test of an anchored policy."""
+        return start_tests(self.anchor, self.policy, cases)
 
     def check_batch(self, frames: int) -> None:
         """Raise a `ValueError` if a batch of that many frames has too few for the minibatches."""

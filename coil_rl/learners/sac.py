@@ -151,7 +151,7 @@ class SAC(OffPolicy):
         arguments = {
             "actor_network": self.actor,
             "qvalue_network": [
-                networks.action_critic(env, in_keys, critic, self.normaliser)
+                networks.action_critic(env, in_keys, critic, self.inputs, self.action_key)
                 for _ in range(critics)
             ],
             "num_qvalue_nets": critics,
@@ -178,10 +178,10 @@ class SAC(OffPolicy):
             self.action_scale,
             self.action_gain,
             state_dependent_scale=True,
-            normaliser=self.normaliser,
-            anchored_to=None if anchor is None else anchor.advice_key,
+            inputs=self.inputs,
+            anchor=anchor,
         )
-        if self.normaliser is None:
+        if self.inputs is None:
             return policy
         return ProbabilisticTensorDictSequential(*policy.module[1:])
 
@@ -205,7 +205,7 @@ class SAC(OffPolicy):
 
     def build_policy(self) -> TensorDictSequential:
         """Return the policy that collects the batches."""
-        before = [] if self.normaliser is None else [self.normaliser]
+        before = [] if self.inputs is None else [self.inputs]
         policy = ProbabilisticTensorDictSequential(*before, *self.actor.module)
         return TensorDictSequential(policy, self.critics) if self.writes_uncertainty else policy
 
@@ -213,7 +213,7 @@ class SAC(OffPolicy):
         for each in auxiliary:
             if isinstance(each, KickstartLoss):
                 each.critics = self.critics
-        self.extend(auxiliary, self.actor)
+        self.extend(auxiliary)
         self.reported = (*self.reported, *self.extensions.weights({}, 0.0))
 
     def losses(self, minibatch: TensorDictBase) -> TensorDictBase:

@@ -32,6 +32,7 @@ class Sample(SafeProbabilisticModule):
         distribution: type,
         options: Mapping[str, Any] | None = None,
     ) -> None:
+        self.read, self.distribution, self.options = list(parameters), distribution, options
         super().__init__(
             list(parameters),
             [key],

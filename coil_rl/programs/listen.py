@@ -110,7 +110,7 @@ def _page(agent: TensorDictModuleBase, data: Survey, table: Sequence[Mapping[str
     """Return the table with its notes as Markdown."""
     import numpy as np
 
-    from coil_rl.learners.anchor import AnchoredHead
+    from coil_rl.learners.anchor import hold_of
     from coil_rl.report import markdown_table
     from coil_rl.report.table import TABLES
 
@@ -121,11 +121,11 @@ def _page(agent: TensorDictModuleBase, data: Survey, table: Sequence[Mapping[str
         del columns["gradient"]
         kind = "discrete"
     notes = f"{texts['notes']} {texts[kind]}"
-    for module in agent.modules():
-        if isinstance(module, AnchoredHead):
-            weights = zip(data.guides, module.weight.tolist(), strict=True)
-            listed = ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights)
-            notes += f"\nWeight of the anchor: {listed}."
+    hold = hold_of(agent)
+    if hold is not None:
+        weights = zip(data.guides, hold.weight.tolist(), strict=True)
+        listed = ", ".join(f"{guide} {weight:.2f}" for guide, weight in weights)
+        notes += f"\nWeight with which the policy holds each guide: {listed}."
     return f"{markdown_table(table, columns)}\n\n{notes}"
 
 

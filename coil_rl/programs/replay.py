@@ -108,6 +108,7 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
 
     These are `annotated.mcap`, its Foxglove layout, `steering.csv` and `steering.png`.
     """
+    from coil_rl.config.build import assemble
     from coil_rl.files import write_text
     from coil_rl.replay.annotation import annotate, foxglove_layout
     from coil_rl.replay.report import draw_steering, over_time
@@ -119,10 +120,11 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     settings = OmegaConf.masked_copy(config, [str(key) for key in config if key != "run_dir"])
     attachments = {"config.yaml": OmegaConf.to_yaml(settings, resolve=True).encode()}
     inputs = {"config": attachments["config.yaml"]}
-    for name, (run, _) in runs.items():
-        own = (run / "config.yaml").read_bytes()
-        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = own
-        inputs[f"{name}_checkpoint"] = weights_file(run, config.policy).read_bytes()
+    for name, (run, own) in runs.items():
+        text = (run / "config.yaml").read_bytes()
+        attachments[f"{name}/config.yaml"] = inputs[f"{name}_config"] = text
+        which = assemble(own, run).file_of(config.policy)
+        inputs[f"{name}_checkpoint"] = weights_file(run, which).read_bytes()
     about = {}
     for name, content in inputs.items():
         about[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()

@@ -57,6 +57,7 @@ def report(config: DictConfig) -> None:
     parts += [*page.training(finished), *page.guide_training(finished)]
     normalised = any(comparison.normalised for comparison in compared.values())
     parts.append(page.notes(against, normalised, "sampled" in compared))
+    parts += page.handed_over(finished)
     parts += differences
     parts.append(page.progress(len(finished), len(runs), failed_jobs(folders)))
     text = "\n\n".join(parts)

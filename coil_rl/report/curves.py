@@ -24,7 +24,6 @@ from coil_rl.report.statistics import Array, mean_interval
 Rows = Sequence[Mapping[str, object]]
 
 RETURNS = "return in evaluation"
-ANCHOR = "learner/anchor"  # column of metrics.csv
 GRID_COLUMNS = 3
 GRID_ROW_HEIGHT = 1.55  # inches
 AGENT = "#1a1a1a"  # the agent in `draw_phases`
@@ -45,8 +44,7 @@ def draw_learning_curves(
 
     Args:
         runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with
-            "frames" (env frames so far) and "evaluation/return", which may be missing, None or NaN;
-            of an anchored policy also with the weight of its guide, drawn as thin steps.
+            "frames" (env frames so far) and "evaluation/return", which may be missing, None or NaN.
         path: output file.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
@@ -71,7 +69,6 @@ def draw_learning_curves(
             axes.fill_between(frames, low, high, color=stroke.colour, alpha=0.16, lw=0)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
-        _draw_anchors(axes, runs, strokes)
         # Their names are beside the plot, where no curve is.
         for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
             axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
@@ -89,35 +86,6 @@ def draw_learning_curves(
 def _with_count(label: str, runs: Sequence[Rows]) -> str:
     """Return a label with the number of its runs if there are several."""
     return f"{label} ({len(runs)} runs)" if len(runs) > 1 else label
-
-
-def _draw_anchors(
-    axes: Axes, runs: Mapping[str, Sequence[Rows]], strokes: Mapping[str, style.Stroke]
-) -> None:
-    """Draw the weights of guides on an axis inside the plot.
-
-    A cross marks where the brake restored an earlier policy.
-    """
-    if not any(len(points(rows, ANCHOR)) for seeds in runs.values() for rows in seeds):
-        return
-    weights = axes.twinx()
-    for label, stroke in strokes.items():
-        for rows in runs[label]:
-            frames, weight = points(rows, ANCHOR).T
-            weights.step(frames, abs(weight), where="pre", color=stroke.colour, lw=0.7, alpha=0.6)
-            back = [frame for frame, went in points(rows, "look/back") if went]
-            weights.plot(back, [0.5] * len(back), "x", color=stroke.colour, ms=4, alpha=0.6)
-    weights.set(ylim=(0, 4), yticks=[0, 1])  # at the foot of the plot
-    weights.tick_params(axis="y", direction="in", pad=-12, labelsize=7)
-    weights.spines[:].set_visible(False)
-    weights.text(
-        0.01,
-        0.01,
-        "guide's weight; x: went back",
-        transform=weights.transAxes,
-        size=7,
-        color=style.QUIET,
-    )
 
 
 def draw_curve_grid(
@@ -265,9 +233,9 @@ def learning(run: Run) -> dict[str, float]:
     """Return the evaluation curve of a run in numbers, NaN where unknown.
 
     These are the `frames` of the run; the return of the `first`, the `final` and the `best` policy,
-    which is chosen in other cases, with the frames `best_at`; the mean of the curve (`area`, under
-    the curve divided by the frames); the return of the best `guide`; and the frames `until_90` and
-    `until_100` percent of that.
+    which is chosen in other cases, if there are any, with the frames `best_at`; the mean of the
+    curve (`area`, under the curve divided by the frames); the return of the best `guide`; and the
+    frames `until_90` and `until_100` percent of that.
 
     Args:
         run: with or without a curve.
@@ -279,14 +247,17 @@ def learning(run: Run) -> dict[str, float]:
         unknown = ("first", "best", "best_at", "final", "area", "until_90", "until_100")
         return {"frames": frames, "guide": guide} | dict.fromkeys(unknown, math.nan)
     at, values = curve.T
-    best = int((choice if len(choice) == len(curve) else curve)[:, 1].argmax())
+    best, best_at = math.nan, math.nan
+    if len(choice) == len(curve):
+        place = int(choice[:, 1].argmax())
+        best, best_at = values[place], at[place]
     return {
         "frames": frames,
         "guide": guide,
         "first": values[0],
         "final": values[-1],
-        "best": values[best],
-        "best_at": at[best],
+        "best": best,
+        "best_at": best_at,
         "area": np.trapezoid(values, at) / (at[-1] - at[0]) if len(at) > 1 else values[0],
         "until_90": frames_until(at, values, 0.9 * guide) if guide > 0 else math.nan,
         "until_100": frames_until(at, values, guide),

@@ -5,6 +5,7 @@ says how to read them.
 """
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from statistics import mean
@@ -192,6 +193,23 @@ def notes(against: str | None, normalised: bool, sampled: bool) -> str:
     }
     text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
     return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
+
+
+def handed_over(runs: Sequence[Run]) -> list[str]:
+    """Return a sentence for each label whose runs tested at their end what they hand over.
+
+    Args:
+        runs: finished runs.
+    """
+    sentences = []
+    for label in dict.fromkeys(run.label for run in runs if run.handed_over):
+        counts = Counter(run.handed_over for run in runs if run.label == label)
+        listed = ", ".join(f"{policy} {count}" for policy, count in counts.most_common())
+        sentences.append(
+            f"The runs of {label} handed over the policy that was best in a test at their end, "
+            f"whose steps are among their frames: {listed}."
+        )
+    return sentences
 
 
 def progress(finished: int, started: int, refused: int = 0) -> str:

@@ -23,6 +23,7 @@ SELECTION = "selection"  # set of cases for the choice of the best policy
 RETURN, CHOICE = f"{EVALUATION}/return", f"{SELECTION}/return"  # columns of metrics.csv
 PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
+DELIVERY = "delivery.json"  # of a run: which policy it hands over, and why
 RESTORE = "restore the file, or remove the run from the folder"
 
 
@@ -43,6 +44,7 @@ class Run:
         curve: rows of metrics.csv; empty without training.
         guide_returns: mean return of each guide in the evaluation, if known.
         seconds: duration of the training; None if unknown, as for an interrupted run.
+        handed_over: which policy a test at its end chose, such as "last"; empty without a test.
         settings: its configuration.
     """
 
@@ -55,6 +57,7 @@ class Run:
     curve: Sequence[dict[str, float]] = field(default=(), repr=False)
     guide_returns: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
+    handed_over: str = ""
     settings: Mapping[str, Any] = field(default_factory=dict, repr=False)
 
     @property
@@ -137,7 +140,16 @@ def _read_run(folder: Path) -> Run:
         curve=curve,
         guide_returns=_read_numbers(folder / "guide_return.json"),
         seconds=_read_numbers(folder / "training_time.json").get("seconds"),
+        handed_over=_handed_over(folder / DELIVERY),
     )
+
+
+def _handed_over(path: Path) -> str:
+    """Return which policy a run handed over; empty without the file."""
+    with file_of_a_run(path, RESTORE):
+        if not path.exists():
+            return ""
+        return str(json.loads(read_file(path, LARGEST_NUMBERS))["policy"])
 
 
 def _read_config(path: Path) -> tuple[Run, dict[str, Measure]]:

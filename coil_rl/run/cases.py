@@ -1,74 +1,89 @@
-"""The fixed cases of the training in which candidate policies are evaluated between updates."""
+"""The cases of a training in which policies are compared; their steps are frames."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from coil_rl.learners.learner import CaseResults
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
-from coil_rl.run.policy_batch import policy_batch
-from coil_rl.transforms.action_space import random_action
+from coil_rl.transforms import GuideActions
 
-RANDOM_SEED = 0  # of random actions: the same ones at each call
+SEEDS = 2**31  # seeds of cases are below
 
 
-@dataclass(frozen=True)
-class SelectionCases:
-    """The cases of a run in which policies are selected, the `Cases` of its learner.
+@dataclass(eq=False)
+class TrainingCases:
+    """Cases of a training in which policies are compared, the `Cases` of its learner.
+
+    They are drawn as the episodes of the training are. All policies act in them one after the other
+    in an env of the same seed, so a difference of two returns is that of the policies.
 
     Args:
-        policy: of the learner; copies of it act.
-        build: makes an env with all cases for each of a number of policies; takes that number and
-            the number of cases.
-        count: C, number of cases.
-        failure: measure that is true for an episode that failed; None: no episode fails.
+        build: makes an env of a number of rows.
+        frames: of the whole run.
+        seed: of the cases.
+
+    Attributes:
+        steps: that all comparisons have taken so far.
+        calls: number of actions that guides were asked for.
     """
 
-    policy: TensorDictModuleBase
-    build: Callable[[int, int], EnvBase]
-    count: int
-    failure: Measure | None = None
+    build: Callable[[int], EnvBase]
+    frames: int
+    seed: int = 0
+    steps: int = field(default=0, init=False)
+    calls: int = field(default=0, init=False)
 
-    def take(self, count: int) -> "SelectionCases":
-        """Return that many cases."""
-        return replace(self, count=count)
+    def __post_init__(self) -> None:
+        self.generator = torch.Generator().manual_seed(self.seed)
+        self.env: EnvBase | None = None
+        self.env_seed = 0
 
-    def evaluate(self, states: Sequence[dict[str, Any]]) -> CaseResults:
-        """Evaluate copies of the policy, each with another state, in all cases."""
-        with torch.random.fork_rng():
-            env = self.build(len(states), self.count)
-            results = self._totals(env, policy_batch(self.policy, states))
-        returns = results["return"].view(len(states), -1)
-        failures = [0] * len(states)
-        if self.failure is not None:
-            counts = results["failure"].view(len(states), -1).sum(1)
-            failures = [int(count) for count in counts.tolist()]
-        return CaseResults(returns, failures)
+    def begin(self) -> None:
+        """Begin a comparison: forget the env of the one before, of which nothing may be left."""
+        self.env = None
 
-    def evaluate_random(self) -> Tensor:
-        """Return the returns of random actions, [C], which are the same at each call."""
-        env = self.build(1, self.count)
-        with torch.random.fork_rng():
-            torch.manual_seed(RANDOM_SEED)
-            return self._totals(env, partial(random_action, env))["return"]
+    def renew(self, count: int) -> None:
+        """Draw that many new cases."""
+        self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
+        if self.env is None or self.env.batch_size.numel() != count:
+            with torch.random.fork_rng():
+                self.env = self.build(count)
 
     @torch.no_grad()
-    def _totals(
-        self, env: EnvBase, policy: Callable[[TensorDictBase], TensorDictBase]
-    ) -> dict[str, Tensor]:
-        """Return return and failure of an episode of each row of an env, by name."""
-        failure = {} if self.failure is None else {"failure": self.failure}
-        totals = Totals({"return": Measure("episode_reward", "last")} | failure)
-        with progress(unit="step", desc="look", leave=False, mininterval=0.5) as bar:
-            for after, running in episodes(env, policy, tick=bar.update):
+    def returns(self, policy: Callable[..., Any], *, sampled: bool = False) -> Tensor:
+        """Return the return of a policy in each of the present cases, [C]."""
+        if self.env is None:
+            raise RuntimeError("there are no cases yet; call renew first")
+        totals = Totals({"return": Measure("episode_reward", "last")})
+        before = guide_calls(self.env)
+        with (
+            torch.random.fork_rng(),
+            progress(unit="step", desc="test", leave=False, mininterval=0.5) as bar,
+        ):
+            self.env.set_seed(self.env_seed)
+            torch.manual_seed(self.env_seed)
+            for after, running in episodes(self.env, policy, sampled=sampled, tick=bar.update):
                 totals.add(after, running)
-        return totals.results()
+        self.steps += int(totals.steps.sum())
+        self.calls += guide_calls(self.env) - before
+        return totals.results()["return"]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what later comparisons depend on."""
+        return {"generator": self.generator.get_state(), "steps": self.steps, "calls": self.calls}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` returned."""
+        self.generator.set_state(state["generator"])
+        self.steps, self.calls = state["steps"], state["calls"]
+
+
+def guide_calls(env: EnvBase) -> int:
+    """Return the number of actions that the guides of an env have been asked for."""
+    return sum(part.calls for part in env.modules() if isinstance(part, GuideActions))

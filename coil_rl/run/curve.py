@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from itertools import pairwise
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +48,7 @@ class EvaluationCurve:
         points: number of policies that are kept, besides the first one.
         batches: number of evaluations over the run. Each is of the policies that were kept since
             the one before, and takes as long as one episode.
+        chooses: whether to write `policy_best.pt`; otherwise the test at the end of the run does.
 
     Attributes:
         columns: names of its numbers in the log.
@@ -61,22 +61,29 @@ class EvaluationCurve:
     watch: Watch = field(default_factory=dict)
     points: int = 16
     batches: int = 1
+    chooses: bool = True
 
-    names: Sequence[str] = field(
-        default=(), init=False
-    )  # it acts after the row of an update was logged
+    # It acts after the row of an update was logged.
+    names: Sequence[str] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
         measured = ["return", *(name for group in self.watch.values() for name in group)]
         self.columns = [f"{cases}/{name}" for cases in self.envs for name in measured]
 
-    def attach(self, metrics: Metrics, stages: Sequence[int], frames: int) -> None:
-        """Set the log to fill, the updates at which the run ends, and the frames of an update.
+    def attach(self, metrics: Metrics, stages: Sequence[int], frames: int, before: int) -> None:
+        """Tell the curve about the run.
 
         A run that was made longer has several ends. Its policies are kept as in a run of each
         length: evenly from one end to the next.
+
+        Args:
+            metrics: the log to fill.
+            stages: numbers of updates at which the run ends.
+            frames: of an update.
+            before: frames that were taken before the first update.
         """
-        self.metrics, self.stages, self.frames_of_update = metrics, list(stages), frames
+        self.metrics, self.stages = metrics, list(stages)
+        self.frames_of_update, self.frames_before = frames, before
 
     def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
         """Return whether a policy is to be kept, or the kept ones to be evaluated."""
@@ -85,12 +92,12 @@ class EvaluationCurve:
     def after_update(self, update: int) -> dict[str, float]:
         """Keep the policy, and evaluate the kept ones, if it is time and it is not done."""
         if update in self.kept():
-            self.keep(update * self.frames_of_update)
+            self.keep(update)
         batch = self.batch(update)
         if batch and math.isnan(self.metrics.rows[batch[-1]][RETURN]):
-            frames = [each * self.frames_of_update for each in batch]
-            results = dict(zip(batch, self.evaluate(frames), strict=True))
-            self._keep_best(results)
+            results = dict(zip(batch, self.evaluate(batch), strict=True))
+            if self.chooses:
+                self._keep_best(results)
             self.metrics.fill(results)
         return {}
 
@@ -106,31 +113,32 @@ class EvaluationCurve:
         begin = ends[ends.index(update) - 1]
         return [each for each in self.kept() if begin < each <= update or begin == each == 0]
 
-    def keep(self, frames: int) -> None:
-        """Write the policy as it is."""
-        checkpoint.save(self.policy.state_dict(), self.file(frames))
+    def keep(self, update: int) -> None:
+        """Write the policy as it is, after some updates."""
+        checkpoint.save(self.policy.state_dict(), self.file(update))
 
-    def file(self, frames: int) -> Path:
-        """Return the file of the policy after some frames."""
+    def file(self, update: int) -> Path:
+        """Return the file of the policy after some updates; its name has their frames."""
+        frames = self.frames_before + update * self.frames_of_update
         return self.folder / POLICIES / f"{frames:012d}.pt"
 
-    def evaluate(self, frames: Sequence[int]) -> list[dict[str, float]]:
-        """Return the mean measures of the policies after some frames, by name.
+    def evaluate(self, updates: Sequence[int]) -> list[dict[str, float]]:
+        """Return the mean measures of the policies after some numbers of updates, by name.
 
         A damaged file is a `UserError`.
         """
-        states = [checkpoint.load(self.file(each)) for each in frames]
+        states = [checkpoint.load(self.file(each)) for each in updates]
         policies = policy_batch(self.policy, states)
-        rows: list[dict[str, float]] = [{} for _ in frames]
+        rows: list[dict[str, float]] = [{} for _ in updates]
         # The training's random numbers are left alone.
         with (
             torch.random.fork_rng(),
             progress(unit="step", desc="evaluate", leave=False, mininterval=0.5) as bar,
         ):
             for cases, make_env in self.envs.items():
-                results = measures(make_env(len(frames)), policies, self.watch, bar.update)
+                results = measures(make_env(len(updates)), policies, self.watch, bar.update)
                 for name, values in results.items():
-                    means = values.view(len(frames), -1).double().mean(1).tolist()
+                    means = values.view(len(updates), -1).double().mean(1).tolist()
                     for row, mean in zip(rows, means, strict=True):
                         row[f"{cases}/{name}"] = mean
         return rows
@@ -138,8 +146,8 @@ class EvaluationCurve:
     def _keep_best(self, results: Mapping[int, Mapping[str, float]]) -> None:
         """Copy the best of all evaluated policies to `policy_best.pt`."""
         rows = [{**row, **results.get(number, {})} for number, row in enumerate(self.metrics.rows)]
-        judged = [row for row in rows if not math.isnan(row[CHOICE])]
-        best = int(max(judged, key=itemgetter(CHOICE))["frames"])
+        judged = [number for number, row in enumerate(rows) if not math.isnan(row[CHOICE])]
+        best = max(judged, key=lambda number: rows[number][CHOICE])
         with whole_file(self.folder / "policy_best.pt") as unfinished:
             shutil.copyfile(self.file(best), unfinished)
 

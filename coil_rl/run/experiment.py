@@ -16,6 +16,7 @@ from coil_rl.errors import UserError, file_of_a_run, is_outside
 from coil_rl.learners.learner import Callback, Learner
 from coil_rl.output import decoration, progress, say
 from coil_rl.run import checkpoint
+from coil_rl.run.cases import TrainingCases, guide_calls
 from coil_rl.run.curve import EvaluationCurve, Watch
 from coil_rl.run.folder import check_same
 from coil_rl.run.metrics import Metrics
@@ -39,7 +40,7 @@ class Experiment:
         learner: learns from the batches.
         rollout: collects them. Its env must write `episode_reward` (TorchRL's RewardSum), and
             `task_reward` if a transform adds to the reward of the task.
-        frames: length of the run; the last batch may exceed it.
+        frames: length of the run, with the steps of all tests; the last batch may exceed it.
         folder: of the run; it exists.
         logger: any TorchRL logger, in addition to the CSV file.
         watch: further entries to log, as means over finished episodes ("episode") or over all steps
@@ -48,6 +49,9 @@ class Experiment:
         callbacks: called before the first update and between updates. One with `names` measures:
             its numbers are columns of the log. One without acts after the row was logged.
         curve: keeps policies and evaluates them; a callback that the log has columns of.
+        cases: in which callbacks compare policies; their steps are frames. None: there are none.
+        reserve: frames that are kept for a test at the end.
+        before: frames that were taken before the run, by what prepared it.
         identity: values of the configuration, which a checkpoint keeps and a resumed run must have.
         stages: earlier lengths of a run that was made longer, in frames.
     """
@@ -64,29 +68,55 @@ class Experiment:
     checkpoint_every: int = 10
     callbacks: Sequence[Callback] = ()
     curve: EvaluationCurve | None = None
+    cases: TrainingCases | None = None
+    reserve: int = 0
+    before: int = 0
     identity: Mapping[str, Any] = field(default_factory=dict)
     stages: Sequence[int] = ()
 
     def __post_init__(self) -> None:
         self.metrics = Metrics(self.folder / "metrics.csv", self.logger)
         self.updates = 0  # so far
+        self.calls_before = 0  # of the guides in the rollouts of earlier processes
+        self.frames_before = self.before  # taken before the first update
+        self.ends: dict[int, int] = {}  # frames of each length of the run to its number of updates
         self.returns: deque[float] = deque(maxlen=self.EPISODES)
         self.measuring = [callback for callback in self.callbacks if callback.names]
         self.acting = [callback for callback in self.callbacks if not callback.names]
         self.acting.append(Checkpoints(self, self.checkpoint_every))
         if self.curve is not None:
-            self.curve.attach(self.metrics, self.stage_updates, self.rollout.frames)
             self.acting.append(self.curve)
 
     @property
-    def stage_updates(self) -> list[int]:
-        """Numbers of updates at which the run ends, and ended before it was made longer."""
-        return [math.ceil(frames / self.rollout.frames) for frames in (*self.stages, self.frames)]
+    def all_updates(self) -> int:
+        """Number of updates of the whole run, once it is known."""
+        return self.ends[self.frames]
 
     @property
-    def all_updates(self) -> int:
-        """Number of updates of the whole run."""
-        return self.stage_updates[-1]
+    def tested(self) -> int:
+        """Steps that tests have taken so far."""
+        return 0 if self.cases is None else self.cases.steps
+
+    @property
+    def calls(self) -> int:
+        """Number of actions that guides were asked for so far."""
+        of_tests = 0 if self.cases is None else self.cases.calls
+        return self.calls_before + guide_calls(self.rollout.env) + of_tests
+
+    def _plan(self) -> None:
+        """Fix at how many updates the run ends, and what the curve keeps.
+
+        What was taken before, what tests have taken and what is kept for the last one is left out
+        of the frames. At least one further update is left.
+        """
+        for frames in (*self.stages, self.frames):
+            if frames not in self.ends:
+                taken = self.before + self.tested + self.reserve
+                updates = math.ceil((frames - taken) / self.rollout.frames)
+                self.ends[frames] = max(updates, self.updates + 1)
+        if self.curve is not None:
+            known = [update for update in self.ends.values() if update <= self.all_updates]
+            self.curve.attach(self.metrics, known, self.rollout.frames, self.frames_before)
 
     def resume(self) -> None:
         """Continue from the last intact checkpoint of the folder.
@@ -132,12 +162,20 @@ class Experiment:
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
         """Train to the end and return the rows of `metrics.csv`.
 
+        What is measured before the first update may take frames, and comes before the plan.
+
         Args:
             guide_return: mean return of the best guide, shown beside the agent's.
 
         Raises:
             UserError: for a NaN from the env, in the losses or in the weights.
         """
+        first = {}
+        if self.updates == 0:
+            first = self._measure({})
+            self.frames_before = self.before + self.tested
+            first |= self._taken()
+        self._plan()
         updates, frames = self.all_updates, self.rollout.frames
         with progress(
             total=updates * frames,
@@ -146,12 +184,12 @@ class Experiment:
             unit_scale=True,
             desc="train",
         ) as bar:
-            first = self._measure({}) if self.updates == 0 else {}
             self._act({})
             with STOP.after_update():
                 while self.updates < updates:
                     row = self.update(self.updates / updates)
                     row |= self._measure(row)
+                    row = self._taken() | row
                     self._log(row, first)
                     bar.update(frames)
                     with decoration("the progress bar"):
@@ -159,7 +197,7 @@ class Experiment:
                     self._act(row)
         policy = self.learner.policy.state_dict()
         checkpoint.save(policy, self.folder / "policy_last.pt")
-        if self.curve is None:
+        if self.curve is None and not self.reserve:
             checkpoint.save(policy, self.folder / "policy_best.pt")
         return self.metrics.rows
 
@@ -181,7 +219,7 @@ class Experiment:
             for name, value in learned.items():
                 if not math.isfinite(value):
                     raise UserError(f"{name} is {value} in update {self.updates}")
-        return {"frames": self.updates * self.rollout.frames, **row, **learned}
+        return {**row, **learned}
 
     def _log(self, row: dict[str, float], first: Mapping[str, float]) -> None:
         """Log an update.
@@ -191,18 +229,30 @@ class Experiment:
             first: numbers of the state before the first update.
         """
         if not self.metrics.rows:
-            self.metrics.append({**dict.fromkeys(row, math.nan), "frames": 0, **first})
+            self.metrics.append({**dict.fromkeys(row, math.nan), **first})
         self.metrics.append(row)
 
     def _measure(self, row: Mapping[str, float]) -> dict[str, float]:
         """Return the numbers of the callbacks that measure, NaN where they are not due."""
         numbers: dict[str, float] = {}
+        all_updates = self.ends.get(self.frames, -1)  # not known before the first update
         for callback in self.measuring:
-            if callback.due(self.updates, self.all_updates, row):
+            if callback.due(self.updates, all_updates, row):
                 numbers |= callback.after_update(self.updates)
             else:
                 numbers |= dict.fromkeys(callback.names, math.nan)
         return numbers
+
+    def _taken(self) -> dict[str, float]:
+        """Return the frames so far, their parts, and the number of calls of guides, by name."""
+        rollout = self.updates * self.rollout.frames
+        return {
+            "frames": self.before + self.tested + rollout,
+            "frames/before": self.before,
+            "frames/rollout": rollout,
+            "frames/tests": self.tested,
+            "guide/calls": self.calls,
+        }
 
     def _act(self, row: Mapping[str, float]) -> None:
         for callback in self.acting:
@@ -287,6 +337,10 @@ class Experiment:
             "rollout": self.rollout.state_dict(),
             "identity": self.identity,
             "updates": self.updates,
+            "ends": self.ends,
+            "frames_before": self.frames_before,
+            "calls": self.calls_before + guide_calls(self.rollout.env),
+            "cases": None if self.cases is None else self.cases.state_dict(),
             "returns": list(self.returns),
             "torch_rng": torch.get_rng_state(),
             "cuda_rng": torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else [],
@@ -296,7 +350,10 @@ class Experiment:
         """Restore a state that `state_dict` returned."""
         self.learner.load_state_dict(state["learner"])
         self.rollout.load_state_dict(state["rollout"])
-        self.updates = state["updates"]
+        self.updates, self.ends = state["updates"], dict(state["ends"])
+        self.frames_before, self.calls_before = state["frames_before"], state["calls"]
+        if self.cases is not None:
+            self.cases.load_state_dict(state["cases"])
         self.returns = deque(state["returns"], maxlen=self.EPISODES)
         torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"]:

@@ -23,11 +23,12 @@ from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
-from coil_rl.report.runs import EVALUATION, SELECTION, read_curve
+from coil_rl.report.runs import DELIVERY, EVALUATION, read_curve
 from coil_rl.run import checkpoint
-from coil_rl.run.cases import SelectionCases
+from coil_rl.run.cases import TrainingCases
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import EvaluationCurve, Watch, measures
+from coil_rl.run.delivery import GUIDE, Delivery, GuideActs, handed_over
 from coil_rl.run.experiment import PUT_BACK, Experiment, watched_keys
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
@@ -42,13 +43,13 @@ from coil_rl.run.folder import (
 )
 from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
 from coil_rl.run.next_step import next_step
-from coil_rl.run.parts import TRAIN, EnvMaker
+from coil_rl.run.parts import TESTS, TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import resume_command
 from coil_rl.transforms.normalised_action import given_units, units_of
 
-FEW_CASES, MANY_CASES = 24, 96  # in which a learner compares policies
 INIT = "init.pt"  # the policy that a run began from
+HANDED_OVER = "handed_over"  # name of the policy that `delivery` chose
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,13 @@ class Run:
         noise_correlation: of the exploration noise, see `Rollout`.
         logger: makes a TorchRL logger, in addition to the CSV file.
         callbacks: makes further callbacks for a learner; `GuideReturns` for one that trains guides.
-        prepare: called before the training, for what the learner needs.
+        prepare: called before the training, for what the learner needs; returns the frames that
+            this took.
         init: folder of a run whose last policy, with its normaliser, this one begins with, instead
             of random weights.
-        which: policy that is evaluated, "last" or "best" of the kept ones.
+        delivery: what the run hands over, "last" for the last policy, or "tested" for what is best
+            in a test at the end, see `Delivery`.
+        which: policy that is evaluated: "handed_over", "last" or "best".
         fallback: whether to evaluate the policy also with its guide to fall back to.
         compiled: whether to compile the steps of env and guides where they can be.
         device: of everything.
@@ -126,9 +130,10 @@ class Run:
     noise_correlation: float = 0.0
     logger: Callable[[], Any] | None = None
     callbacks: Callable[[Learner], Sequence[Callback]] = lambda learner: ()
-    prepare: Callable[[], None] = lambda: None
+    prepare: Callable[[], int] = lambda: 0
     init: Path | None = None
-    which: str = "last"
+    delivery: str = "last"
+    which: str = HANDED_OVER
     fallback: bool = False
     compiled: bool = False
     device: str = "cpu"
@@ -148,6 +153,17 @@ class Run:
     def trial(self) -> Trial:
         """How the run is evaluated."""
         return self.make_trial()
+
+    @property
+    def chosen(self) -> str:
+        """Policy that is evaluated, "last" or "best"."""
+        return self.file_of(self.which)
+
+    def file_of(self, which: str) -> str:
+        """Return "last" or "best" for the name of a policy, which may be "handed_over"."""
+        if which != HANDED_OVER:
+            return which
+        return "best" if self.delivery == "tested" else "last"
 
     def train(self, frames: int | None = None) -> Run:
         """Train to the end, evaluate, and return the run.
@@ -199,7 +215,7 @@ class Run:
         """Return what a machine is sent: the policy with guide, normaliser and memory inside.
 
         Args:
-            which: policy, "last" or "best" of the kept ones; by default the one that is evaluated.
+            which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
         """
         env = self.make_env(1, TRAIN)
         if self.make_learner is None:
@@ -212,7 +228,7 @@ class Run:
 
         Args:
             env: of the run, such as `run.make_env(rows)`; by default a new one.
-            which: policy, "last" or "best" of the kept ones; by default the one that is evaluated.
+            which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
         """
         if self.make_learner is None:
             return None
@@ -245,7 +261,7 @@ class Run:
         if not begun:
             return
         write_config(self.folder, self.settings)
-        for file in ("evaluation.csv", "evaluation.md", "training_time.json"):
+        for file in ("evaluation.csv", "evaluation.md", "training_time.json", DELIVERY):
             (self.folder / file).unlink(missing_ok=True)
         say(
             f"{self.folder} goes on from {budget.frames:,} to {frames:,} frames; schedules over "
@@ -290,7 +306,7 @@ class Run:
                 report_changed_versions(self.folder)
             policy = None if self.make_learner is None else self.learn(resumed=resumed)
             fallback = self.make_fallback(policy) if self.fallback else None
-            judge(self.trial, policy, self.folder, self.seed, fallback)
+            judge(self._trial_with_reason(), policy, self.folder, self.seed, fallback)
             reward = report_outcome(self.folder)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"continue with: {resume_command(self.folder)}") from None
@@ -312,12 +328,12 @@ class Run:
 
     def learn(self, *, resumed: bool = False) -> TensorDictModuleBase:
         """Train, draw the learning curve and return the policy to evaluate."""
-        self.prepare()
+        before = self.prepare()
         torch.set_num_threads(self.threads)  # what prepares may have set another number
         guide_returns = self._saved_guide_returns()
         # After the guides, which a resumed run does not evaluate again.
         torch.manual_seed(self.seed)
-        experiment = self._experiment()
+        experiment = self._experiment(before)
         if resumed:
             experiment.resume()
         start = time.monotonic()
@@ -329,11 +345,14 @@ class Run:
         with decoration(f"the learning curve in {self.folder}"):
             self._draw(rows, learner, guide_returns)
         learner.export(self.folder)
-        state = checkpoint.load(weights_file(self.folder, self.which), self.device)
-        learner.policy.load_state_dict(state)
-        return learner.policy
+        return self._loaded(learner.policy, experiment.rollout.env, self.chosen)
 
-    def _experiment(self) -> Experiment:
+    def _experiment(self, before: int) -> Experiment:
+        """Return the training.
+
+        Args:
+            before: frames that were taken before it.
+        """
         make_learner = self.make_learner
         require_agent(make_learner, self.folder)
         env = self.make_env(self.budget.rows)
@@ -345,6 +364,14 @@ class Run:
             load_weights(learner.policy, self._init_file(), self.device)
         keys = [*learner.keys, *watched_keys(env, self.watch)]
         rollout = Rollout(env, learner.policy, self.budget.steps, keys, self.noise_correlation)
+        cases = TrainingCases(partial(self.make_env, cases=TESTS), self.budget.frames, self.seed)
+        curve = self._curve(learner.policy)
+        callbacks = [*learner.callbacks(cases), *self.callbacks(learner)]
+        reserve = 0
+        if self.delivery == "tested":
+            delivery = Delivery(learner, env, cases, curve, self.folder)
+            callbacks.append(delivery)
+            reserve = delivery.reserve
         return Experiment(
             learner,
             rollout,
@@ -353,8 +380,11 @@ class Run:
             logger=self.logger() if self.logger is not None else None,
             watch=self.watch,
             checkpoint_every=self.budget.checkpoint_every,
-            callbacks=[*learner.callbacks(self.selection(learner)), *self.callbacks(learner)],
-            curve=self._curve(learner.policy),
+            callbacks=callbacks,
+            curve=curve,
+            cases=cases,
+            reserve=reserve,
+            before=before,
             identity=self.identity,
             stages=self.budget.stages,
         )
@@ -366,27 +396,14 @@ class Run:
             checkpoint.save(checkpoint.load(weights_file(Path(self.init or ""))), copy)
         return copy
 
-    def selection(self, learner: Learner) -> SelectionCases:
-        """Return the cases in which the learner may compare policies."""
-
-        def make(policies: int, count: int) -> EnvBase:
-            if SELECTION not in self.make_env.sizes:
-                raise UserError(
-                    f"learner.anchor needs evaluation.curve.cases.{SELECTION}, cases for its "
-                    "drives; give it"
-                )
-            return self.make_env(policies * count, SELECTION, count=count)
-
-        # Rare failures do not show in a few cases.
-        count = FEW_CASES if self.failure is None else MANY_CASES
-        return SelectionCases(learner.policy, make, count, self.failure)
-
     def _curve(self, policy: TensorDictModuleBase) -> EvaluationCurve | None:
         """Return the evaluation curve of the run; None without cases."""
         sizes = self.make_env.sizes
         if EVALUATION not in sizes:
             return None
-        envs = {cases: partial(self._rows_of_policies, cases) for cases in sizes}
+        chooses = self.delivery != "tested"
+        sets = sizes if chooses else [EVALUATION]
+        envs = {cases: partial(self._rows_of_policies, cases) for cases in sets}
         return EvaluationCurve(
             self.folder,
             policy,
@@ -394,6 +411,7 @@ class Run:
             watch=self.watch,
             points=self.budget.points,
             batches=self.budget.batches,
+            chooses=chooses,
         )
 
     def _rows_of_policies(self, cases: str, policies: int) -> EnvBase:
@@ -424,23 +442,50 @@ class Run:
         write_text(file, json.dumps(returns, indent=2))
         return returns
 
-    def load_policy(self, env: EnvBase, which: str = "last") -> TensorDictModuleBase:
+    def load_policy(self, env: EnvBase, which: str = HANDED_OVER) -> TensorDictModuleBase:
         """Return the policy of the run for an env with its transforms.
 
         Args:
             env: with the transforms of the run.
-            which: "last", or "best" of the kept ones, in the cases of selection.
+            which: "handed_over", "last", or "best".
 
         Raises:
             UserError: if the policy is missing, damaged, or does not fit the configuration.
         """
         make_learner = self.make_learner
         require_agent(make_learner, self.folder)
-        policy = make_learner(env).policy  # type: ignore[misc]
-        load_weights(policy, weights_file(self.folder, which), self.device)
+        return self._loaded(make_learner(env).policy, env, which)  # type: ignore[misc]
+
+    def _loaded(
+        self, policy: TensorDictModuleBase, env: EnvBase, which: str
+    ) -> TensorDictModuleBase:
+        """Return a policy with the weights of a file, or the guide for which that file stands.
+
+        Args:
+            policy: of the learner.
+            env: with the transforms of the run.
+            which: "handed_over", "last" or "best".
+
+        Raises:
+            UserError: if the file is missing, damaged, or does not fit the policy.
+        """
+        path = weights_file(self.folder, self.file_of(which))
+        guide = checkpoint.load(path, self.device).get(GUIDE)
+        if guide is not None:
+            return GuideActs(env, int(guide))
+        load_weights(policy, path, self.device)
         return policy
 
-    def in_env(self, env: EnvBase, which: str = "last") -> tuple[EnvBase, TensorDictModuleBase]:
+    def _trial_with_reason(self) -> Trial:
+        """Return the trial with a note on which policy was handed over, and why."""
+        reason = handed_over(self.folder) if self.chosen == "best" else None
+        if reason is None:
+            return self.trial
+        return replace(self.trial, notes=[*self.trial.notes, reason])
+
+    def in_env(
+        self, env: EnvBase, which: str = HANDED_OVER
+    ) -> tuple[EnvBase, TensorDictModuleBase]:
         """Return any env with the guides and transforms of the run, and the policy of the run.
 
         The own env and tracks of the run are not built. Arguments and errors are those of

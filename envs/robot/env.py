@@ -60,7 +60,8 @@ class SimulatedRobotEnv(SeededEnv):
             driven from the finish at full speed. None for the starts of the tracks.
         assignment: "random" draws a place at each reset; with `starts` it also draws at the first
             reset how much of `time_limit` is over, so that the episodes do not end together.
-            "cyclic" keeps robot i on place i mod places.
+            "drawn" draws a place at each reset, and leaves each episode the whole limit. "cyclic"
+            keeps robot i on place i mod places.
         perception: from scans to cones; None for `Perception` with the shipped classifier.
         lidar: the sensor, with one control step per scan; None for an RPLIDAR A1M8.
         spline: of the boundary estimate, "cubic" (smoothing) or "quadratic" (least-squares
@@ -91,7 +92,7 @@ class SimulatedRobotEnv(SeededEnv):
         num_envs: int = 1,
         *,
         starts: int | None = None,
-        assignment: Literal["random", "cyclic"] = "random",
+        assignment: Literal["random", "drawn", "cyclic"] = "random",
         perception: Perception | None = None,
         lidar: SimulatedLidar | None = None,
         spline: Literal["cubic", "quadratic"] = "cubic",
@@ -108,7 +109,7 @@ class SimulatedRobotEnv(SeededEnv):
         check_range(1, LARGEST_STARTS, starts=starts or 1)
         check_range(0, LARGEST_COUNT, above=True, laps=laps, time_limit=time_limit)
         check_range(0, 90, above=True, max_steering=max_steering)
-        check_choice(("random", "cyclic"), assignment=assignment)
+        check_choice(("random", "drawn", "cyclic"), assignment=assignment)
         if tracks is not None and not tracks:
             raise ValueError("tracks is empty; give at least one, or None for robot_track()")
         check_weights("reward", reward or {}, RewardWeights._fields)
@@ -156,9 +157,9 @@ class SimulatedRobotEnv(SeededEnv):
         steps = torch.zeros(self.batch_size, dtype=torch.int64)
         # All robots draw and measure, reset or not: the order of random numbers must not depend on
         # the data.
-        if self.assignment == "random":
+        if self.assignment != "cyclic":
             drawn = torch.randint(len(self.start_track), self.batch_size, generator=self.generator)
-            if mask is None and self.staggered:
+            if mask is None and self.staggered and self.assignment == "random":
                 steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
             self.place = drawn if mask is None else torch.where(mask.view(-1), drawn, self.place)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)

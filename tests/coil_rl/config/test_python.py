@@ -37,7 +37,7 @@ def test_nine_lines_of_the_docs(tmp_path):
     from thermostat.control import PI
 
     observation = np.array([-6.0, 3.0], np.float32)
-    small = ["learner.anchor.looks=1", "learner.anchor.cases=2", *SHORT]
+    small = ["learner.anchor.share=0", *SHORT]
 
     run = coil_rl.train(
         ENV,
@@ -60,7 +60,9 @@ def test_nine_lines_of_the_docs(tmp_path):
     assert action.shape == (1,)
     assert 0 <= action[0] <= 1
     metrics = rows(tmp_path / "outputs" / "room" / "metrics.csv")
-    assert [int(float(row["frames"])) for row in metrics] == [0, 32, 64, 96]
+    assert [int(float(row["frames/rollout"])) for row in metrics] == [0, 32, 64]
+    parts = [float(metrics[-1][f"frames/{part}"]) for part in ("before", "rollout", "tests")]
+    assert float(metrics[-1]["frames"]) == sum(parts), "the tests are frames too"
     # A run that was made in Python is a run for every program.
     trusting = "trust=[thermostat]"
     called("evaluate", "run=outputs/room", "evaluation.cases=2", trusting, "hydra.run.dir=again")

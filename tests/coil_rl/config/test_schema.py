@@ -27,33 +27,17 @@ def test_label_is_the_method_and_an_unusual_learner(overrides, label):
     assert composed(*overrides.split(), "run_dir=unused").label == label
 
 
-@pytest.mark.parametrize(
-    ("overrides", "values"),
-    [
-        ("preset=default", (3e-3, 224, 0.15)),
-        ("preset=paper", (1e-3, None, 0.3)),
-        ("preset=authors", (1e-3, None, 0.1)),
-        ("env=lunar_lander", (1e-3, None, 0.3)),
-        (
-            "env=lunar_lander training.learning_rate=0.1 learner.anchor.margin=0.2",
-            (0.1, None, 0.2),
-        ),
-    ],
-)
-def test_learning_rate_and_looks_of_anchored_coil_are_those_of_the_world(overrides, values):
-    learner = composed("method=coil_anchored", *overrides.split(), "run_dir=unused").learner
-    assert (learner.learning_rate.start, learner.anchor.cases, learner.anchor.margin) == values
-
-
-def test_learning_rate_of_anchored_coil_is_not_that_of_coil():
-    assert composed("method=coil", "run_dir=unused").learner.learning_rate.start == 1e-3
+@pytest.mark.parametrize("method", ["ppo", "coil", "coil_anchored"])
+def test_learning_rate_is_the_same_for_all_methods(method):
+    learner = composed(f"method={method}", "run_dir=unused").learner
+    assert learner.learning_rate.start == 1e-3
 
 
 @pytest.mark.parametrize(
     ("overrides", "correlation"),
     [
         ("method=coil", 0.7),
-        ("method=coil_anchored", 0.0),
+        ("method=coil_anchored", 0.7),
         ("method=coil preset=paper", 0.0),
         ("method=coil preset=authors", 0.0),
         ("method=coil_anchored preset=authors", 0.0),

@@ -124,7 +124,6 @@ def test_extensions_act_one_after_the_other():
     both = Extensions([Counting(), KickstartLoss(3.0)])
     assert both.weights({"loss": 1.0}, 0.5) == {"loss": 0.5, "loss_noise": 0.5, "loss_guide": 3.0}
     assert both.keys == ["guide_action"]
-    assert both.callbacks(None, None) == []
 
 
 def test_rewards_of_agents_are_summed():

@@ -56,7 +56,7 @@ def test_listen_prints_the_table_and_writes_maps_and_numbers(runs, tmp_path):
 def test_page_of_an_anchored_agent_gives_the_weights_of_its_guides(runs, tmp_path):
     listen(tmp_path, f"run={runs / 'anchored'}", *FEW, "hydra.run.dir=out")
     assert (
-        "Weight of the anchor: spline 1.00, random 0.00."
+        "Weight with which the policy holds each guide: spline 1.00, random 0.00."
         in (tmp_path / "out" / "listening.md").read_text()
     )
     everywhere = {

@@ -60,7 +60,7 @@ REPLAY = [
     "learner.critics=3",
 ]
 SMALL |= {
-    "coil_anchored": [*PPO, "learner.anchor.cases=4"],
+    "coil_anchored": [*PPO, "learner.anchor.share=0"],
     "cheq": REPLAY,
     "policy_decorator": REPLAY,
     "q_filter": REPLAY,

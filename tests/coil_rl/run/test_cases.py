@@ -1,17 +1,16 @@
-"""The brake of an anchored policy, on a pendulum that its guide swings up."""
+"""Comparisons of policies in new cases of a training: a pendulum that its guide swings up."""
 
 import pytest
 import torch
 from hydra import compose, initialize_config_module
-from torchrl.envs import EnvBase
 
 from coil_rl.config.build import assemble, build_learner, env_maker
-from coil_rl.errors import UserError
-from coil_rl.measures import Measure
-from coil_rl.run.cases import SelectionCases
+from coil_rl.learners.anchor import hold_of
+from coil_rl.run.cases import TrainingCases, guide_calls
+from coil_rl.run.delivery import GuideActs
+from coil_rl.run.parts import TESTS, TRAIN
 
 pytest.importorskip("gymnasium.envs.classic_control")
-FAST = Measure("reward", "min", at_most=-10.0)  # true for an episode that was ever far from upright
 
 
 def configured(*overrides):
@@ -24,120 +23,104 @@ def configured(*overrides):
     return config, build_learner(config, env_maker(config)())
 
 
-def built(*overrides, failure=None):
-    """Return the anchor of a learner, its brake, and the cases in which the brake evaluates it."""
-    config, learner = configured("env=pendulum", *overrides)
-
-    def build(policies: int, count: int) -> EnvBase:
-        return env_maker(config)(policies * count, "selection", count=count)
-
-    (brake,) = learner.callbacks(SelectionCases(learner.policy, build, 5, failure))
-    return brake.anchored, brake, brake.cases
+def built(*overrides, frames=100_000, seed=0):
+    """Return cases of a training, and its learner."""
+    config, learner = configured(*overrides)
+    make_env = env_maker(config)
+    return TrainingCases(lambda rows: make_env(rows, TESTS), frames, seed), learner
 
 
-@pytest.mark.parametrize(
-    ("overrides", "cases"),
-    [
-        ("env=pendulum", 24),
-        ("env=cone_track preset=paper", 96),
-        ("env=cone_track", 224),
-        ("learner.anchor.cases=7", 7),
-    ],
-)
-def test_check_up_has_more_cases_where_failures_are_counted(overrides, cases):
-    config, learner = configured(*overrides.split())
-    (brake,) = learner.callbacks(assemble(config).selection(learner))
-    assert brake.cases.count == cases
-    assert brake.cases.build(2, cases).batch_size == (2 * cases,)
+def test_all_policies_act_in_the_same_cases_and_each_comparison_has_others():
+    cases, learner = built("env=pendulum")
+    cases.renew(3)
+    first = cases.returns(learner.policy)
+    assert torch.equal(cases.returns(learner.policy), first)
+    cases.renew(3)
+    assert not torch.isin(cases.returns(learner.policy), first).any()
+
+
+def test_cases_depend_on_the_seed_and_go_on_from_a_saved_state():
+    one, learner = built("env=pendulum")
+    other, _ = built("env=pendulum", seed=1)
+    again, _ = built("env=pendulum")
+    returns = []
+    for cases in (one, other):
+        cases.renew(2)
+        returns.append(cases.returns(learner.policy))
+    assert not torch.equal(*returns)
+    again.load_state_dict(one.state_dict())
+    for cases in (one, again):
+        cases.begin()
+        cases.renew(2)
+    assert torch.equal(one.returns(learner.policy), again.returns(learner.policy))
+    assert (again.steps, again.calls) == (one.steps, one.calls)
+
+
+def test_steps_and_calls_of_guides_are_counted():
+    cases, learner = built("env=pendulum")
+    cases.renew(3)
+    cases.returns(learner.policy)
+    assert cases.steps == 3 * 200
+    assert cases.calls == 3 * 201, "also in the first states"
+    env = cases.env
+    assert guide_calls(env) == cases.calls
+
+
+def test_comparison_leaves_policy_and_random_numbers_alone():
+    cases, learner = built("env=pendulum")
+    before, state = torch.get_rng_state(), learner.policy.state_dict()
+    copies = {name: value.clone() for name, value in state.items()}
+    cases.renew(2)
+    sampled = cases.returns(learner.policy, sampled=True)
+    assert torch.equal(torch.get_rng_state(), before)
+    assert all(torch.equal(value, copies[name]) for name, value in state.items())
+    assert torch.equal(cases.returns(learner.policy, sampled=True), sampled)
+    assert not torch.equal(cases.returns(learner.policy), sampled)
+
+
+def test_no_case_without_renew():
+    cases, learner = built("env=pendulum")
+    with pytest.raises(RuntimeError, match="call renew"):
+        cases.returns(learner.policy)
 
 
 @pytest.mark.parametrize("action", ["continuous", "choices"])
-def test_first_policy_is_within_two_percent_of_the_guide(action):
-    anchor, brake, cases = built(f"action={action}")
-    first = brake.after_update(0)["look/return"]
-    env = cases.build(1, cases.count)
-    returns = cases._totals(env, lambda data: data.set("action", guided(data, action)))["return"]
-    assert anchor.weight == 1
-    assert first == pytest.approx(float(returns.mean()), rel=0.02)
-    assert float(anchor.best_returns.mean()) == pytest.approx(first)
+def test_first_policy_has_the_returns_of_its_guide(action):
+    cases, learner = built("env=pendulum", f"action={action}")
+    cases.renew(4)
+    guide = cases.returns(GuideActs(cases.env))
+    assert torch.equal(cases.returns(learner.policy), guide)
 
 
-def guided(data, action):
-    advice = data["guide_action"][..., 0, :]
-    return advice.argmax(-1) if action == "choices" else advice
+def start_test(*overrides):
+    """Return the weight after the start test of a run."""
+    cases, learner = built(*overrides)
+    (test,) = learner.callbacks(cases)
+    numbers = test.after_update(0)
+    return hold_of(learner.policy).weight.tolist(), numbers, cases
 
 
-def test_opposite_of_a_reversed_guide_is_as_good_as_the_guide():
-    anchor, brake, _ = built("degrade=adversarial")
-    brake.after_update(0)
-    good, brake_of_good, _ = built()
-    brake_of_good.after_update(0)
-    assert anchor.head.weight.tolist() == [-1]
-    assert torch.allclose(anchor.best_returns, good.best_returns)
+def test_start_test_holds_a_guide_that_swings_up_and_the_opposite_of_a_reversed_one():
+    good, numbers, cases = start_test("env=pendulum")
+    assert good == [pytest.approx(numbers["start/weight"])]
+    assert good[0] > 0
+    assert cases.steps <= 0.05 * cases.frames
+    assert start_test("env=pendulum", "degrade=adversarial")[0][0] < 0
 
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
-def test_guide_that_is_of_no_use_does_not_hold(degrade):
-    anchor, brake, _ = built(f"degrade={degrade}")
-    brake.after_update(0)
-    assert anchor.weight == 0
-    assert not any(brake.due(update, 20, {}) for update in range(1, 20))
+def test_start_test_holds_no_useless_guide(degrade):
+    assert start_test("env=pendulum", f"degrade={degrade}")[0] == [0]
 
 
-def state_of(policy):
-    return {name: value.clone() for name, value in policy.state_dict().items()}
-
-
-def test_check_up_leaves_policy_and_random_numbers_alone_and_can_be_repeated():
-    _, brake, _ = built("learner.anchor.step=0", "learner.anchor.margin=0", failure=FAST)
-    brake.after_update(0)
-    before, random_state = state_of(brake.policy), torch.get_rng_state()
-    first, second = brake.after_update(1), brake.after_update(2)
-    assert first == second
-    assert first["look/return"] == first["look/lower_return"]
-    assert first["look/failures"] == 5, "every episode begins far from upright"
-    assert first["look/back"] == 0
-    assert torch.equal(torch.get_rng_state(), random_state)
-    after = brake.policy.state_dict()
-    assert all(torch.equal(value, before[name]) for name, value in after.items())
-
-
-def test_weight_falls_where_the_network_does_what_the_guide_did_and_a_bad_policy_goes_back():
-    anchor, brake, _ = built()
-    brake.after_update(0)
-    brake.after_update(1)
-    assert anchor.weight in (1.0, pytest.approx(0.95))
-    first = {name: value.clone() for name, value in anchor.best_state.items()}
-    for value in brake.policy.parameters():
-        value.data += 1
-    anchor.best_returns += 1000
-    assert brake.after_update(2)["look/back"] == 1
-    after = brake.policy.state_dict()
-    assert all(torch.equal(value, first[name]) for name, value in after.items())
-
-
-def test_random_actions_are_those_of_seed_0_whatever_the_random_numbers_of_the_run():
-    _, _, cases = built()
-    env = cases.build(1, cases.count)
-    torch.manual_seed(0)
-    expected = cases._totals(env, env.rand_action)["return"]
-    for seed in (1, 2):
-        torch.manual_seed(seed)
-        assert torch.equal(cases.evaluate_random(), expected)
-
-
-def test_weight_of_the_guide_is_the_only_difference_between_the_candidates():
-    anchor, brake, cases = built()
-    anchor.set_weight(0.5)
-    results = brake._evaluate([torch.tensor([0.5]), torch.tensor([0.0])])
-    present = cases.evaluate([brake.policy.state_dict()])
-    assert torch.equal(results.returns[0], present.returns[0])
-    assert not torch.equal(results.returns[1], present.returns[0])
-
-
-def test_run_without_cases_is_told_what_an_anchor_needs():
-    config, learner = configured("env=pendulum")
-    config.evaluation.curve.cases = {}
-    (brake,) = learner.callbacks(assemble(config).selection(learner))
-    with pytest.raises(UserError, match=r"learner.anchor needs evaluation.curve.cases.selection"):
-        brake.after_update(0)
+def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
+    config, _ = configured("env=cone_track", "training.tests.time_limit=2.0")
+    make_env = env_maker(config)
+    cases = TrainingCases(lambda rows: make_env(rows, TESTS), 10_000)
+    cases.renew(8)
+    cases.returns(GuideActs(cases.env))
+    env = cases.env.base_env
+    assert cases.steps == 8 * 24, "none of the first episodes begins with a part of its limit over"
+    assert len(env.start_track) == 2000
+    assert make_env(2, TRAIN).base_env.assignment == "random"
+    assert assemble(config).delivery == "tested"

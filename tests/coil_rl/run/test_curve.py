@@ -31,15 +31,16 @@ def world(tracks, drivers=1, *transforms):
 def curve(folder, tracks, policy, stages=(1,), **options):
     envs = dict.fromkeys(("evaluation", "selection"), lambda policies: world(tracks, policies))
     line = EvaluationCurve(folder, policy, envs, watch=WATCH, **options)
-    line.attach(Metrics(folder / "metrics.csv"), stages, frames=100)
+    line.attach(Metrics(folder / "metrics.csv"), stages, frames=100, before=28)
     return line
 
 
 def test_driver_that_never_changes_gives_a_flat_line(tmp_path, rings):
     line = curve(tmp_path, rings, PPO(world(rings)).policy)
-    for frames in (0, 100, 200):
-        line.keep(frames)
-    rows = line.evaluate([0, 100, 200])
+    for update in (0, 1, 2):
+        line.keep(update)
+    assert (tmp_path / "policies" / "000000000228.pt").exists(), "28 frames before the first update"
+    rows = line.evaluate([0, 1, 2])
     assert list(rows[0]) == line.columns
     assert rows[0] == rows[1] == rows[2]
     assert rows[0]["evaluation/return"] == rows[0]["selection/return"]
@@ -49,12 +50,12 @@ def test_numbers_are_those_of_each_policy_driven_alone(tmp_path, rings):
     policy = PPO(world(rings)).policy
     line = curve(tmp_path, rings, policy)
     expected = []
-    for frames in (0, 100):
-        policy.load_state_dict(perturbed(policy, seed=frames))
-        line.keep(frames)
+    for update in (0, 1):
+        policy.load_state_dict(perturbed(policy, seed=update))
+        line.keep(update)
         expected.append(evaluate_policy(world(rings), policy, measures=driving_measures()).episodes)
     assert expected[0] != expected[1]
-    for row, episodes in zip(line.evaluate([0, 100]), expected, strict=True):
+    for row, episodes in zip(line.evaluate([0, 1]), expected, strict=True):
         for name, key in {
             "return": "reward",
             "crashed": "crashed",
@@ -103,7 +104,7 @@ def test_run_that_was_made_longer_keeps_policies_as_before_and_evenly_until_its_
 def test_missing_policy_is_named(tmp_path, rings):
     line = curve(tmp_path, rings, PPO(world(rings)).policy)
     with pytest.raises(UserError, match=r"there is no file .*policies/000000000128\.pt"):
-        line.evaluate([128])
+        line.evaluate([1])
 
 
 def test_guide_measured_from_its_cases_does_not_crash(rings):

@@ -1,0 +1,178 @@
+"""The promise of anchored COIL, arm by arm: at least the better of its guide and of plain PPO.
+
+`coil-train +experiment=promise` trains the runs, and this program makes the table of them:
+
+    python -m benchmarks.promise outputs/experiments/promise
+
+A task has a folder with the runs of its arms. The arm `alone` is plain PPO; in the others anchored
+COIL has an intact, detuned, reversed or random guide. The unit is the seed. An arm is compared with
+the better of its guide, as it acts alone in the cases of the table, and of PPO, seed by seed. It is
+a loss if the 95 % interval of the mean difference is below 0 and the mean below -1 % of the scale,
+a gain if both are above, and else even. The scale of a task is the distance from the return of its
+random guide to the better of PPO and its intact guide.
+"""
+
+import argparse
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from coil_rl.files import write_text
+from coil_rl.report import markdown_table, write_csv
+from coil_rl.report.curves import points
+from coil_rl.report.runs import GUIDE, RETURN, Run, read_runs
+from coil_rl.report.statistics import mean_interval
+
+ALONE, INTACT, RANDOM = "alone", "intact", "random"
+MATERIAL = 0.01  # of the scale of a task
+COLUMNS = {
+    "task": ("task", ""),
+    "arm": ("arm", ""),
+    "seeds": ("seeds", "d"),
+    "guide": ("guide", ".1f"),
+    "ppo": ("ppo", ".1f"),
+    "end": ("anchored", ".1f"),
+    "difference": ("difference (%)", "+.1f"),
+    "low": ("low", "+.1f"),
+    "high": ("high", "+.1f"),
+    "verdict": ("verdict", ""),
+    "lowest": ("lowest kept - guide (%)", "+.1f"),
+    "tests": ("tests (% of frames)", ".1f"),
+    "held": ("weight: seeds", ""),
+    "handed_over": ("handed over: seeds", ""),
+    "time": ("seconds / PPO", ".2f"),
+}
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The runs of one arm of a task, by their seeds.
+
+    Args:
+        runs: finished runs by seed.
+    """
+
+    runs: dict[int, Run]
+
+    def reward(self, seed: int) -> float:
+        """Return the mean reward of the policy that a run handed over."""
+        return _reward(self.runs[seed], self.runs[seed].label)
+
+    @property
+    def guide(self) -> float:
+        """Mean reward of the guide alone, which is the same for all seeds; NaN without one."""
+        return float(np.mean([_reward(run, GUIDE) for run in self.runs.values()]))
+
+
+def _reward(run: Run, driver: str) -> float:
+    """Return a mean reward with deterministic actions; NaN if there is no such policy."""
+    table = run.evaluation
+    plain = (table["advice"] == "") & (table["actions"] == "deterministic")
+    return float(table[plain & (table["driver"] == driver)]["reward"].mean())
+
+
+def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
+    """Return a row of the table for each arm of a task, and each arm but `alone`.
+
+    Args:
+        name: of the task.
+        runs: its finished runs; their labels are the arms.
+    """
+    arms: dict[str, Arm] = {}
+    for run in runs:
+        arms.setdefault(run.label, Arm({})).runs[run.seed] = run
+    if ALONE not in arms:
+        return []
+    alone = arms.pop(ALONE)
+    return [_row(name, label, arm, alone, _scale(arms, alone)) for label, arm in arms.items()]
+
+
+def _scale(arms: dict[str, Arm], alone: Arm) -> float:
+    """Return the scale of a task; NaN without its random guide."""
+    best = float(np.mean([alone.reward(seed) for seed in alone.runs]))
+    if INTACT in arms:
+        best = max(best, arms[INTACT].guide)
+    return abs(best - arms[RANDOM].guide) if RANDOM in arms else math.nan
+
+
+def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
+    """Return the row of an arm."""
+    seeds = sorted(set(arm.runs) & set(alone.runs))
+    ends = np.array([arm.reward(seed) for seed in seeds])
+    of_ppo = np.array([alone.reward(seed) for seed in seeds])
+    guide = arm.guide
+    better = of_ppo
+    if guide > of_ppo.mean():
+        better = np.full(len(seeds), guide)
+    mean, low, high = (100 * float(each) / scale for each in mean_interval(ends - better))
+    rows = [arm.runs[seed].curve for seed in seeds]
+    seconds = [(arm.runs[seed].seconds, alone.runs[seed].seconds) for seed in seeds]
+    return {
+        "task": name,
+        "arm": label,
+        "seeds": len(seeds),
+        "guide": guide,
+        "ppo": float(of_ppo.mean()),
+        "end": float(ends.mean()),
+        "difference": mean,
+        "low": low,
+        "high": high,
+        "verdict": verdict(mean, low, high),
+        "lowest": 100 * min(_lowest(arm.runs[seed]) for seed in seeds) / scale,
+        "tests": 100 * max(each[-1]["frames/tests"] / each[-1]["frames"] for each in rows),
+        "held": _counted(f"{each[0].get('start/weight', math.nan):g}" for each in rows),
+        "handed_over": _counted(arm.runs[seed].handed_over for seed in seeds),
+        "time": float(np.median([a / b for a, b in seconds if a and b] or [math.nan])),
+    }
+
+
+def verdict(mean: float, low: float, high: float) -> str:
+    """Return "gain", "even" or "loss" for a mean difference and its interval, in % of the scale."""
+    if high < 0 and mean < -100 * MATERIAL:
+        return "loss"
+    if low > 0 and mean > 100 * MATERIAL:
+        return "gain"
+    return "even"
+
+
+def _lowest(run: Run) -> float:
+    """Return the lowest return of a kept policy minus that of the guide, in the curve's cases.
+
+    NaN if no guide was held.
+    """
+    if not run.curve[0].get("start/weight", 0):
+        return math.nan
+    return float(points(run.curve, RETURN)[:, 1].min()) - max(run.guide_returns.values())
+
+
+def _counted(values: object) -> str:
+    """Return values with the number of times that each occurs."""
+    counts = Counter(values)  # type: ignore[call-overload]
+    return ", ".join(f"{value}: {count}" for value, count in counts.most_common())
+
+
+def main() -> None:
+    """Print the table and write it into the folder."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, help="of coil-train +experiment=promise")
+    folder = parser.parse_args().folder
+    rows: list[dict[str, object]] = []
+    for task in sorted(path for path in folder.iterdir() if path.is_dir()):
+        rows += rows_of_task(task.name, [run for run in read_runs([task]) if run.finished])
+    counts = Counter(row["verdict"] for row in rows)
+    losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
+    sentence = f"{counts['gain']} gains, {counts['even']} even, {counts['loss']} losses"
+    if losses:
+        sentence += f": {', '.join(losses)}"
+    page = f"{markdown_table(rows, COLUMNS)}\n\n{sentence}."
+    write_text(folder / "promise.md", page)
+    write_csv(rows, folder / "promise.csv")
+    print(page)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,224 @@
+"""What a run hands over: its last policy, an earlier one, or its guide, by a test that is counted.
+
+The last policy of a training need not be its best one, and may be worse than its guide. With
+`delivery=tested` a part of the frames is kept for a test at the end: the last policy, the kept one
+that had the highest return in training, and each guide act in the same new cases, and the one with
+the highest mean return is handed over. A policy that holds a guide is compared with its own first
+policy instead. None of these cases is in the evaluation curve or in the table.
+"""
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coil_rl.errors import file_of_a_run
+from coil_rl.files import LARGEST_NUMBERS, read_file, write_text
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.learners.anchor import hold_of
+from coil_rl.learners.learner import Learner
+from coil_rl.report.runs import DELIVERY
+from coil_rl.run import checkpoint
+from coil_rl.run.cases import TrainingCases
+from coil_rl.run.curve import EvaluationCurve
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
+
+GUIDE = "guide"  # entry of a file of weights that stands for a guide: its number
+SHARE = 0.05  # of the frames of a run that the test may take; its first cases may take more
+FIRST_CASES, MOST_CASES = 2, 32
+RETURN_IN_TRAINING = "train/return"
+
+
+class GuideActs(TensorDictModuleBase):
+    """Policy in the env of a method that makes the env execute what a guide advises.
+
+    Args:
+        env: of the method.
+        guide: number of the guide.
+    """
+
+    def __init__(self, env: EnvBase, guide: int = 0) -> None:
+        advised = FollowAdvice(env, guide, out_key=env.action_key)
+        self.in_keys: list[NestedKey] = list(advised.in_keys)
+        self.out_keys: list[NestedKey] = [env.action_key]
+        super().__init__()
+        self.advised = advised
+        # Where the agent's action is added to the guide's, its neutral action leaves the guide.
+        residual = (ResidualAction, GradualResidual)
+        adds = any(isinstance(part, residual) for part in env.modules())
+        self.neutral = advised.action_space.neutral() if adds else None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        tensordict = self.advised(tensordict)
+        if self.neutral is None:
+            return tensordict
+        (key,) = self.out_keys
+        return tensordict.set(key, self.neutral.expand_as(tensordict[key]))
+
+
+@dataclass(eq=False)
+class Delivery:
+    """The test at the end of a training, a `Callback`.
+
+    It writes `policy_best.pt`, the policy that is handed over, and `delivery.json`, which says
+    which it is and why. Ties go to the last policy.
+
+    Args:
+        learner: has the policy.
+        env: of the training.
+        cases: in which policies are compared.
+        curve: has kept policies; None: none are kept.
+        folder: of the run.
+    """
+
+    learner: Learner
+    env: EnvBase
+    cases: TrainingCases
+    curve: EvaluationCurve | None
+    folder: Path
+
+    names: Sequence[str] = ("delivery/last", "delivery/earlier", "delivery/guide", "delivery/cases")
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether the training is over."""
+        return update == updates > 0
+
+    @property
+    def reserve(self) -> int:
+        """Frames that are kept for the test."""
+        return math.ceil(SHARE * self.cases.frames)
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Test, hand over, and return the mean returns by name."""
+        last = {name: value.clone() for name, value in self.learner.policy.state_dict().items()}
+        candidates: dict[str, Any] = {"last": last} | self._guides()
+        earlier = self._earlier(update)
+        if earlier is not None:
+            candidates["earlier"] = checkpoint.load(earlier)
+        returns = self._tested(candidates, last)
+        means = {name: float(values.mean()) for name, values in returns.items()}
+        chosen = max(means, key=lambda name: means[name])
+        self._write(chosen, candidates[chosen], returns, earlier)
+        guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
+        numbers = (
+            means["last"],
+            means.get("earlier", math.nan),
+            max(guides, default=math.nan),
+            float(len(returns["last"])),
+        )
+        return dict(zip(self.names, numbers, strict=True))
+
+    def _earlier(self, update: int) -> Path | None:
+        """Return the file of the kept policy with the highest return in training, if it is known.
+
+        The first one is left out, as no episode was finished with it.
+        """
+        if self.curve is None:
+            return None
+        rows = self.curve.metrics.rows
+        returns = {
+            each: rows[each][RETURN_IN_TRAINING] for each in self.curve.kept() if 0 < each < update
+        }
+        known = {each: value for each, value in returns.items() if not math.isnan(value)}
+        if not known:
+            return None
+        return self.curve.file(max(known, key=lambda each: known[each]))
+
+    def _guides(self) -> dict[str, Any]:
+        """Return what stands for the guides: the first policy if it holds one, else their numbers.
+
+        The advice of a run without guides in its env does not exist, so there is nothing then.
+        """
+        hold = hold_of(self.learner.policy)
+        if hold is not None and bool(hold.held) and self.curve is not None:
+            return {"first": checkpoint.load(self.curve.file(0))}
+        found = [part for part in self.env.modules() if isinstance(part, GuideActions)]
+        names = found[0].names if found else []
+        titles = ["guide"] if len(names) == 1 else [f"guide {name}" for name in names]
+        return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}
+
+    def _tested(self, candidates: Mapping[str, Any], last: dict[str, Any]) -> dict[str, Tensor]:
+        """Return the returns of the candidates in the same new cases, [C] each.
+
+        An earlier policy is left out where the frames do not allow for it.
+        """
+        tested, returns = dict(candidates), dict[str, Tensor]()
+        self.cases.begin()
+        begun, count = self.cases.steps, FIRST_CASES
+        while count > 0:
+            self.cases.renew(count)
+            for name, state in candidates.items():
+                with_one_more = (self.cases.steps - begun) * (1 + 1 / max(len(returns), 1))
+                if name == "earlier" and name not in returns and with_one_more > self.reserve:
+                    tested.pop(name, None)
+                if name in tested:
+                    policy = policy_of(state, self.learner, self.env)
+                    known = returns.get(name, torch.empty(0))
+                    returns[name] = torch.cat([known, self.cases.returns(policy)])
+            done, taken = len(returns["last"]), self.cases.steps - begun
+            affordable = int(self.reserve * done / taken)  # as long as those so far
+            count = min(affordable, MOST_CASES) - done
+        self.learner.policy.load_state_dict(last)
+        return returns
+
+    def _write(
+        self, chosen: str, state: Any, returns: Mapping[str, Tensor], earlier: Path | None
+    ) -> None:
+        """Write what is handed over, and why."""
+        checkpoint.save(state, self.folder / "policy_best.pt")
+        report = {
+            "policy": chosen,
+            "cases": len(returns["last"]),
+            "steps": self.cases.steps,
+            "returns": {name: float(values.mean()) for name, values in returns.items()},
+            "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
+        }
+        write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
+
+
+def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDictModuleBase:
+    """Return the policy that a file of weights stands for: a guide, or the learner's with them.
+
+    Args:
+        state: of the file.
+        learner: has the policy, which gets the weights.
+        env: with the transforms of the run.
+    """
+    if GUIDE in state:
+        return GuideActs(env, int(state[GUIDE]))
+    learner.policy.load_state_dict(state)
+    return learner.policy
+
+
+def handed_over(folder: Path) -> str | None:
+    """Return the sentence that says what a run handed over and why; None without a test.
+
+    Raises:
+        UserError: if the file is damaged.
+    """
+    file = folder / DELIVERY
+    if not file.exists():
+        return None
+    with file_of_a_run(file, "remove it, and the sentence is left out"):
+        report = json.loads(read_file(file, LARGEST_NUMBERS))
+        returns = {str(name): float(value) for name, value in report["returns"].items()}
+        chosen, cases, frames = str(report["policy"]), int(report["cases"]), report["frames"]
+    names = {"last": "the last policy", "earlier": "an earlier policy", "first": "the first policy"}
+    if frames is not None:
+        names["earlier"] = f"the policy after {int(frames):,} frames"
+    listed = ", ".join(f"{names.get(name, name)} {value:.1f}" for name, value in returns.items())
+    title = names.get(chosen, f"the {chosen}")
+    return (
+        f"Handed over is {title}: mean returns in {cases} new cases of the training, whose steps "
+        f"are among its frames: {listed}."
+    )

@@ -1,0 +1,91 @@
+"""The table of the promise: its verdicts, and a run of one arm."""
+
+import json
+
+import pytest
+from programs import called
+
+from benchmarks import promise
+from coil_rl.report.runs import read_runs
+
+pytest.importorskip("gymnasium.envs.classic_control")
+SMALL = [
+    "env.max_steps=30",
+    "budget.frames=600",
+    "budget.num_envs=2",
+    "budget.steps=50",
+    "evaluation.cases=2",
+    "evaluation.curve.num_envs=2",
+    "evaluation.curve.points=1",
+]
+
+
+@pytest.mark.parametrize(
+    ("mean", "low", "high", "expected"),
+    [
+        (-5, -8, -2, "loss"),
+        (-0.9, -1.5, -0.1, "even"),
+        (-5, -12, 2, "even"),
+        (5, 2, 8, "gain"),
+        (0.5, 0.1, 0.9, "even"),
+    ],
+    ids=["clear loss", "not material", "undecided", "clear gain", "gain that is not material"],
+)
+def test_verdict_needs_an_interval_and_a_material_mean(mean, low, high, expected):
+    assert promise.verdict(mean, low, high) == expected
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two seeds of three arms of one task."""
+    path = tmp_path_factory.mktemp("promise")
+    called(
+        "train",
+        "-m",
+        "+experiment=promise",
+        "+task=pendulum",
+        "+arm=alone,intact,random",
+        "seed=0,1",
+        *SMALL,
+        f"hydra.sweep.dir={path}",
+        cwd=path,
+    )
+    return path
+
+
+def test_experiment_trains_the_arms_of_a_task_in_its_folder(folder):
+    labels = [(run.label, run.seed) for run in read_runs([folder / "pendulum"])]
+    assert sorted(labels) == sorted(
+        (arm, seed) for arm in ("alone", "intact", "random") for seed in (0, 1)
+    )
+
+
+def test_table_compares_each_arm_with_the_better_of_guide_and_ppo(folder):
+    runs = read_runs([folder / "pendulum"])
+    intact, random = promise.rows_of_task("pendulum", runs)
+    assert [intact["arm"], random["arm"]] == ["intact", "random"]
+    assert intact["ppo"] == random["ppo"]
+    assert intact["guide"] > intact["ppo"], "so the guide is what it is compared with"
+    scale = intact["guide"] - random["guide"]
+    expected = 100 * (intact["end"] - intact["guide"]) / scale
+    assert intact["difference"] == pytest.approx(expected)
+    shares = [
+        row["frames/tests"] / row["frames"]
+        for row in (run.curve[-1] for run in runs if run.label == "intact")
+    ]
+    assert intact["tests"] == pytest.approx(100 * max(shares))
+    chosen = [
+        json.loads((run.folder / "delivery.json").read_text())["policy"]
+        for run in runs
+        if run.label == "intact"
+    ]
+    assert all(policy in intact["handed_over"] for policy in chosen)
+
+
+def test_program_writes_the_table(folder, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["promise", str(folder)])
+    promise.main()
+    page = (folder / "promise.md").read_text()
+    assert page in capsys.readouterr().out
+    assert "gains," in page
+    assert (folder / "promise.csv").exists()

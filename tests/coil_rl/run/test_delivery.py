@@ -1,0 +1,154 @@
+"""What a run hands over: its last policy, an earlier one, or its guide."""
+
+import csv
+import json
+import math
+
+import pytest
+import torch
+from hydra import compose, initialize_config_module
+from programs import called
+
+from coil_rl import open_run
+from coil_rl.config.build import env_maker
+from coil_rl.guides.simple import FollowAdvice
+from coil_rl.report.runs import DELIVERY
+from coil_rl.run import checkpoint
+from coil_rl.run.cases import TrainingCases
+from coil_rl.run.delivery import GUIDE, GuideActs, handed_over
+from coil_rl.run.parts import TESTS
+
+pytest.importorskip("gymnasium.envs.classic_control")
+SMALL = [
+    "env=pendulum",
+    "budget.frames=6000",
+    "budget.num_envs=4",
+    "budget.steps=50",
+    "budget.minibatches=2",
+    "evaluation.cases=2",
+    "evaluation.curve.num_envs=2",
+    "evaluation.curve.points=2",
+    "evaluation.gif=false",
+    "env.max_steps=40",
+    "logger=none",
+    "delivery=tested",
+]
+
+
+def trained(folder, *overrides):
+    called("train", *SMALL, *overrides, f"hydra.run.dir={folder}", cwd=folder.parent)
+    return folder
+
+
+def rows_of(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def report(folder):
+    return json.loads((folder / DELIVERY).read_text())
+
+
+@pytest.fixture(scope="module")
+def guide_wins(tmp_path_factory):
+    """A run of COIL that learns nothing, so that its guide is better than any of its policies."""
+    folder = tmp_path_factory.mktemp("delivery") / "run"
+    return trained(folder, "method=coil", "training.learning_rate=0")
+
+
+def test_guide_is_handed_over_where_nothing_better_was_learned(guide_wins):
+    found = report(guide_wins)
+    assert found["policy"] == "guide"
+    assert found["returns"]["guide"] == max(found["returns"].values())
+    assert checkpoint.load(guide_wins / "policy_best.pt") == {GUIDE: torch.tensor(0)}
+    guide, agent = [
+        row
+        for row in rows_of(guide_wins / "evaluation.csv")
+        if row["case"] == "mean" and row["actions"] == "deterministic"
+    ]
+    assert guide["driver"] == "guide"
+    assert agent["reward"] == guide["reward"]
+    page = (guide_wins / "evaluation.md").read_text()
+    assert "Handed over is the guide: mean returns in" in page
+    listed = called("report", f"folder={guide_wins.parent}").stdout
+    assert "whose steps are among their frames: guide 1." in listed
+
+
+def test_controller_of_a_handed_over_guide_does_what_the_guide_does(guide_wins):
+    run = open_run(guide_wins)
+    controller, env = run.controller(), run.make_env(1)
+    data = env.reset()
+    expected = GuideActs(env)(data.clone())["action"]
+    torch.testing.assert_close(controller.act_on(data.clone())[0], 2 * expected[0])
+    assert not isinstance(run.controller("last").policy, GuideActs)
+
+
+def test_every_step_is_a_frame_and_the_log_has_the_parts(guide_wins):
+    rows = rows_of(guide_wins / "metrics.csv")
+    last = {name: float(value) for name, value in rows[-1].items() if name.startswith("frames")}
+    assert last["frames"] == last["frames/rollout"] + last["frames/tests"] + last["frames/before"]
+    assert last["frames/tests"] == report(guide_wins)["steps"] > 0
+    assert last["frames"] < 6000 + 200, "within the budget but for a part of a batch"
+    assert last["frames/tests"] <= 0.1 * 6000
+    assert float(rows[-1]["guide/calls"]) > last["frames"]
+
+
+def test_learned_policy_is_handed_over_where_it_is_better(tmp_path):
+    folder = trained(tmp_path / "run", "method=coil", "degrade=[random]", "guide=constant")
+    found = report(folder)
+    best = max(found["returns"], key=found["returns"].get)
+    assert found["policy"] == best
+    name = {"last": "policy_last.pt"}.get(best, f"policies/{found['frames'] or 0:012d}.pt")
+    if best != "guide":
+        assert (folder / "policy_best.pt").read_bytes() == (folder / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    "method", ["coil", "residual", "residual_coil", "mixing", "jump_start", "policy_decorator"]
+)
+def test_guide_acts_alone_also_where_actions_are_combined(method):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [f"method={method}", "env=pendulum", "run_dir=unused"])
+    make_env = env_maker(config)
+    combined = TrainingCases(lambda rows: make_env(rows, TESTS), 10_000)
+    alone = TrainingCases(lambda rows: make_env.guided(rows, TESTS)[0], 10_000)
+    for cases in (combined, alone):
+        cases.renew(2)
+    expected = alone.returns(FollowAdvice(alone.env))
+    torch.testing.assert_close(combined.returns(GuideActs(combined.env)), expected)
+
+
+def test_run_without_a_guide_in_its_env_compares_its_own_policies(tmp_path):
+    folder = trained(tmp_path / "run", "method=ppo")
+    assert set(report(folder)["returns"]) <= {"last", "earlier"}
+    assert math.isnan(float(rows_of(folder / "metrics.csv")[-1]["delivery/guide"]))
+
+
+def test_sentence_needs_a_test(tmp_path):
+    assert handed_over(tmp_path) is None
+
+
+def test_killed_run_ends_with_the_same_files(tmp_path):
+    overrides = ["method=coil_anchored", "checkpoint_every=2"]
+    whole = trained(tmp_path / "whole", *overrides)
+    stopped = trained(tmp_path / "stopped", *overrides)
+    for name in ("evaluation.csv", "evaluation.md", DELIVERY, "policy_best.pt", "policy_last.pt"):
+        (stopped / name).unlink()
+    (stopped / "checkpoint.pt").unlink()
+    called("train", f"resume={stopped}", cwd=tmp_path)
+    for name in ("metrics.csv", DELIVERY, "policy_best.pt", "evaluation.csv"):
+        assert (stopped / name).read_bytes() == (whole / name).read_bytes(), name
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["method=guide"], "delivery=tested has no effect: method=guide trains no policy"),
+        (["evaluation.policy=best"], "a training evaluates what it hands over"),
+        (["delivery=best"], "delivery='best' must be 'last' or 'tested'"),
+    ],
+)
+def test_delivery_that_means_nothing_is_refused(overrides, message, tmp_path):
+    done = called("train", "env=pendulum", "delivery=tested", *overrides, cwd=tmp_path, code=2)
+    assert message in done.stderr
+    assert not any(tmp_path.iterdir())
