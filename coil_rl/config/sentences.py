@@ -30,7 +30,9 @@ LAUNCHERS = {
 }
 
 
+OF_CONES = ("track", "preset")
 TYPED = re.compile(r"Could not override '([^']+)'")
+NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
@@ -75,6 +77,9 @@ def _not_composed(error: BaseException) -> str:
         without_package = hints.file_without_package(str(error))
         if without_package:
             return without_package
+    group = NO_GROUP.match(str(error))
+    if group is not None and group[2] in OF_CONES:
+        return _group_of_cones(group[1], group[2])
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
             return _unknown_key(key_error, TYPED.search(str(error)))
@@ -89,6 +94,23 @@ def _not_composed(error: BaseException) -> str:
     if isinstance(error.__cause__, OmegaConfBaseException):
         return f"{_first_paragraph(error)}: {_first_paragraph(error.__cause__)}"
     return _first_paragraph(error)
+
+
+def _group_of_cones(file: str | None, group: str) -> str:
+    """Return the message for a group that only the cone world has, and another env is chosen.
+
+    Args:
+        file: in whose defaults list it is overridden, without its suffix; None: the command line.
+        group: such as "track".
+    """
+    has = f"only the cone world (env=cone_track) has the group {group}"
+    if file is None:
+        return f"{group}= cannot be given for this env: {has}; leave it out"
+    return (
+        f"{file}.yaml overrides /{group}, but {has}: leave env= out, or write in the file, instead "
+        f"of that line, override /env: NAME, of an env file that does it (as "
+        "env/cone_track_unseen.yaml), so that another env replaces it"
+    )
 
 
 def _unreadable_override(error: OverrideParseException) -> str:
@@ -144,6 +166,9 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
     names = parent if isinstance(parent, DictConfig) else []
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
+    unchosen = hints.unchosen(key, typed[1] if typed else key)
+    if unchosen:
+        return f"there is no key {key}{unchosen}"
     hint = hints.similar(str(error.key), known)
     if not hint and parent is not None:
         hint = hints.where(typed[1] if typed else key, parent._get_root())
