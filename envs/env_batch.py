@@ -285,10 +285,15 @@ class EnvBatch(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         envs = [of() for _ in range(num_envs)]
-        if max_steps is not None:
+        if max_steps is not None and isinstance(envs[0], EnvBase):
             envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]
         one = envs[0]
         name = type(one).__name__
+        if not isinstance(one, EnvBase):
+            raise ValueError(
+                f"of makes {name}, which is no env of TorchRL; for an env of Gymnasium write "
+                "env=gym env.id=MODULE:NAME"
+            )
         if one.batch_size:
             raise ValueError(
                 f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without "

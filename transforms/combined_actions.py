@@ -147,6 +147,8 @@ class MixedAction(CombinedAction):
         advice_key: NestedKey = "guide_action",
     ) -> None:
         super().__init__(guide, action_key, advice_key)
+        if isinstance(weight, (int, float)) and not 0 <= weight <= 1:
+            raise ValueError(f"weight={weight} must be at least 0 and at most 1")
         self.weight = weight
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:

@@ -119,6 +119,11 @@ def _check_env(
     _check_repeats(env)
     advises = config.method.needs_guide or "advice" in config.method.transforms
     if not config.guide and not advises:
+        if config.degrade:
+            raise UserError(
+                f"degrade=[{','.join(map(str, config.degrade))}] has no effect, because there is "
+                "no guide whose advice could be degraded; leave it out, or give guide=NAME"
+            )
         return
     guides = build.build_guides(config)
     for name, guide in guides.items():

@@ -36,6 +36,7 @@ OTHER_NAMES = {
     "env_id": "id",
 }
 SEVERAL = ("guide", "degrade")  # groups whose files are nodes by their names
+OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
 MOST = 2  # places that a hint names
 
 
@@ -93,6 +94,9 @@ def unchosen(key: str, typed: str) -> str:
         key: that does not exist, such as "guide.controller".
         typed: the key that was typed, such as "guide.controller.of".
     """
+    env = OF_ENVS.get(key)
+    if env is not None:
+        return f"; it belongs to env={env}: write env={env} {typed}=VALUE"
     group, _, name = key.partition(".")
     if not re.fullmatch(r"\w+\.\w+", key) or group not in SEVERAL:
         return ""
