@@ -21,8 +21,9 @@ from torchrl.data import Bounded, TensorSpec
 from torchrl.envs import EnvBase, StepCounter, TransformedEnv
 
 from coil_rl.envs.cone_track import SeededEnv
-from coil_rl.envs.gate import foreign
+from coil_rl.envs.gate import LIMIT, foreign
 from coil_rl.envs.limits import LARGEST_SEED, check_range
+from coil_rl.envs.step_limit import names_limit, warn_of_limit
 
 SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
@@ -203,6 +204,7 @@ class _EnvRow:
 
     env: EnvBase
     number: int
+    limit: int | None = None  # steps of an episode, for an env that names no limit
     steps: int = 0  # since the reset
 
     def begin(self, seed: int) -> None:
@@ -230,7 +232,19 @@ class _EnvRow:
         given = self.state.copy().set(self.env.action_key, action.to(self.env.device))
         with foreign(f"the env {self.name} (row {self.number}, step {self.steps})", "step"):
             step = self.env.step(given)
+            if self.limit is not None and self.steps >= self.limit:
+                self._truncate(step["next"])
             self.after, self.state = step["next"], self.env.step_mdp(step)
+
+    def _truncate(self, after: TensorDictBase) -> None:
+        """End the episode, unless it is over."""
+        if after["done"].any():
+            return
+        warn_of_limit(self.name, self.steps, "env.max_steps=NUMBER sets another limit")
+        for name in ("done", "truncated"):
+            flag = after.get(name, None)
+            if flag is not None:
+                after[name] = torch.ones_like(flag)
 
 
 class EnvBatch(SeededRows):
@@ -243,8 +257,8 @@ class EnvBatch(SeededRows):
     Args:
         of: makes one env, without a batch and with one action; called once for each row.
         num_envs: B, number of rows.
-        max_steps: steps after which an episode is truncated, for an env that does not end by
-            itself; None for no limit.
+        max_steps: steps after which an episode is truncated. With None an env that names no number
+            of its own is truncated after 1,000, with a warning.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
@@ -271,10 +285,15 @@ class EnvBatch(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         envs = [of() for _ in range(num_envs)]
-        if max_steps is not None:
+        if max_steps is not None and isinstance(envs[0], EnvBase):
             envs = [TransformedEnv(env, StepCounter(max_steps)) for env in envs]
         one = envs[0]
         name = type(one).__name__
+        if not isinstance(one, EnvBase):
+            raise ValueError(
+                f"of makes {name}, which is no env of TorchRL; for an env of Gymnasium write "
+                "env=gym env.id=MODULE:NAME"
+            )
         if one.batch_size:
             raise ValueError(
                 f"{name} has the batch size {list(one.batch_size)}: use it as it is, or without "
@@ -284,8 +303,9 @@ class EnvBatch(SeededRows):
             raise ValueError(
                 f"{name} must have one action, it has {', '.join(map(str, one.action_keys))}"
             )
+        limit = None if names_limit(one) else LIMIT
         super().__init__(
-            [_EnvRow(env, number) for number, env in enumerate(envs)],
+            [_EnvRow(env, number, limit) for number, env in enumerate(envs)],
             seed,
             first_seed,
             cases,

@@ -532,12 +532,21 @@ def _reason(id: str, error: BaseException) -> str:
     extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
     if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
         return f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+    if not isinstance(error, errors.Error):  # of the env itself
+        text = shortened(re.split(r" was raised from", str(error).strip())[0])
+        return f"it raised {type(error).__name__}: {text}" if text else type(error).__name__
     first_line = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
-    unknown = isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound))
+    if not id:
+        return "env.id is empty; write env.id=MODULE:NAME, or the id of a registered env"
+    if not isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)):
+        return first_line or type(error).__name__
+    module, _, name = id.rpartition(":")
+    if module:
+        return f"{module} has no env {name}, and registers none of this name"
     # Gymnasium may have a suggestion of its own: "Did you mean ...".
-    if unknown and "mean" not in first_line:
-        return f"{first_line}; if a package registers it, write PACKAGE:{id}"
-    return first_line or type(error).__name__
+    if "mean" in first_line:
+        return first_line
+    return f"{first_line}; if a package registers it, write PACKAGE:{id}"
 
 
 def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:

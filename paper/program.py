@@ -32,7 +32,7 @@ def reproduce(config: DictConfig) -> None:
     import torch
 
     from coil_paper.reproduce import pages
-    from coil_paper.reproduce.result import Result
+    from coil_paper.reproduce.result import Result, check_pools
     from coil_rl import build, versions, write_text
 
     torch.set_num_threads(config.threads)
@@ -43,6 +43,8 @@ def reproduce(config: DictConfig) -> None:
     for name in requested(config):
         results[name] = build(config.results[name], f"results.{name}", Result)
     runs = trained_runs(config, list(results.values()))
+    for result in results.values():
+        check_pools(result, runs)
     note = config.budgets[config.budget].note
     for name, result in results.items():
         used = list(chain.from_iterable(runs[each] for each in dict.fromkeys(result.experiments)))

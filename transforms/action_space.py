@@ -36,6 +36,10 @@ def nested_key(key: Key) -> Key:
     return key if key is None or isinstance(key, str) else unravel_key(tuple(key))
 
 
+class ChoicesError(ValueError):
+    """An error about an action that is choices, where a number is needed."""
+
+
 class ActionSpace:
     """Actions of an env as vectors [*batch, *agents, A].
 

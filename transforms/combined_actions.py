@@ -16,6 +16,7 @@ from tensordict.utils import expand_as_right
 from torch import Tensor, nn
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 
+from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_transform import GuideTransform, Schedule, SeededGenerator
 
 EXECUTED = "executed_action"
@@ -64,9 +65,9 @@ class CombinedAction(GuideTransform):
         return tensordict_reset.set(EXECUTED, self.action_space.spec.zero())
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Add what it writes; raises a `ValueError` if discrete actions would have to be added."""
+        """Add what it writes; raises a `ChoicesError` if choices would have to be added."""
         if self.adds and not self.action_space.continuous:
-            raise ValueError(
+            raise ChoicesError(
                 f"{type(self).__name__} needs continuous actions, but this env has "
                 f"{self.action_space.size} discrete ones; use Takeover, which replaces the agent's "
                 "action in some steps"
@@ -146,6 +147,8 @@ class MixedAction(CombinedAction):
         advice_key: NestedKey = "guide_action",
     ) -> None:
         super().__init__(guide, action_key, advice_key)
+        if isinstance(weight, (int, float)) and not 0 <= weight <= 1:
+            raise ValueError(f"weight={weight} must be at least 0 and at most 1")
         self.weight = weight
 
     def _executed(self, tensordict: TensorDictBase) -> Tensor:

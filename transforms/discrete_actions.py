@@ -78,7 +78,12 @@ class DiscreteActions(ActionTransform):
         bounded = isinstance(spec, Bounded) and bool(
             (spec.space.high - spec.space.low).isfinite().all()
         )
-        if not real or not bounded:
+        if not real:
+            raise ValueError(
+                "DiscreteActions makes choices of one number, but the action of this env is "
+                f"choices already ({type(spec).__name__}); leave it out: action=continuous"
+            )
+        if not bounded:
             raise ValueError(
                 "DiscreteActions needs an action of one bounded number, but this env's action is "
                 f"{type(spec).__name__}"

@@ -16,6 +16,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, TransformedEnv
 
 from coil_rl.config import build
+from coil_rl.config.choices import about_choices, needs_numbers
 from coil_rl.config.distillation import (
     guides_with_untrained_proxies,
     guides_without_parameters,
@@ -73,7 +74,12 @@ def check_parts(config: DictConfig) -> None:
     build_all(config.evaluation.advice, "evaluation.advice")
     if has_agent:
         _check_label(config.label)
-        _check_training(config, make_env)
+        try:
+            _check_training(config, make_env)
+        except UserError as error:
+            if not needs_numbers(error):
+                raise
+            raise UserError(about_choices(config, make_env.bare(1, TEST, None))) from error
         if config.method.transforms:
             for advice in config.evaluation.advice:
                 _check_cases(cases, partial(make_env, cases, TEST, advice))
@@ -131,6 +137,11 @@ def _check_env(
     _check_repeats(env)
     advises = config.method.needs_guide or "advice" in config.method.transforms
     if not config.guide and not advises:
+        if config.degrade:
+            raise UserError(
+                f"degrade=[{','.join(map(str, config.degrade))}] has no effect, because there is "
+                "no guide whose advice could be degraded; leave it out, or give guide=NAME"
+            )
         return
     guides = build.build_guides(config)
     for name, guide in guides.items():

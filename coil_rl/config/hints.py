@@ -7,6 +7,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from coil_rl import conf
 from coil_rl.errors import did_you_mean
 
 # Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
@@ -34,6 +35,8 @@ OTHER_NAMES = {
     "learning_starts": "starts",
     "env_id": "id",
 }
+SEVERAL = ("guide", "degrade")  # groups whose files are nodes by their names
+OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
 MOST = 2  # places that a hint names
 
 
@@ -82,6 +85,25 @@ def _keys_of(name: str, node: Any) -> Iterator[str]:
     if isinstance(node, Mapping):
         for key, value in node.items():
             yield from _keys_of(f"{name}.{key}", value)
+
+
+def unchosen(key: str, typed: str) -> str:
+    """Return `; ...` for the key of a file that exists and was not chosen, or an empty string.
+
+    Args:
+        key: that does not exist, such as "guide.controller".
+        typed: the key that was typed, such as "guide.controller.of".
+    """
+    env = OF_ENVS.get(key)
+    if env is not None:
+        return f"; it belongs to env={env}: write env={env} {typed}=VALUE"
+    group, _, name = key.partition(".")
+    if not re.fullmatch(r"\w+\.\w+", key) or group not in SEVERAL:
+        return ""
+    if not Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
+        return ""
+    chosen = f"[{name}]" if group == "degrade" else name
+    return f"; it belongs to {group}={name}: write {group}={chosen} {typed}=VALUE"
 
 
 def choice(group: str, name: str, options: Iterable[str]) -> str:

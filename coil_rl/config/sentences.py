@@ -30,7 +30,15 @@ LAUNCHERS = {
 }
 
 
+OF_CONES = ("track", "preset")
 TYPED = re.compile(r"Could not override '([^']+)'")
+MERGED = re.compile(r"Error merging override (.+)")
+# OmegaConf adds no typed node by an override.
+NO_NEW_MEASURE = (
+    "a measure cannot be added on the command line; write evaluation: {measures: {NAME: {entry: "
+    "KEY}}} in a file of yours, such as that of an env or experiment"
+)
+NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
     re.DOTALL,
@@ -75,20 +83,68 @@ def _not_composed(error: BaseException) -> str:
         without_package = hints.file_without_package(str(error))
         if without_package:
             return without_package
+    group = NO_GROUP.match(str(error))
+    if group is not None and group[2] in OF_CONES:
+        return _group_of_cones(group[1], group[2])
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):
             return _unknown_key(key_error, TYPED.search(str(error)))
-    number = NO_INTEGER.search(f"{error} {error.__cause__}")
-    if number is not None and float(number[2]).is_integer():
-        return (
-            f"{number[1]}={number[2]} must be a whole number; "
-            f"write {number[1]}={int(float(number[2])):_}"
-        )
+    merged = MERGED.match(str(error))
+    if merged is not None:
+        problem = _wrong_kind(merged[1], f"{error} {error.__cause__}")
+        if problem:
+            return problem
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return _wrong_value(error, error.full_key)
     if isinstance(error.__cause__, OmegaConfBaseException):
         return f"{_first_paragraph(error)}: {_first_paragraph(error.__cause__)}"
     return _first_paragraph(error)
+
+
+def _wrong_kind(override: str, cause: str) -> str:
+    """Return the message for a value of another kind than its key has, or an empty string.
+
+    Args:
+        override: as typed.
+        cause: what OmegaConf says.
+    """
+    key, _, value = override.partition("=")
+    number = NO_INTEGER.search(cause)
+    if number is not None and float(number[2]).is_integer():
+        return (
+            f"{number[1]}={number[2]} must be a whole number; "
+            f"write {number[1]}={int(float(number[2])):_}"
+        )
+    if "could not be converted to Integer" in cause:
+        return f"{override} must be a whole number"
+    if "could not be converted to Float" in cause:
+        return f"{override} must be a number"
+    if "is not a valid bool" in cause or "could not be converted to Boolean" in cause:
+        return f"{override} must be true or false"
+    if "is not a ListConfig" in cause:
+        return f"{override} must be a list; write {key}=[{value}]"
+    if "is not a subclass of MeasureConfig" in cause:
+        return f"{override}: {NO_NEW_MEASURE}"
+    if "does not support deletion" in cause:
+        return f"{override}: {key.lstrip('~')} cannot be left out; give it another value"
+    return ""
+
+
+def _group_of_cones(file: str | None, group: str) -> str:
+    """Return the message for a group that only the cone world has, and another env is chosen.
+
+    Args:
+        file: in whose defaults list it is overridden, without its suffix; None: the command line.
+        group: such as "track".
+    """
+    has = f"only the cone world (env=cone_track) has the group {group}"
+    if file is None:
+        return f"{group}= cannot be given for this env: {has}; leave it out"
+    return (
+        f"{file}.yaml overrides /{group}, but {has}: leave env= out, or write in the file, instead "
+        f"of that line, override /env: NAME, of an env file that does it (as "
+        "env/cone_track_unseen.yaml), so that another env replaces it"
+    )
 
 
 def _unreadable_override(error: OverrideParseException) -> str:
@@ -142,8 +198,13 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
     """
     key, parent = str(error.full_key or error.key), error.parent_node
     names = parent if isinstance(parent, DictConfig) else []
+    if key.startswith("evaluation.measures.") and key.count(".") == 2:
+        return f"there is no key {key}: {NO_NEW_MEASURE}"
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
+    unchosen = hints.unchosen(key, typed[1] if typed else key)
+    if unchosen:
+        return f"there is no key {key}{unchosen}"
     hint = hints.similar(str(error.key), known)
     if not hint and parent is not None:
         hint = hints.where(typed[1] if typed else key, parent._get_root())

@@ -27,6 +27,8 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
+OF_CONES = ("track", "preset")  # groups of the cone world
+SEVERAL = ("guide", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
 
@@ -67,6 +69,13 @@ def keep_written(
     loader: Any = GlobalHydra.instance().config_loader()
     _, files = loader._parse_overrides_and_create_caching_repo(config_name, overrides)
     defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
+    for text in task:
+        group, value = key_of(text), text.partition("=")[2]
+        if group not in SEVERAL and value.startswith("[") and files.group_exists(group):
+            raise UserError(
+                f"{text} chooses several files of a group that takes one; for a run with each "
+                f"write -m {group}={value.strip('[]')}"
+            )
     # A choice of a file, such as method=coil, gives no value.
     typed = [key for key in map(key_of, task) if not files.group_exists(key.replace(".", "/"))]
     last: dict[str, Written] = {}
@@ -178,7 +187,9 @@ def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) 
                 f"{text} has no effect: method={config.method.name} trains no guides, for which a "
                 "proxy would stand; leave it out, or take method=dynamic_coil_sequential"
             )
-        if "." not in key or not any(_covers(each, key) for each in REFERRED):
+        if "." not in key and key not in OF_CONES:
+            continue
+        if not any(_covers(each, key) for each in REFERRED):
             continue
         references = _references(config) if references is None else references
         if not any(_covers(each, key) for each in references):

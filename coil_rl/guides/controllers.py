@@ -200,7 +200,9 @@ class ControllerGuide(TensorDictModuleBase):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         thing = load(of) if isinstance(of, str) else of
-        title = of if isinstance(of, str) else getattr(of, "__name__", type(of).__name__)
+        title = getattr(of, "__name__", type(of).__name__)
+        if isinstance(of, (str, int, float)):
+            title = str(of)
         keys = None if in_keys is None else [nested_key(key) for key in in_keys]
         make = _of_class if inspect.isclass(thing) else _of_object
         guide = make(thing, title, keys, dict(options or {}))

@@ -23,6 +23,7 @@ from coil_rl.learners.encoders import Mlp
 from coil_rl.learners.extension import Extension
 from coil_rl.learners.ppo import PPO
 from coil_rl.schedules import Linear, Schedule, schedule
+from coil_rl.transforms.action_space import ChoicesError
 from coil_rl.transforms.guide_actions import Guides
 from coil_rl.transforms.normalised_action import given_units
 
@@ -253,7 +254,7 @@ class DynamicCoil(PPO):
         check_range(0, 1, above=True, shrink=shrink)
         check_choice(("both", "agent", "guide"), critic_phases=critic_phases)
         if not env.action_spec.dtype.is_floating_point:
-            raise ValueError(
+            raise ChoicesError(
                 "Dynamic COIL needs continuous actions, but this env has discrete ones"
             )
         self.guide_learning_rate = schedule(guide_learning_rate)

@@ -31,7 +31,7 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.kickstart import KickstartLoss
 from coil_rl.learners.off_policy import OffPolicy
 from coil_rl.schedules import Linear, Schedule
-from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.action_space import ChoicesError, nested_key
 
 
 class SAC(OffPolicy):
@@ -120,7 +120,7 @@ class SAC(OffPolicy):
         check_range(0, action_gain=action_gain)
         check_range(0, above=True, action_scale=action_scale, temperature=temperature)
         if not env.action_spec.dtype.is_floating_point:
-            raise ValueError(
+            raise ChoicesError(
                 "SAC needs continuous actions, but this env has discrete ones; use "
                 "action=continuous, or a learner for discrete actions, such as DQN"
             )

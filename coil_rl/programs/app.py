@@ -353,10 +353,27 @@ class Jobs:
         refuse(
             self.name,
             UserError(
-                f"{count} of this sweep failed: {'; '.join(lines)}; correct the cause, and do what "
-                f"is missing by {_sweep_command(self.arguments, _sweep[0])}"
+                f"{count} of this sweep failed: {_by_reason(lines)}; correct the cause, and do "
+                f"what is missing by {_sweep_command(self.arguments, _sweep[0])}"
             ),
         )
+
+
+def _by_reason(lines: Sequence[str]) -> str:
+    """Return the lines of failed jobs in one, each reason once.
+
+    Args:
+        lines: such as "job 0 (method=ppo seed=0): the env ...".
+    """
+    jobs: dict[str, list[str]] = {}
+    for line in lines:
+        job, _, reason = line.partition("): ")
+        jobs.setdefault(reason, []).append(f"{job})")
+    parts = []
+    for reason, failed in jobs.items():
+        numbers = ", ".join(job.split()[1] for job in failed)
+        parts.append(f"{failed[0]}: {reason}" if len(failed) == 1 else f"jobs {numbers}: {reason}")
+    return "; ".join(parts)
 
 
 def _sweep_command(arguments: Sequence[str], folder: str) -> str:

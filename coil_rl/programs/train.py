@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
-from coil_rl.programs import app, folders
+from coil_rl.programs import app, folders, plan
 
 # What may be given beside resume=FOLDER.
 BESIDE_RESUME = ("trust=", "budget.frames=")
@@ -23,7 +23,7 @@ def train(config: DictConfig) -> float:
         raise UserError(
             f"resume={config.resume} belongs on the command line, alone: coil-train resume=FOLDER"
         )
-    return run_configured(config, command=app.command_line())
+    return run_configured(config, command=app.command_line(), callback=plan.pace(config))
 
 
 def check(config: DictConfig) -> None:

@@ -5,6 +5,7 @@ from coil_rl.report.comparison import Comparison as Comparison
 from coil_rl.report.comparison import Group as Group
 from coil_rl.report.comparison import compare as compare
 from coil_rl.report.comparison import paired as paired
+from coil_rl.report.configurations import distinguish as distinguish
 from coil_rl.report.curves import draw_curve_grid as draw_curve_grid
 from coil_rl.report.curves import draw_learning_curves as draw_learning_curves
 from coil_rl.report.curves import draw_phases as draw_phases

@@ -20,6 +20,7 @@ from torchrl.envs import (
     VecNormV2,
 )
 
+from coil_rl.envs.step_limit import limits_of
 from coil_rl.errors import UserError
 from coil_rl.guides.simple import FollowAdvice
 from coil_rl.transforms import GuideActions
@@ -131,6 +132,8 @@ class EnvMaker:
 def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> EnvBase:
     """Return an env with the sum of its rewards, `episode_reward`, and with transforms.
 
+    Episodes of a foreign env that names no largest number of steps are truncated after 1,000.
+
     Transforms that do not fit are a `UserError` that begins with `name`.
     """
     # Of the env itself and of the transforms.
@@ -141,7 +144,7 @@ def transformed(env: EnvBase, transforms: Sequence[Transform], name: str) -> Env
             "out and give learner.normalise=true"
         )
     # The sum comes first, before a method changes the reward.
-    env = TransformedEnv(env, Compose(RewardSum(), *transforms))
+    env = TransformedEnv(env, Compose(*limits_of(env), RewardSum(), *transforms))
     try:
         env.observation_spec  # noqa: B018  transforms check the specs when these are computed
     except (KeyError, ValueError) as error:

@@ -15,7 +15,7 @@ from typing import Any
 import yaml
 
 from coil_rl import UserError
-from coil_rl.report import Run
+from coil_rl.report import Run, distinguish
 
 # Finished runs by experiment, the name of a file in `paper/conf/experiment`.
 Runs = Mapping[str, Sequence[Run]]
@@ -30,6 +30,11 @@ class Result(ABC):
     """A table, figure or claim of the paper; the constructor takes its options and checks them."""
 
     experiments: Sequence[str] = ()  # whose runs it needs; empty if it needs no training
+
+    @property
+    def pools(self) -> list[Sequence[str]]:
+        """Groups of experiments; runs of one label in a group are means of one another."""
+        return [self.experiments]
 
     @abstractmethod
     def make(self, stem: Path, runs: Runs = NO_RUNS) -> str:
@@ -62,6 +67,31 @@ class WorldsResult(Result):
             self.worlds[name] = list(variant)
         self.experiments = list(chain.from_iterable(self.worlds.values()))
         self.against = against
+
+    @property
+    def pools(self) -> list[Sequence[str]]:
+        """The experiments of each world."""
+        return list(self.worlds.values())
+
+
+def check_pools(result: Result, runs: Runs) -> None:
+    """Check that runs of one label, of which a result shows means, differ by their seed only.
+
+    Args:
+        result: the result.
+        runs: the finished runs by experiment.
+
+    Raises:
+        UserError: if the configurations of such runs differ; it names the keys.
+    """
+    for experiments in result.pools:
+        pooled = list(chain.from_iterable(runs[each] for each in dict.fromkeys(experiments)))
+        _, differences = distinguish(pooled)
+        if differences:
+            raise UserError(
+                f"experiment={', '.join(experiments)}: {' '.join(differences)} Give them labels of "
+                "their own, label=NAME, or move the folders of the other runs away"
+            )
 
 
 def runs_by_label(labels: Sequence[str], runs: Runs) -> dict[str, list[Run]]:

@@ -1,3 +1,4 @@
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +11,10 @@ from run_folders import driven, make_run
 
 from coil_paper import sweeps
 from coil_paper.program import INDEX
+from coil_paper.reproduce.result import check_pools
+from coil_paper.reproduce.training import Figure22
+from coil_rl import UserError
+from coil_rl.report import read_runs
 
 
 @pytest.fixture(autouse=True)
@@ -117,6 +122,19 @@ def two_runs(monkeypatch):
 
     monkeypatch.setattr(sweeps, "start", start)
     return sweep, started
+
+
+def test_runs_of_one_label_with_other_configurations_are_not_pooled(tmp_path):
+    for seed, gamma in ((0, 0.9), (1, 0.9), (2, 0.99)):
+        run = make_run(tmp_path / str(seed), "coil", seed, driven("coil", {"a": 1.0}))
+        settings = json.loads((run / "config.yaml").read_text())
+        (run / "config.yaml").write_text(json.dumps(settings | {"learner": {"gamma": gamma}}))
+    runs = read_runs([tmp_path])
+    result = Figure22(["one"], ["coil"], {"other": ["two"]})
+    alike, differs = runs[:2], runs[2:]
+    check_pools(result, {"one": alike, "two": differs})  # worlds are not pooled
+    with pytest.raises(UserError, match=r"=one: The runs of coil differ in learner.gamma"):
+        check_pools(result, {"one": runs, "two": []})
 
 
 def test_finished_runs_are_reused_and_a_lost_run_is_trained_again_alone(two_runs):

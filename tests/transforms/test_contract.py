@@ -152,7 +152,7 @@ def degraded(transform):
         ),
         (
             lambda: worlds.carts(DiscreteActions(5)).reset(),
-            "bounded number, but this env's action is Categorical",
+            "makes choices of one number, but the action of this env is choices already",
         ),
         (
             lambda: AdaptiveMixedAction(low=0.4),

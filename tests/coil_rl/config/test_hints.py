@@ -27,6 +27,11 @@ from programs import called
             "guide=twotank.control:PI",
             "write guide=controller guide.controller.of=twotank.control:PI",
         ),
+        (
+            "guide.controller.of=twotank.control:PI",
+            "it belongs to guide=controller: write guide=controller guide.controller.of=VALUE",
+        ),
+        ("degrade.noisy.sigma=0.1", "write degrade=[noisy] degrade.noisy.sigma=VALUE"),
         ("run=outputs/tank", "to go on with a run write resume=FOLDER"),
     ],
 )

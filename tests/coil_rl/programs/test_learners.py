@@ -137,13 +137,16 @@ def test_compatible_method_and_learner_train(method, learner, tmp_path):
         ),
         (
             "learner=sac action=choices",
-            "SAC needs continuous actions, but this env has discrete ones",
+            "learner=sac needs numbers as actions, but action=choices makes choices of them",
         ),
         (
             "method=ppo learner=dynamic_coil",
             "such as learner=ppo, but DynamicCoil is one that improves its guides",
         ),
-        ("method=dynamic_coil_sequential action=choices", "Dynamic COIL needs continuous actions"),
+        (
+            "method=dynamic_coil_sequential action=choices",
+            "method=dynamic_coil_sequential needs numbers as actions, but action=choices",
+        ),
         ("learner=dqn action.choices=1", "action: choices=1 must be at least 2"),
         (
             "learner=dqn action.choices=[0.0,2.0]",

@@ -94,11 +94,11 @@ def refusal(name, *arguments):
         ),
         ("~learner", "learner must be given: write learner=VALUE"),
         # types
-        ("seed=abc", "seed=abc: Value 'abc' of type 'str' could not be converted to Integer"),
+        ("seed=abc", "seed=abc must be a whole number"),
         ("budget=5", "budget=5: Invalid type assigned: int is not a subclass of BudgetConfig"),
         (
             "method.observes=5",
-            "method.observes=5: Invalid value assigned: int is not a ListConfig, list or tuple",
+            "method.observes=5 must be a list; write method.observes=[5]",
         ),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("learner.gamma=nan", "learner.gamma=nan must be a finite number"),

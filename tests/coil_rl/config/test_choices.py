@@ -1,0 +1,64 @@
+"""A method that needs numbers as actions is refused by name where they are choices."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hydra import compose, initialize_config_module
+
+from coil_rl.config.check import check_parts
+from coil_rl.config.choices import WITH_CHOICES
+from coil_rl.errors import UserError
+
+METHODS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "method").glob("*"))
+# They have no agent, or need several guides.
+OTHERS = ("guide", "coil_multi")
+
+
+class Switches(gymnasium.Env):
+    """Three switches are set at once, for five steps."""
+
+    observation_space = spaces.Box(-1, 1, (2,))
+    action_space = spaces.MultiBinary(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        observation = self.np_random.uniform(-1, 1, 2).astype(np.float32)
+        return observation, float(np.sum(action)), False, self.steps >= 5, {}
+
+
+def on(observation):
+    return np.array([1, 0, 1])
+
+
+def checked(method, tmp_path, *words):
+    env = ["env=gym", f"env.id={__name__}:Switches", "evaluation.cases=2"]
+    guide = ["guide=controller", f"guide.controller.of={__name__}:on"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        config = compose("train", [*env, *guide, f"method={method}", f"run_dir={tmp_path}", *words])
+    check_parts(config)
+
+
+@pytest.mark.parametrize("method", sorted({*METHODS} - {*OTHERS}))
+def test_method_takes_choices_or_is_refused_with_those_that_do(method, tmp_path):
+    if method in WITH_CHOICES:
+        checked(method, tmp_path)
+        return
+    with pytest.raises(UserError) as refused:
+        checked(method, tmp_path)
+    assert str(refused.value).startswith(
+        f"method={method} needs numbers as actions, but the action of env.id={__name__}:Switches "
+        "is 3 choices at once, of 2, 2, 2 options; with choices take learner=ppo and method=coil"
+    )
+
+
+def test_learner_that_was_chosen_is_named(tmp_path):
+    with pytest.raises(UserError, match=r"^learner=sac needs numbers as actions"):
+        checked("coil", tmp_path, "learner=sac")

@@ -1,0 +1,172 @@
+"""The shipped experiments with an env and a controller of somebody else."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hydra import compose, initialize_config_module
+from omegaconf import OmegaConf
+from programs import called
+
+from coil_rl.config.check import check_parts
+from coil_rl.programs import plan
+from coil_rl.programs.plan import Pace, described, duration, estimated
+
+CONF = Path(__file__).parents[3] / "conf" / "experiment"
+# What each experiment needs besides an env of one's own.
+OWN = {
+    "advice": "controller",
+    "advice_better_guide": "controller",
+    "anchored": "controller",
+    "coil_vs_ppo": "controller",
+    "dynamic_coil": "[controller,random,zero]",
+    "guide_phase": "controller",
+    "guide_quality": "controller",
+    "guide_removed": "controller",
+    "learners": "controller",
+    "listening": "[controller,random]",
+    "methods": "controller",
+    "placebo": "controller",
+}
+REFUSED = {
+    "advice_noisy_view": "its noise is in units of the cone world's range of sight",
+    "advice_slow_control": "it changes the control rate of the cone world",
+    "advice_sparse_reward": "it leaves out the cone world's reward for cones",
+    "driving_guides": "it is about the tasks of env=driving_tasks",
+    "driving_tasks": "it is about the tasks of env=driving_tasks",
+}
+ENV = [
+    "env=gym",
+    f"env.id={__name__}:Follow",
+    f"guide.controller.of={__name__}:repeat",
+    "evaluation.cases=2",
+    "logger=none",
+]
+TINY = ["budget.num_envs=2", "budget.steps=64", "evaluation.curve.num_envs=2"]
+
+
+class Follow(gymnasium.Env):
+    """The right action is the observation, for ten steps."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._look(), {}
+
+    def step(self, action):
+        reward = -abs(float(action[0] - self.seen[0]))
+        self.steps += 1
+        return self._look(), reward, False, self.steps >= 10, {}
+
+    def _look(self):
+        self.seen = self.np_random.uniform(-1, 1, 1).astype(np.float32)
+        return self.seen
+
+
+def repeat(observation):
+    return observation
+
+
+def jobs(experiment):
+    """Return the overrides of the first seed of each job of an experiment."""
+    file = OmegaConf.load(CONF / f"{experiment}.yaml")
+    if OmegaConf.select(file, "hydra.sweeper.params") is None:
+        file = OmegaConf.load(CONF / f"{file.defaults[0]}.yaml")
+    words = [[]]
+    for key, value in file.hydra.sweeper.params.items():
+        choices = str(value).split(",")[: 1 if key == "seed" else None]
+        words = [[*word, f"{key}={choice.strip()}"] for word in words for choice in choices]
+    return words
+
+
+def test_every_experiment_is_either_for_any_env_or_refused():
+    assert sorted({*OWN, *REFUSED}) == sorted(path.stem for path in CONF.glob("*.yaml"))
+
+
+@pytest.mark.parametrize("experiment", sorted(OWN))
+def test_jobs_of_an_experiment_can_be_started_in_an_own_env(experiment, tmp_path):
+    checked = set()
+    for job in jobs(experiment):
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            words = [f"+experiment={experiment}", f"guide={OWN[experiment]}", *ENV, *job]
+            config = compose("train", [*words, f"run_dir={tmp_path}"])
+        assert not config.track
+        if not any(word.startswith("budget.frames=") for word in job):
+            frames = {"method=oil": 18_900, "method=dagger": 22_400}.get(job[0], 200_000)
+            assert config.budget.frames == frames  # those of the env, not of the cone world
+        if job[0] != "learner=dqn" and not checked.issuperset(job):
+            check_parts(config)
+        checked.update(job)
+
+
+@pytest.mark.parametrize("experiment", sorted(REFUSED))
+def test_experiment_about_the_cone_world_says_why_and_what_to_do(experiment, tmp_path):
+    words = [f"+experiment={experiment}", "guide=controller", *ENV]
+    refused = called("train", *words, cwd=tmp_path, code=2).stderr
+    assert f"experiment={experiment} cannot be used with env=gym: " in refused
+    assert REFUSED[experiment] in refused
+    assert len(refused.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_own_file_that_overrides_tracks_is_told_what_to_write(tmp_path):
+    file = tmp_path / "conf" / "experiment" / "mine.yaml"
+    file.parent.mkdir(parents=True)
+    file.write_text("# @package _global_\ndefaults: [override /track: unseen]\n")
+    words = ["--config-dir", str(tmp_path / "conf"), "+experiment=mine", "guide=controller", *ENV]
+    refused = called("train", *words, cwd=tmp_path, code=2).stderr
+    assert "experiment/mine.yaml overrides /track, but only the cone world" in refused
+    refused = called("train", *ENV, "guide=controller", "track=unseen", cwd=tmp_path, code=2)
+    assert "track= cannot be given for this env: only the cone world" in refused.stderr
+
+
+def test_sweep_says_its_runs_and_frames_and_then_trains(tmp_path):
+    words = ["+experiment=coil_vs_ppo", "guide=controller", *ENV, *TINY]
+    words += ["budget.frames=256", "budget.minibatches=4", "evaluation.curve.points=1", "seed=0"]
+    said = called("train", *words, cwd=tmp_path).stderr
+    assert "this sweep has 2 runs with 512 frames of training in all, 256 each" in said
+    folders = sorted(path.parent.name for path in tmp_path.rglob("evaluation.csv"))
+    assert folders == ["coil_seed0", "ppo_seed0"]
+
+
+def test_jobs_that_fail_for_one_reason_are_named_with_it_once(tmp_path):
+    words = ["-m", *ENV, "guide=controller", "guide.controller.of=no:thing", "seed=0,1,2"]
+    last = called("train", *words, cwd=tmp_path, code=2).stderr.splitlines()[-1]
+    assert "3 jobs of this sweep failed: jobs 0, 1, 2: guide.controller" in last
+    assert last.count("there is no module no") == 1
+
+
+def test_plan_and_estimate_are_in_words():
+    assert described([100, 100, 0]).startswith(
+        "this sweep has 3 runs with 200 frames of training in all, 100 each;"
+    )
+    assert ", 100 to 300 each;" in described([100, 300])
+    assert [duration(seconds) for seconds in (0.2, 40, 600, 9000)] == [
+        "1 s",
+        "40 s",
+        "10 min",
+        "2.5 h",
+    ]
+    assert "of all 3 runs takes about 10 min" in estimated(0.01, [20_000] * 3)
+    assert "100,000 frames of training take about 17 min" in estimated(0.01, [])
+
+
+def test_estimate_is_not_misled_by_a_slow_first_update(monkeypatch):
+    said = []
+    clock = iter([0.0, 100.0, *(100.0 + 3 * update for update in range(1, 8))])
+    monkeypatch.setattr(plan, "say", lambda text, error: said.append(text))
+    monkeypatch.setattr(plan.time, "monotonic", lambda: next(clock))
+    monkeypatch.setattr(plan.HydraConfig, "get", lambda: OmegaConf.create({"sweep": {"dir": "x"}}))
+    monkeypatch.setattr(plan, "_said", [])
+    monkeypatch.setattr(plan, "_frames", [1000] * 10)
+    pace = Pace(frames=600)
+    for update in range(9):
+        assert pace.due(update, 10, {})
+        pace.after_update(update)
+    assert not pace.due(9, 10, {})
+    assert "of all 10 runs takes about 50 s" in said[0]

@@ -1,0 +1,96 @@
+"""A TorchRL env that never ends and names no limit is truncated after 1,000 steps."""
+
+import gymnasium
+import pytest
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase, GymWrapper, StepCounter, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, EnvBatch, shipped_tracks
+from coil_rl.envs.step_limit import limits_of, names_limit
+from coil_rl.run.evaluation import evaluate_policy
+from coil_rl.run.parts import EnvMaker
+
+
+class Endless(EnvBase):
+    """It is never done; its reward is 1 in each step."""
+
+    def __init__(self, *batch):
+        super().__init__(batch_size=batch)
+        self.observation_spec = Composite(observation=Unbounded((*batch, 1)), shape=self.batch_size)
+        self.action_spec = Bounded(-1, 1, (*batch, 1))
+        self.reward_spec = Unbounded((*batch, 1))
+
+    def _set_seed(self, seed):
+        pass
+
+    def _reset(self, tensordict=None):
+        return TensorDict({"observation": torch.zeros(*self.batch_size, 1)}, self.batch_size)
+
+    def _step(self, tensordict):
+        after = {
+            "observation": torch.zeros(*self.batch_size, 1),
+            "reward": torch.ones(*self.batch_size, 1),
+            "done": torch.zeros(*self.batch_size, 1, dtype=torch.bool),
+        }
+        return TensorDict(after, self.batch_size)
+
+
+class Named(Endless):
+    max_steps = 30
+
+
+def stay(env):
+    return TensorDictModule(torch.zeros_like, in_keys=["observation"], out_keys=["action"])
+
+
+@pytest.mark.parametrize("make", [lambda: Endless(2), lambda: EnvBatch(Endless, num_envs=2)])
+def test_endless_env_is_truncated_and_says_so_once(make):
+    env = EnvMaker(lambda rows, cases, count: make())(2)
+    assert "limit_count" not in make().observation_spec
+    with pytest.warns(UserWarning, match="names no largest number of steps") as said:
+        result = evaluate_policy(env, stay(env))
+    assert [(row["steps"], row["reward"]) for row in result.episodes] == [(1000, 1000.0)] * 2
+    assert "Endless" in str(said[0].message)
+    after = env.rollout(1000, stay(env), break_when_any_done=False)["next"][:, -1]
+    assert after["done"].all()
+    assert not after["terminated"].any()
+
+
+def test_rows_count_their_own_steps():
+    env = TransformedEnv(Endless(2), *limits_of(Endless(2)))
+    carrier = env.reset()
+    for step in range(1, 1001):
+        after, carrier = env.step_and_maybe_reset(env.rand_action(carrier))
+        if step == 10:
+            mask = torch.tensor([[True], [False]])
+            carrier = env.reset(carrier.set("_reset", mask))
+    assert after["next", "done"].view(-1).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Named(2),
+        lambda: TransformedEnv(Endless(2), StepCounter(5)),
+        lambda: GymWrapper(gymnasium.make("Pendulum-v1")),
+        lambda: TransformedEnv(GymWrapper(gymnasium.make("Pendulum-v1"))),
+    ],
+)
+def test_limit_that_an_env_names_is_left_to_it(make):
+    env = make()
+    assert names_limit(env)
+    assert not limits_of(env)
+
+
+def test_envs_of_the_project_are_left_as_they_are():
+    env = ConeTrackEnv(shipped_tracks("train")[:1], num_envs=1)
+    assert not limits_of(env)
+
+
+def test_rows_of_a_batch_keep_a_longer_limit():
+    env = EnvBatch(lambda: TransformedEnv(Endless(), StepCounter(1200)), num_envs=1)
+    steps = evaluate_policy(env, stay(env)).episodes[0]["steps"]
+    assert steps == 1200
