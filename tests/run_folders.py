@@ -58,8 +58,9 @@ def make_run(
     frames = range(1000, 20_001, 1000)
     write_csv(
         [
-            {"frames": n, "evaluation/return": 400 * (1 - math.exp(-n / 5000)) + seed}
+            {"frames": n, "evaluation/return": value, "selection/return": value - 1}
             for n in frames
+            for value in [400 * (1 - math.exp(-n / 5000)) + seed]
         ],
         folder / "metrics.csv",
     )
@@ -105,7 +106,7 @@ def make_untrained_run(folder: Path, *overrides: str) -> Path:
         config = compose("train", [*overrides, f"run_dir={folder}"])
     if config.method.observes is not None:
         policy = build_learner(config, env_maker(config)()).policy
-        for which in ("last", "best"):
+        for which in ("last", "best")[: 2 if config.delivery == "tested" else 1]:
             checkpoint.save(policy.state_dict(), folder / f"policy_{which}.pt")
     saved = OmegaConf.create(OmegaConf.to_container(config, resolve=True))
     saved.logger = None

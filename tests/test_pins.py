@@ -34,6 +34,7 @@ RUNS = {
         "learner.phases.agent_phase.frames=512",
         "learner.phases.guide_phase.frames=512",
         "proxy.budget.frames=512",
+        "budget.frames=3072",  # those of the two proxies are among them
         "proxy.learner.regressor.epochs=5",
     ],
     "sac": ["method=coil", "learner=sac", "learner.starts=256", "learner.ratio=2"],
@@ -43,7 +44,7 @@ TOLERANCE = 1e-4
 
 
 def run(name: str, folder: Path) -> Path:
-    called("train", *RUNS[name], *SMALL, f"hydra.run.dir={folder / name}", cwd=folder)
+    called("train", *SMALL, *RUNS[name], f"hydra.run.dir={folder / name}", cwd=folder)
     return folder / name
 
 

@@ -62,7 +62,7 @@ def replay(config: DictConfig) -> None:
     parts = [describe(result) for result in results]
     cautions = [text for text in (caution(result, env.perception) for result in results) if text]
     parts += [f"Warning: {each}." for each in cautions]
-    parts += [f"{name} is {run} ({config.policy} policy)." for name, (run, _) in runs.items()]
+    parts += [f"{name} is {run} (policy {config.policy})." for name, (run, _) in runs.items()]
     parts.append(TABLES["replay"]["notes"].format(max_steering=math.degrees(env.max_steering)))
     text = "\n\n".join(parts)
     write_text(folder / "replay.md", text)

@@ -64,6 +64,8 @@ def shown(value):
     if OmegaConf.is_dict(value) and value["_target_"] == "coil_rl.schedules.Linear":
         points = [f", {key} {value[key]:g}" for key in ("since", "until") if key in value]
         return "".join([f"{value.start:g} to {value.end:g}", *points])
+    if OmegaConf.is_list(value):
+        return json.dumps(OmegaConf.to_container(value))
     is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
     return f"{value:g}" if is_number else json.dumps(value).strip('"')
 

@@ -269,7 +269,7 @@ def test_outputs_are_never_modified_later(tracks: list[Track]) -> None:
             {"cone_bonus": "never"},
             "cone_bonus='never' must be one of first_sighting, every_sighting",
         ),
-        ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, cyclic"),
+        ({"assignment": "shuffled"}, "assignment='shuffled' must be one of random, drawn, cyclic"),
         *(
             ({name: value}, f"{name}={value} must be more than 0")
             for name in (

@@ -25,7 +25,7 @@ def make_runs(folder, gains, seeds=3, *, sampled=True, curve=True, **others):
             returns = [np.nan, *(300 + gain + seed + np.array([0.0, 40.0, 20.0]))]
             frames = range(1000, 5000, 1000)
             points = [
-                {"frames": n, "evaluation/return": value}
+                {"frames": n, "evaluation/return": value, "selection/return": value}
                 for n, value in zip(frames, returns, strict=True)
             ]
             (run / "metrics.csv").unlink()

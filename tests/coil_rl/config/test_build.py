@@ -68,6 +68,7 @@ OF_OTHER_ENVS = {
     "lander",
     "linear_feedback",
     "oscillator",
+    "swing_tip",
     "swing_up",
     "walker",
 }

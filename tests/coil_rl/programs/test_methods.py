@@ -60,7 +60,7 @@ REPLAY = [
     "learner.critics=3",
 ]
 SMALL |= {
-    "coil_anchored": [*PPO, "learner.anchor.share=0"],
+    "coil_anchored": [*PPO, "training.tests.time_limit=0.5"],
     "cheq": REPLAY,
     "policy_decorator": REPLAY,
     "q_filter": REPLAY,
@@ -68,7 +68,9 @@ SMALL |= {
 }
 SMALL |= {method: [*REPLAY, "method.transforms.takeover.frames=32"] for method in ("rlpd", "wsrl")}
 SKLEARN = ["oil", "dagger"]  # archives of skops contain the time
-SMALL |= {method: SMALL_PROXY for method in METHODS if method.startswith("dynamic")}
+# Twice 64 frames of proxies, and two updates.
+DYNAMIC = [*SMALL_PROXY, "budget.frames=256"]
+SMALL |= {method: DYNAMIC for method in METHODS if method.startswith("dynamic")}
 
 
 def composed(method, folder, *overrides):
