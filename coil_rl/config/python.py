@@ -50,7 +50,8 @@ def train(
         guide: a class, an object with `act(observation)`, a function, a network; the import path
             "PACKAGE.MODULE:NAME" of one; the name of a file in conf/guide, such as "spline"; a
             `Controller` of another run; or None.
-        method: name of a file in conf/method; by default "coil" with a guide, "ppo" without one.
+        method: name of a file in conf/method; by default "coil_anchored" with a guide, "ppo"
+            without one.
         frames: length of the run; by default that of the env's file.
         seed: of everything.
         folder: for everything that the run writes; by default a new one in outputs/train.
@@ -107,7 +108,7 @@ def prepare(
     env_words, env_nodes = _env(env, f"{folder}#env")
     guide_words, guide_nodes = _guide(guide, f"{folder}#guide")
     words = [*env_words, *guide_words]
-    words.append(f"method={method or ('ppo' if guide is None else 'coil')}")
+    words.append(f"method={method or ('ppo' if guide is None else 'coil_anchored')}")
     if frames is not None:
         words.append(f"budget.frames={frames}")
     words += [f"seed={seed}", *overrides]

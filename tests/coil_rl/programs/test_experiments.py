@@ -32,10 +32,7 @@ def first(experiment, run_dir):
     ]
     tiny = TINY_SWEEP
     if experiment == "promise":  # of no world with tracks
-        tiny = [
-            word for word in TINY_SWEEP if word.split(".")[0] not in ("track=generated", "track")
-        ]
-        tiny = [word for word in tiny if not word.startswith("env.")]
+        tiny = [word for word in TINY_SWEEP if not word.startswith(("track", "env."))]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose("train", [f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}"])
 
