@@ -315,7 +315,7 @@ class StartTest:
         opposites = [tuple(-value for value in row) for row in guides]
         new = tuple(0.0 for _ in guides)
         held = self._first_held(guides, opposites, new)
-        if held != new and self.hold.space.continuous:
+        if held != new and self.hold.space.continuous and self.anchor.gains:
             held = self._best_gain(held)
         self.hold.set(held)
         numbers = (
@@ -350,18 +350,17 @@ class StartTest:
 
     def _best_gain(self, held: tuple[float, ...]) -> tuple[float, ...]:
         """Return the best gain of held weights."""
-        scaled = {gain: tuple(gain * value for value in held) for gain in (1.0, *self.anchor.gains)}
-        tried = {weights: torch.empty(0) for weights in scaled.values()}
-        self.returns = {key: value for key, value in self.returns.items() if key not in tried}
+        lower = [tuple(gain * value for value in held) for gain in self.anchor.gains]
+        del self.returns[held]  # all gains are compared in the same new cases
         done, best = 0, held
         for total in GAIN_CASES:
             before = self.cases.steps
             self.cases.renew(total - done)
             done = total
-            for each in tried:
+            for each in (held, *lower):
                 self._act(each)
             best = held
-            for each in list(tried)[1:]:
+            for each in lower:
                 if self._clear(each, best):
                     best = each
             if not self._affordable((self.cases.steps - before) * (GAIN_CASES[-1] / done - 1)):
