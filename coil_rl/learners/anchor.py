@@ -43,6 +43,7 @@ ADVISED = 0.9  # probability of the advised one of several options at a choice w
 # exceed: quantiles of the t distribution, 0.5 % of one tail up to 8 cases, and 1 % at the last.
 BARS = {2: 63.7, 4: 5.8, 8: 3.5, 12: 2.7}
 GAIN_CASES = (4, 12)  # numbers of cases after which the comparison of gains may end
+GAIN_ERRORS = 1.0  # standard errors by which a lower gain must be better: any of them is usable
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -282,8 +283,8 @@ class StartTest:
     held. Opposites are tried only where no guide passes. More cases are added until one passes, or
     the test would take more than its share of the frames.
 
-    Then lower gains of it are tried in the same way. One is taken if it is better, by the same bar,
-    than the gain above it.
+    Then lower gains of it are tried in further cases. One is taken if it is better by more than a
+    standard error than the best of the gains above it.
 
     Args:
         anchor: the settings.
@@ -361,7 +362,7 @@ class StartTest:
                 self._act(each)
             best = held
             for each in lower:
-                if self._clear(each, best):
+                if self._clear(each, best, GAIN_ERRORS):
                     best = each
             if not self._affordable((self.cases.steps - before) * (GAIN_CASES[-1] / done - 1)):
                 break
@@ -388,11 +389,20 @@ class StartTest:
         ]
         return max(passing, key=self._mean, default=None)
 
-    def _clear(self, better: tuple[float, ...], worse: tuple[float, ...]) -> bool:
-        """Return whether a paired difference exceeds the bar of its number of cases."""
+    def _clear(
+        self, better: tuple[float, ...], worse: tuple[float, ...], errors: float | None = None
+    ) -> bool:
+        """Return whether a paired difference is more than some standard errors.
+
+        Args:
+            better: weights.
+            worse: weights.
+            errors: number of standard errors; None: the bar of the number of cases.
+        """
         differences = self.returns[better] - self.returns[worse]
+        bar = BARS[len(differences)] if errors is None else errors
         mean = float(differences.mean())
-        return mean > 0 and mean > BARS[len(differences)] * float(standard_error(differences))
+        return mean > 0 and mean > bar * float(standard_error(differences))
 
     def _mean(self, weights: tuple[float, ...]) -> float:
         return float(self.returns[weights].mean())

@@ -301,10 +301,10 @@ def test_start_test_ends_when_it_would_take_more_than_its_share():
     assert cases.steps == 600
 
 
-def test_lower_gain_is_taken_only_if_it_is_clearly_better():
+def test_lower_gain_is_taken_only_if_it_is_better():
     weights, *_ = decided(lambda weights: 100 - 60 * abs(weights[0] - 0.5) if weights[0] else 0)
     assert weights == [0.5]
-    weights, *_ = decided(lambda weights: 100 if weights[0] else 0.0)
+    weights, *_ = decided(lambda weights: 100 * weights[0])
     assert weights == [1]
     weights, *_ = decided(lambda weights: 100 * (weights[0] in (-0.75, -1.0)) - weights[0])
     assert weights == [-1], "the opposite keeps its sign"
