@@ -35,10 +35,12 @@ class Plan(Callback):
     Args:
         only_in: classes of envs, one of which the env of the sweep must be; empty for any env.
         because: why other envs cannot be used, and what to do instead.
+        unless: group of files that bring their env, so that a choice of one allows any env; empty:
+            there is none.
     """
 
-    def __init__(self, only_in: Sequence[str] = (), because: str = "") -> None:
-        self.only_in, self.because = tuple(only_in), because
+    def __init__(self, only_in: Sequence[str] = (), because: str = "", unless: str = "") -> None:
+        self.only_in, self.because, self.unless = tuple(only_in), because, unless
 
     def on_run_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Refuse an env that the experiment is not made for."""
@@ -60,6 +62,8 @@ class Plan(Callback):
     def _check(self, config: DictConfig) -> None:
         target = OmegaConf.select(config, "env._target_", throw_on_missing=False)
         if not self.only_in or target in self.only_in or not isinstance(target, str):
+            return
+        if self.unless and self.unless in config.hydra.runtime.choices:
             return
         with contextlib.suppress(ImportError, ValueError):  # no such env, which the check refuses
             if _derives(get_object(target), self.only_in):

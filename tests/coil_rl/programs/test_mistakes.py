@@ -398,6 +398,10 @@ def test_resume_checks_the_configuration_before_it_trains(started, run, tmp_path
         ("evaluate", "method=ppo"),
         ("evaluate", "+action.x=1"),
         ("listen", "guide=random"),
+        *(
+            pytest.param("listen", change, marks=pytest.mark.slow)
+            for change in ("env.laps=2", "preset=authors", "method=ppo", "+action.x=1")
+        ),
     ],
 )
 def test_override_of_what_a_run_provides_is_refused(started, run, name, change):

@@ -159,6 +159,13 @@ def test_half_bounded_actions_have_equal_digits_wherever_the_bound_is(method, tm
     check_equal(tmp_path, boxes, method)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("method", FAST)
+def test_methods_of_the_fast_tests_have_equal_digits_in_the_other_boxes_too(method, tmp_path):
+    check_equal(tmp_path / "bounded", BOXES, method)
+    check_equal(tmp_path / "half bounded", HALF, method)
+
+
 @pytest.mark.parametrize("squash", ["true", "false"])
 def test_clipped_actions_have_equal_digits_too(squash, tmp_path):
     boxes = {name: BOXES[name] for name in ("unit", "shifted")}
