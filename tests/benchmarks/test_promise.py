@@ -10,8 +10,8 @@ from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
 SMALL = [
-    "env.max_steps=30",
-    "budget.frames=600",
+    "env.max_steps=15",
+    "budget.frames=300",
     "budget.num_envs=2",
     "budget.steps=50",
     "evaluation.cases=2",

@@ -110,7 +110,7 @@ def test_start_test_holds_a_guide_that_swings_up_and_the_opposite_of_a_reversed_
 
 @pytest.mark.parametrize("degrade", ["random", "zeroed"])
 def test_start_test_holds_no_useless_guide(degrade):
-    assert start_test("env=pendulum", f"degrade={degrade}")[0] == [0]
+    assert start_test("env=pendulum", "env.max_steps=50", f"degrade={degrade}")[0] == [0]
 
 
 def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():

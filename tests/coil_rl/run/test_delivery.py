@@ -129,7 +129,7 @@ def test_sentence_needs_a_test(tmp_path):
 
 
 def test_killed_run_ends_with_the_same_files(tmp_path):
-    overrides = ["method=coil_anchored", "checkpoint_every=2"]
+    overrides = ["method=coil_anchored", "checkpoint_every=2", "budget.frames=2400"]
     whole = trained(tmp_path / "whole", *overrides)
     stopped = trained(tmp_path / "stopped", *overrides)
     for name in ("evaluation.csv", "evaluation.md", DELIVERY, "policy_best.pt", "policy_last.pt"):
