@@ -76,7 +76,7 @@ def _reward(run: Run, driver: str) -> float:
 
 
 def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
-    """Return a row of the table for each arm of a task, and each arm but `alone`.
+    """Return a row of the table for each arm of a task, except for `alone`.
 
     Args:
         name: of the task.

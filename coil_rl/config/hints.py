@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl import conf
 from coil_rl.errors import did_you_mean
 
+OF_CONES = ("track", "preset")  # groups of the cone world
 # Names of hyper-parameters elsewhere (Stable-Baselines3, CleanRL, rsl_rl), and ours.
 OTHER_NAMES = {
     "lr": "learning_rate",

@@ -30,7 +30,6 @@ LAUNCHERS = {
 }
 
 
-OF_CONES = ("track", "preset")
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
 # OmegaConf adds no typed node by an override.
@@ -84,7 +83,7 @@ def _not_composed(error: BaseException) -> str:
         if without_package:
             return without_package
     group = NO_GROUP.match(str(error))
-    if group is not None and group[2] in OF_CONES:
+    if group is not None and group[2] in hints.OF_CONES:
         return _group_of_cones(group[1], group[2])
     for key_error in (error, error.__cause__):
         if isinstance(key_error, (ConfigAttributeError, ConfigKeyError)):

@@ -15,6 +15,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from coil_rl.config.hints import OF_CONES
 from coil_rl.errors import UserError
 
 # Where the files are whose order of composition is meant.
@@ -27,7 +28,6 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
-OF_CONES = ("track", "preset")  # groups of the cone world
 SEVERAL = ("guide", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 

@@ -151,12 +151,13 @@ class AnchoredInputs(TensorDictModuleBase):
         self.in_keys = [key for part in parts for key in part.in_keys]
         self.out_keys = [key for part in parts for key in part.out_keys]
         super().__init__()
-        self.parts, self.shown = nn.ModuleList(parts), (shown,)  # a tuple: it is no part twice
+        self.parts = nn.ModuleList(parts)
 
     @property
     def hold(self) -> Hold:
         """The weights."""
-        return self.shown[0].hold
+        hold: Hold = self.parts[-1].hold  # type: ignore[assignment]
+        return hold
 
     def reads(self, keys: Sequence[NestedKey]) -> list[NestedKey]:
         """Return the keys that a network reads in place of `keys`."""

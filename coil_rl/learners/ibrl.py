@@ -168,7 +168,7 @@ class IBRL(SAC):
                     "edit is a fraction of the range of the action, but it has no bounds; "
                     "take edit=0"
                 )
-            editor = self.build_actor(env, [*in_keys, ADVICE], network, anchor=None)
+            editor = self.build_actor(env, [*in_keys, ADVICE], network)
         loss = ProposalLoss(partial(self.choice, space=space, editor=editor), arguments)
         loss.target_entropy  # noqa: B018  becomes part of the state at the first access
         return loss

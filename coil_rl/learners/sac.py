@@ -144,7 +144,7 @@ class SAC(OffPolicy):
             seed=seed,
         )
         self.action_scale, self.action_gain = action_scale, action_gain
-        self.actor = self.build_actor(env, in_keys, network, anchor)
+        self.actor = self.build_actor(env, in_keys, network)
         if target_entropy is None:
             target_entropy = -networks.action_shape(env).numel()
         critic = replace(network, layer_norm=True) if critic_layer_norm else network
@@ -165,7 +165,7 @@ class SAC(OffPolicy):
         self._extend(auxiliary)
 
     def build_actor(
-        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp, anchor: Anchor | None
+        self, env: EnvBase, in_keys: Sequence[NestedKey], network: Mlp
     ) -> ProbabilisticTensorDictSequential:
         """Return a policy that reads entries that have been normalised already.
 
@@ -179,7 +179,7 @@ class SAC(OffPolicy):
             self.action_gain,
             state_dependent_scale=True,
             inputs=self.inputs,
-            anchor=anchor,
+            anchor=self.anchor,
         )
         if self.inputs is None:
             return policy

@@ -29,6 +29,7 @@ from coil_rl.report.runs import DELIVERY
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.curve import EvaluationCurve
+from coil_rl.run.judge import guide_titles
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.combined_actions import GradualResidual, ResidualAction
 
@@ -108,13 +109,15 @@ class Delivery:
         returns = self._tested(candidates, last)
         means = {name: float(values.mean()) for name, values in returns.items()}
         chosen = max(means, key=lambda name: means[name])
-        self._write(chosen, candidates[chosen], returns, earlier)
+        cases = len(returns["last"])
+        checkpoint.save(candidates[chosen], self.folder / "policy_best.pt")
+        self._report(chosen, means, cases, earlier)
         guides = [mean for name, mean in means.items() if name not in ("last", "earlier")]
         numbers = (
             means["last"],
             means.get("earlier", math.nan),
             max(guides, default=math.nan),
-            float(len(returns["last"])),
+            float(cases),
         )
         return dict(zip(self.names, numbers, strict=True))
 
@@ -143,8 +146,7 @@ class Delivery:
         if hold is not None and bool(hold.held) and self.curve is not None:
             return {"first": checkpoint.load(self.curve.file(0))}
         found = [part for part in self.env.modules() if isinstance(part, GuideActions)]
-        names = found[0].names if found else []
-        titles = ["guide"] if len(names) == 1 else [f"guide {name}" for name in names]
+        titles = guide_titles(found[0].names) if found else []
         return {title: {GUIDE: torch.tensor(index)} for index, title in enumerate(titles)}
 
     def _tested(self, candidates: Mapping[str, Any], last: dict[str, Any]) -> dict[str, Tensor]:
@@ -152,35 +154,34 @@ class Delivery:
 
         An earlier policy is left out where the frames do not allow for it.
         """
-        tested, returns = dict(candidates), dict[str, Tensor]()
+        names, returns = list(candidates), dict[str, Tensor]()
         self.cases.begin()
         begun, count = self.cases.steps, FIRST_CASES
         while count > 0:
             self.cases.renew(count)
-            for name, state in candidates.items():
+            for name in names:
                 with_one_more = (self.cases.steps - begun) * (1 + 1 / max(len(returns), 1))
                 if name == "earlier" and name not in returns and with_one_more > self.reserve:
-                    tested.pop(name, None)
-                if name in tested:
-                    policy = policy_of(state, self.learner, self.env)
-                    known = returns.get(name, torch.empty(0))
-                    returns[name] = torch.cat([known, self.cases.returns(policy)])
+                    continue
+                policy = policy_of(candidates[name], self.learner, self.env)
+                known = returns.get(name, torch.empty(0))
+                returns[name] = torch.cat([known, self.cases.returns(policy)])
+            names = list(returns)
             done, taken = len(returns["last"]), self.cases.steps - begun
             affordable = int(self.reserve * done / taken)  # as long as those so far
             count = min(affordable, MOST_CASES) - done
         self.learner.policy.load_state_dict(last)
         return returns
 
-    def _write(
-        self, chosen: str, state: Any, returns: Mapping[str, Tensor], earlier: Path | None
+    def _report(
+        self, chosen: str, means: Mapping[str, float], cases: int, earlier: Path | None
     ) -> None:
-        """Write what is handed over, and why."""
-        checkpoint.save(state, self.folder / "policy_best.pt")
+        """Write which policy is handed over, and why."""
         report = {
             "policy": chosen,
-            "cases": len(returns["last"]),
+            "cases": cases,
             "steps": self.cases.steps,
-            "returns": {name: float(values.mean()) for name, values in returns.items()},
+            "returns": means,
             "frames": int(earlier.stem) if chosen == "earlier" and earlier is not None else None,
         }
         write_text(self.folder / DELIVERY, json.dumps(report, indent=2))
@@ -194,10 +195,21 @@ def policy_of(state: dict[str, Any], learner: Learner, env: EnvBase) -> TensorDi
         learner: has the policy, which gets the weights.
         env: with the transforms of the run.
     """
-    if GUIDE in state:
-        return GuideActs(env, int(state[GUIDE]))
+    guide = guide_of(state, env)
+    if guide is not None:
+        return guide
     learner.policy.load_state_dict(state)
     return learner.policy
+
+
+def guide_of(state: Mapping[str, Any], env: EnvBase) -> GuideActs | None:
+    """Return the guide that a file of weights stands for; None for a file of a policy.
+
+    Args:
+        state: of the file.
+        env: with the transforms of the run.
+    """
+    return GuideActs(env, int(state[GUIDE])) if GUIDE in state else None
 
 
 def handed_over(folder: Path) -> str | None:

@@ -114,8 +114,6 @@ class EnvMaker:
 
         Its actions are in the unit of the env.
 
-        Its actions are in the unit of the env.
-
         Args:
             rows: number of rows for each guide. Those of the first guide come first.
             cases: as above.

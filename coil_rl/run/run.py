@@ -28,7 +28,7 @@ from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import EvaluationCurve, Watch, measures
-from coil_rl.run.delivery import GUIDE, Delivery, GuideActs, handed_over
+from coil_rl.run.delivery import Delivery, guide_of, handed_over
 from coil_rl.run.experiment import PUT_BACK, Experiment, watched_keys
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
@@ -470,10 +470,11 @@ class Run:
             UserError: if the file is missing, damaged, or does not fit the policy.
         """
         path = weights_file(self.folder, self.file_of(which))
-        guide = checkpoint.load(path, self.device).get(GUIDE)
+        state = checkpoint.load(path, self.device)
+        guide = guide_of(state, env)
         if guide is not None:
-            return GuideActs(env, int(guide))
-        load_weights(policy, path, self.device)
+            return guide
+        put_weights(policy, state, path)
         return policy
 
     def _trial_with_reason(self) -> Trial:
@@ -597,7 +598,20 @@ def load_weights(policy: TensorDictModuleBase, path: Path, device: str = "cpu") 
         UserError: if the file is missing or damaged, does not fit the policy, or holds weights that
             are not finite.
     """
-    state = checkpoint.load(path, device)
+    put_weights(policy, checkpoint.load(path, device), path)
+
+
+def put_weights(policy: TensorDictModuleBase, state: Any, path: Path) -> None:
+    """Put the weights that were read from a file into a policy.
+
+    Args:
+        policy: gets the weights.
+        state: what the file holds.
+        path: of the file, for messages.
+
+    Raises:
+        UserError: if they do not fit the policy, or are not finite.
+    """
     try:
         policy.load_state_dict(state)
     except UserError as error:
