@@ -110,6 +110,8 @@ def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str,
         better = np.full(len(seeds), guide)
     mean, low, high = (100 * float(each) / scale for each in mean_interval(ends - better))
     rows = [arm.runs[seed].curve for seed in seeds]
+    lowest = [_lowest(arm.runs[seed]) for seed in seeds]
+    held = [each for each in lowest if not math.isnan(each)]  # their number is in the column `held`
     seconds = [(arm.runs[seed].seconds, alone.runs[seed].seconds) for seed in seeds]
     return {
         "task": name,
@@ -122,7 +124,7 @@ def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str,
         "low": low,
         "high": high,
         "verdict": verdict(mean, low, high),
-        "lowest": 100 * min(_lowest(arm.runs[seed]) for seed in seeds) / scale,
+        "lowest": 100 * min(held, default=math.nan) / scale,
         "tests": 100 * max(each[-1]["frames/tests"] / each[-1]["frames"] for each in rows),
         "held": _counted(f"{each[0].get('start/weight', math.nan):g}" for each in rows),
         "handed_over": _counted(arm.runs[seed].handed_over for seed in seeds),
