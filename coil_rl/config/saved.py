@@ -8,6 +8,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from coil_rl.config.measured import complete_measures
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import check_config
@@ -61,6 +62,7 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
         for name, value in (changes or {}).items():
             saved[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)
+        complete_measures(config)
         OmegaConf.to_container(config, throw_on_missing=True)
     except (OmegaConfBaseException, yaml.YAMLError, ValueError, OSError) as error:
         raise UserError(f"{path} is not the configuration of a run ({sentence(error)})") from error

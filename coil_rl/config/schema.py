@@ -121,7 +121,7 @@ class EvaluationConfig(NodeConfig):
     """Evaluation of a policy; `cases` is their number, or a node that gives their names."""
 
     cases: Any = 1
-    measures: dict[str, MeasureConfig] = field(default_factory=dict)
+    measures: dict[str, Any] = field(default_factory=dict)  # of `MeasureConfig`, see `measured`
     pictures: dict[str, Any] = field(default_factory=dict)
     sections: dict[str, Any] | None = None  # of coil-listen
     env: dict[str, Any] = field(default_factory=dict)
@@ -300,8 +300,17 @@ OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_ro
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
 
 _store = ConfigStore.instance().store
-_store(name="schema", node=TrainConfig)
-_store(name="evaluate_schema", node=EvaluateConfig)
+
+
+def _open_to_measures(schema: type[DrivingConfig]) -> DictConfig:
+    """Return a schema to which the command line may add measures without a plus sign."""
+    config = OmegaConf.structured(schema)
+    OmegaConf.set_struct(config.evaluation.measures, False)
+    return config
+
+
+_store(name="schema", node=_open_to_measures(TrainConfig))
+_store(name="evaluate_schema", node=_open_to_measures(EvaluateConfig))
 _store(name="report_schema", node=ReportConfig)
-_store(name="listen_schema", node=ListenConfig)
+_store(name="listen_schema", node=_open_to_measures(ListenConfig))
 _store(name="replay_schema", node=ReplayConfig)

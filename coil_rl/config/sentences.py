@@ -32,11 +32,6 @@ LAUNCHERS = {
 
 TYPED = re.compile(r"Could not override '([^']+)'")
 MERGED = re.compile(r"Error merging override (.+)")
-# OmegaConf adds no typed node by an override.
-NO_NEW_MEASURE = (
-    "a measure cannot be added on the command line; write evaluation: {measures: {NAME: {entry: "
-    "KEY}}} in a file of yours, such as that of an env or experiment"
-)
 NO_GROUP = re.compile(r"(?:In '([^']+)': )?Could not override '([\w/]+)'\. No match")
 NO_INTEGER = re.compile(
     r"override ([\w.]+)=.*Value '([\d.eE+]+)' of type 'float' could not be converted to Integer",
@@ -122,8 +117,6 @@ def _wrong_kind(override: str, cause: str) -> str:
         return f"{override} must be true or false"
     if "is not a ListConfig" in cause:
         return f"{override} must be a list; write {key}=[{value}]"
-    if "is not a subclass of MeasureConfig" in cause:
-        return f"{override}: {NO_NEW_MEASURE}"
     if "does not support deletion" in cause:
         return f"{override}: {key.lstrip('~')} cannot be left out; give it another value"
     return ""
@@ -197,8 +190,6 @@ def _unknown_key(error: OmegaConfBaseException, typed: re.Match[str] | None) -> 
     """
     key, parent = str(error.full_key or error.key), error.parent_node
     names = parent if isinstance(parent, DictConfig) else []
-    if key.startswith("evaluation.measures.") and key.count(".") == 2:
-        return f"there is no key {key}: {NO_NEW_MEASURE}"
     known = [str(name) for name in names if name not in ("hydra", "defaults")]
     node = key.rpartition(".")[0] or "the configuration"
     unchosen = hints.unchosen(key, typed[1] if typed else key)

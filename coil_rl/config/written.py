@@ -16,6 +16,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from coil_rl.config.hints import OF_CONES
+from coil_rl.config.measured import complete_measures
 from coil_rl.errors import UserError
 
 # Where the files are whose order of composition is meant.
@@ -63,7 +64,8 @@ def keep_written(
         hydra: overrides of the command line for Hydra.
 
     Raises:
-        UserError: for a value that two files give differently, or that has no place.
+        UserError: for a value that two files give differently, or that has no place, and for a
+            measure that is none.
     """
     overrides = [*task, *hydra]
     loader: Any = GlobalHydra.instance().config_loader()
@@ -91,6 +93,7 @@ def keep_written(
                     f"{written.file}; leave one out, or give it on the command line"
                 )
             _put(config, written)
+        complete_measures(config)
 
 
 def _put(config: DictConfig, written: Written) -> None:

@@ -1,0 +1,44 @@
+"""Measures of episodes in a configuration: from files, and from the command line."""
+
+from collections.abc import Mapping
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from coil_rl.config.schema import MeasureConfig
+from coil_rl.config.sentences import sentence
+from coil_rl.errors import UserError
+
+# Columns that evaluation.csv and episodes.csv have besides the measures.
+TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "seed")
+
+
+def complete_measures(config: DictConfig) -> None:
+    """Give measures their types, and the values that a person left out.
+
+    The schema leaves them untyped, because OmegaConf adds no typed node by an override.
+
+    Args:
+        config: composed; it is changed in place.
+
+    Raises:
+        UserError: for a measure that is no node, has an unknown key or a value of another type, or
+            whose name is another column of the tables.
+    """
+    measures = OmegaConf.select(config, "evaluation.measures")
+    for name in measures or ():
+        key = f"evaluation.measures.{name}"
+        if name in TAKEN:
+            raise UserError(
+                f"{key}: {name} is already a column of the tables; give the measure another name"
+            )
+        if not isinstance(measures[name], Mapping):
+            raise UserError(
+                f"{key}={measures[name]} is no measure; write {key}.entry=ENTRY and, where it is "
+                "not the mean over the steps, its reduction"
+            )
+        try:
+            typed = OmegaConf.merge(OmegaConf.structured(MeasureConfig), measures[name])
+        except OmegaConfBaseException as error:
+            raise UserError(f"{key}: {sentence(error)}") from error
+        OmegaConf.update(config, key, typed, merge=False)
