@@ -21,6 +21,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.config.build import assemble
 from coil_rl.config.check import check
+from coil_rl.config.default_method import method_for
 from coil_rl.config.given import import_path, keep
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_own
@@ -108,7 +109,7 @@ def prepare(
     env_words, env_nodes = _env(env, f"{folder}#env")
     guide_words, guide_nodes = _guide(guide, f"{folder}#guide")
     words = [*env_words, *guide_words]
-    words.append(f"method={method or ('ppo' if guide is None else 'coil_anchored')}")
+    words.append(f"method={method or method_for(guide)}")
     if frames is not None:
         words.append(f"budget.frames={frames}")
     words += [f"seed={seed}", *overrides]
