@@ -11,7 +11,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 from scipy.spatial import cKDTree
 
 Array = NDArray[np.float64]
@@ -115,6 +114,8 @@ class Track:
             side: "left" or "right".
             spacing: m, largest distance of two points along the chords.
         """
+        from scipy.interpolate import CubicSpline  # takes half a second
+
         cones: Array = getattr(self, side)
         chord = np.concatenate([[0.0], np.linalg.norm(_edges(cones), axis=1).cumsum()])
         curve = CubicSpline(chord, np.vstack([cones, cones[:1]]), bc_type="periodic")

@@ -11,7 +11,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d, maximum_filter1d
 
 from coil_rl.envs.track import Array, Track, TrackError
 
@@ -88,6 +87,8 @@ def _draw(seed: int, k: int, name: str) -> Track:
 
 def _centre_line(rng: np.random.Generator, lap: float) -> Line:
     """Draw a closed anticlockwise line of length `lap` with equidistant points: [lap / STEP]."""
+    from scipy.ndimage import gaussian_filter1d  # only drawn tracks need it
+
     corners = _corners(rng, _outline(rng, max(3, round(CELLS_PER_METRE * lap - 1))))
     edges = np.roll(corners, -1) - corners
     shorter = np.minimum(np.abs(edges), np.roll(np.abs(edges), -1))
@@ -190,6 +191,8 @@ def _drivable(line: Line, width: Array) -> bool:
 
 def _start(line: Line) -> int | None:
     """Return the middle of the straightest 8 m, or None if these are too curved."""
+    from scipy.ndimage import maximum_filter1d
+
     bends = maximum_filter1d(np.abs(_curvature(line)), round(8 / STEP) + 1, mode="wrap")
     return int(bends.argmin()) if bends.min() < 0.06 else None
 

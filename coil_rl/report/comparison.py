@@ -1,4 +1,7 @@
-"""Comparison of policies over seeds: agents grouped by label, and their guides."""
+"""Comparison of policies over seeds: agents grouped by label, and their guides.
+
+pandas is imported where it is used, because a training does without it.
+"""
 
 from __future__ import annotations
 
@@ -6,15 +9,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from coil_rl.errors import UserError
 from coil_rl.measures import Measure
 from coil_rl.report.runs import DRIVER, GUIDE, Run
 from coil_rl.report.statistics import Array, Estimate, count_of_seeds, estimate, holm, wins
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LABELS_IN_NAME = 2  # of a guide, if there are several guides of one name
 
@@ -72,6 +77,8 @@ class Group:
         Args:
             measure: name of the measure, "reward", or "score".
         """
+        import pandas as pd
+
         index, score = self.table.index.unique("seed"), measure == "score"
         values = self.table["reward" if score else measure].to_numpy().reshape(len(index), -1)
         if score and self.reference is not None:
@@ -349,6 +356,8 @@ def _references(guides: Sequence[Group], runs: Sequence[Run]) -> dict[tuple[str,
 
 def _join_runs(runs: Sequence[Run]) -> pd.DataFrame:
     """Join the evaluations of the runs of one label."""
+    import pandas as pd
+
     first: dict[int, Run] = {}
     for run in runs:
         if run.seed in first:
@@ -401,6 +410,8 @@ class _Guide:
 
     def table(self) -> pd.DataFrame:
         """Return all different evaluations, numbered by the column of the seed."""
+        import pandas as pd
+
         numbered = [rows.assign(seed=number) for number, rows in enumerate(self.results.values())]
         return _index(f"the guide of {self.labels[0]}", pd.concat(numbered))
 

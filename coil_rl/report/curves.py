@@ -10,7 +10,6 @@ from itertools import cycle
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -290,9 +289,10 @@ def points(run: Rows, key: str) -> Array:
         run: rows of `metrics.csv`.
         key: column of the values.
     """
-    table = pd.DataFrame(list(run), columns=["frames", key], dtype=float)
-    return table[np.isfinite(table).all(axis=1)].sort_values("frames", kind="stable").to_numpy()
+    table = np.stack([_column(run, "frames"), _column(run, key)], axis=1)
+    known = table[np.isfinite(table).all(axis=1)]
+    return known[known[:, 0].argsort(kind="stable")]
 
 
-def _column(rows: Sequence[Mapping[str, float]], key: str) -> Array:
+def _column(rows: Rows, key: str) -> Array:
     return np.array([row.get(key, np.nan) for row in rows], dtype=np.float64)

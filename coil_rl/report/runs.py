@@ -1,20 +1,29 @@
-"""Configuration, evaluation and learning curve of finished runs, read from their folders."""
+"""Configuration, evaluation and learning curve of finished runs, read from their folders.
 
+pandas takes half a second to import, so only what reads an evaluation does. A training does not.
+"""
+
+from __future__ import annotations
+
+import csv
 import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-import pandas as pd
 import yaml
 
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, LARGEST_TABLE, read_file, read_text
 from coil_rl.measures import Measure, measures_of
 from coil_rl.plain_yaml import read_yaml
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 GUIDE = "guide"  # in the column `driver` of evaluation.csv
 DRIVER = ("driver", "advice", "actions", "case")
@@ -25,6 +34,12 @@ PER_STEP = "per_step_"  # prefix of the measures of tasks
 TERM = "reward_"  # prefix of the measures of the terms of the reward
 DELIVERY = "delivery.json"  # of a run: which policy it hands over, and why
 RESTORE = "restore the file, or remove the run from the folder"
+
+
+def _no_rows() -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame()
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +67,7 @@ class Run:
     label: str
     seed: int
     needs_guide: bool | None
-    evaluation: pd.DataFrame = field(default_factory=pd.DataFrame, repr=False)
+    evaluation: pd.DataFrame = field(default_factory=_no_rows, repr=False)
     measures: Mapping[str, Measure] = field(default_factory=dict, repr=False)
     curve: Sequence[dict[str, float]] = field(default=(), repr=False)
     guide_returns: Mapping[str, float] = field(default_factory=dict)
@@ -186,7 +201,12 @@ def _read_evaluation(path: Path, shown: Iterable[str]) -> pd.DataFrame:
         path: of the file.
         shown: measures that reports show, of which there must be a column.
     """
-    frame = _read_csv(path)
+    import pandas as pd
+
+    rows = read_table(path)
+    if not rows:
+        raise ValueError("no rows")
+    frame = pd.DataFrame(rows)
     for name in shown:
         if name not in frame and set(DRIVER) <= set(frame):
             raise ValueError(f"no column {name}")
@@ -209,19 +229,35 @@ def read_curve(file: Path | BinaryIO) -> list[dict[str, float]]:
     Raises:
         ValueError: if a cell is no number, or `frames` is missing.
     """
-    frame = _read_csv(file).astype(float)
-    if not np.isfinite(frame.get("frames", np.nan)).all():
+    rows = [{name: float(cell) for name, cell in row.items()} for row in read_table(file)]
+    if not all(np.isfinite(row.get("frames", np.nan)) for row in rows):
         raise ValueError("not every row has its number of frames")
-    return frame.to_dict("records")
+    return rows
 
 
-def _read_csv(path: Path | BinaryIO) -> pd.DataFrame:
-    """Read all cells as text.
+def read_table(file: Path | BinaryIO) -> list[dict[str, str]]:
+    """Return the rows of a CSV file by the names of its columns, all cells as text.
 
     So numbers keep every digit, and an empty cell is an error where a number is expected.
+
+    Args:
+        file: its path, or the opened file.
+
+    Raises:
+        ValueError: for a file that is no text or empty, and for a row with more values than there
+            are columns; one with fewer, as while it is written, is filled with "nan".
     """
-    file = io.BytesIO(read_file(path, LARGEST_TABLE)) if isinstance(path, Path) else path
-    frame = pd.read_csv(file, dtype=str, keep_default_na=False)
-    if not isinstance(frame.index, pd.RangeIndex):
+    content = read_file(file, LARGEST_TABLE) if isinstance(file, Path) else file.read()
+    try:
+        lines = list(csv.reader(io.StringIO(content.decode("utf-8"), newline=""), strict=True))
+    except csv.Error as error:
+        raise ValueError(str(error)) from error
+    if not lines or not lines[0]:
+        raise ValueError("No columns")
+    columns = lines[0]
+    if len(set(columns)) < len(columns):
+        raise ValueError("two columns of one name")
+    rows = [line for line in lines[1:] if line]
+    if any(len(row) > len(columns) for row in rows):
         raise ValueError("a row with more values than columns")
-    return frame
+    return [dict(zip_longest(columns, row, fillvalue="nan")) for row in rows]

@@ -1,6 +1,7 @@
 """Tables of results as Markdown, aligned for terminals, and as CSV."""
 
 import csv
+import math
 import os
 from collections.abc import Mapping, Sequence
 from importlib import resources
@@ -8,7 +9,6 @@ from itertools import chain
 from numbers import Real
 from typing import Any
 
-import pandas as pd
 import tabulate
 import yaml
 
@@ -52,7 +52,7 @@ def markdown_table(
             )
     values = [[_to_python(row.get(key)) for key in columns] for row in rows]
     numeric = [
-        all(pd.isna(value) or _is_number(value) for value in column)
+        all(_is_missing(value) or _is_number(value) for value in column)
         for column in zip(*values, strict=True)
     ]
     specs = [spec for _, spec in columns.values()]
@@ -90,12 +90,16 @@ def _to_python(value: object) -> object:
     return value
 
 
+def _is_missing(value: object) -> bool:
+    return value is None or (isinstance(value, float) and math.isnan(value))
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _format(value: object, spec: str) -> str:
-    if pd.isna(value):
+    if _is_missing(value):
         return "-"
     if isinstance(value, bool):
         return "yes" if value else "no"

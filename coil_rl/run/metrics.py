@@ -8,12 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
-
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import LARGEST_TABLE, read_file, whole_file
 from coil_rl.output import decoration
-from coil_rl.report.runs import RETURN, read_curve
+from coil_rl.report.runs import RETURN, read_curve, read_table
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
 
@@ -71,12 +69,16 @@ class Metrics:
         for number, values in results.items():
             self.rows[number] |= values
             self.log(values, int(self.rows[number]["frames"]))
-        file = io.BytesIO(read_file(self.path, LARGEST_TABLE))
-        text = pd.read_csv(file, dtype=str, keep_default_na=False)
+        rows: list[dict[str, Any]] = list(read_table(self.path))
         for number, values in results.items():
-            text.loc[number, list(values)] = list(map(str, values.values()))
-        with whole_file(self.path) as unfinished:
-            text.to_csv(unfinished, index=False, lineterminator="\r\n")
+            rows[number] |= values
+        with (
+            whole_file(self.path) as unfinished,
+            unfinished.open("w", encoding="utf-8", newline="") as file,
+        ):
+            writer = csv.DictWriter(file, list(rows[0]))
+            writer.writeheader()
+            writer.writerows(rows)
 
     def newest(self, name: str = RETURN) -> float | None:
         """Return the newest number in a column; None if there is none yet."""

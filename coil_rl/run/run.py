@@ -9,9 +9,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import pandas as pd
 import torch
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
@@ -47,6 +46,9 @@ from coil_rl.run.parts import TESTS, TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
 from coil_rl.run.stopping import resume_command
 from coil_rl.transforms.normalised_action import given_units, units_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 INIT = "init.pt"  # the policy that a run began from
 HANDED_OVER = "handed_over"  # name of the policy that `delivery` chose
@@ -204,6 +206,8 @@ class Run:
         Raises:
             UserError: if the cases of the env have names, so that there is no other number of them.
         """
+        import pandas as pd  # a training does without it
+
         trial = self.trial if cases is None else trial_with_cases(self.trial, cases)
         policy = self.policy()
         fallback = self.make_fallback(policy) if self.fallback else None
