@@ -7,7 +7,6 @@ within milliseconds and need no compiler.
 """
 
 import hashlib
-import os
 import platform
 import shutil
 import warnings
@@ -21,6 +20,7 @@ import torch
 from torch import Tensor, nn
 from torch.fx import GraphModule
 
+from coil_rl.envs.kept_tables import cache_folder
 from coil_rl.errors import UserError
 from coil_rl.files import whole_file
 from coil_rl.output import say
@@ -79,18 +79,13 @@ def library(function: Callable[..., Sequence[Tensor]], arguments: Sequence[Tenso
     """
     graph = record(function, arguments)
     device = arguments[0].device
-    path = folder() / f"{fingerprint(graph, arguments)}.so"
+    path = cache_folder() / f"{fingerprint(graph, arguments)}.so"
     if not path.is_file():
         compile_graph(graph, arguments, path)
     runners = torch._C._aoti
     if device.type == "cpu":
         return runners.AOTIModelContainerRunnerCpu(str(path), 1)
     return runners.AOTIModelContainerRunnerCuda(str(path), 1, str(device))
-
-
-def folder() -> Path:
-    """Return the folder of the compiled libraries, `coil-rl` in the user's cache folder."""
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "coil-rl"
 
 
 def compile_steps(env: nn.Module) -> None:

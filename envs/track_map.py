@@ -5,17 +5,20 @@ that may be visible, and on a fine grid the distance to each boundary. A step of
 then reads a few numbers per car.
 """
 
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Iterator, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from coil_rl.envs.constants import constant
+from coil_rl.envs.kept_tables import Tables, kept
 from coil_rl.envs.sight import HALF_FIELD_OF_VIEW, SIGHT
 from coil_rl.envs.splines import slots_in_use
 from coil_rl.envs.track import SIDES, Track
@@ -174,10 +177,28 @@ class Grid:
 
 
 # Cached and shared, because programs build several envs with the same tracks, which takes seconds
-# for a hundred.
+# for a hundred; and kept for the next program.
 @lru_cache(maxsize=8)
-def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> dict[str, Tensor]:
+def _tables(tracks: tuple[Track, ...], sight: float, dtype: torch.dtype) -> Tables:
     """Return the buffers of a `TrackMap` by name."""
+    make = partial(_computed_tables, tracks, sight, dtype)
+    return kept("tracks", _source(tracks, sight, dtype), make)
+
+
+def _source(tracks: Sequence[Track], sight: float, dtype: torch.dtype) -> Iterator[bytes]:
+    """Yield everything that the buffers follow from, this program included."""
+    folder = Path(__file__).parent
+    for file in ("track_map.py", "track.py", "sight.py"):
+        yield (folder / file).read_bytes()
+    yield f"{np.__version__} {scipy.__version__} {sight} {dtype}".encode()
+    for track in tracks:
+        for array in (track.left, track.right, np.array(track.start)):
+            yield array.tobytes()
+
+
+def _computed_tables(
+    tracks: Sequence[Track], sight: float, dtype: torch.dtype
+) -> dict[str, Tensor]:
     cones = _cone_table(tracks)
     slots = cones.shape[-1]
     used, visible, near = zip(*(nearby_cones(track, sight, dtype) for track in tracks), strict=True)

@@ -1,0 +1,141 @@
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from coil_rl.envs import Track, shipped_tracks
+from coil_rl.envs.kept_tables import MOST_FILES, cache_folder, kept, packed, unpacked
+from coil_rl.envs.track_map import TrackMap, _computed_tables, _tables
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    _tables.cache_clear()
+    return cache_folder()
+
+
+def numbers() -> dict[str, Tensor]:
+    return {
+        "field": torch.arange(200_000, dtype=torch.float32),
+        "empty": torch.zeros(0, 3, dtype=torch.int16),
+        "counts": torch.tensor([[1, -(2**40)]]),
+    }
+
+
+class Computed:
+    """Makes the tables, and counts how often."""
+
+    def __init__(self) -> None:
+        self.times = 0
+
+    def __call__(self) -> dict[str, Tensor]:
+        self.times += 1
+        return numbers()
+
+
+def equal(tables: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
+    return list(tables) == list(others) and all(
+        tables[name].dtype == others[name].dtype and torch.equal(tables[name], others[name])
+        for name in tables
+    )
+
+
+def test_tables_are_computed_once_for_each_source(cache: Path) -> None:
+    make = Computed()
+    for source in ([b"a", b"b"], [b"a", b"b"], [b"ab"], [b"a", b"b"]):
+        assert equal(dict(kept("numbers", source, make)), numbers())
+    assert make.times == 2
+    assert len(list(cache.iterdir())) == 2
+
+
+def cut(content: bytes) -> bytes:
+    return content[:1000]
+
+
+def flipped(content: bytes) -> bytes:
+    return content[:-7] + bytes([content[-7] ^ 1]) + content[-6:]
+
+
+def foreign(content: bytes) -> bytes:
+    return b"cos\nsystem\n(S'touch /tmp/hacked'\ntR."
+
+
+def empty(content: bytes) -> bytes:
+    return b""
+
+
+@pytest.mark.parametrize("change", [cut, flipped, foreign, empty])
+def test_damaged_file_is_computed_anew_and_replaced(
+    change: Callable[[bytes], bytes], cache: Path
+) -> None:
+    make = Computed()
+    kept("numbers", [b"a"], make)
+    (file,) = cache.iterdir()
+    whole = file.read_bytes()
+    file.write_bytes(change(whole))
+    assert equal(dict(kept("numbers", [b"a"], make)), numbers())
+    assert make.times == 2
+    assert file.read_bytes() == whole
+
+
+def test_objects_of_python_are_no_tables() -> None:
+    rest = b'{"field": ["object", 3]}\n' + bytes(100)
+    with pytest.raises(ValueError, match="of object"):
+        unpacked(hashlib.sha256(rest).hexdigest().encode() + rest)
+
+
+def test_tables_come_back_from_bytes_as_they_were() -> None:
+    assert equal(unpacked(packed(numbers())), numbers())
+
+
+def test_folder_that_cannot_be_used_costs_nothing_but_time(cache: Path) -> None:
+    cache.parent.mkdir(exist_ok=True)
+    cache.write_text("a file in its place")
+    make = Computed()
+    for _ in range(2):
+        assert equal(dict(kept("numbers", [b"a"], make)), numbers())
+    assert make.times == 2
+    assert cache.is_file()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes of Windows have no path")
+def test_pipe_in_place_of_a_file_is_not_waited_for(cache: Path) -> None:
+    kept("numbers", [b"a"], Computed())
+    (file,) = cache.iterdir()
+    file.unlink()
+    os.mkfifo(file)
+    assert equal(dict(kept("numbers", [b"a"], Computed())), numbers())
+    assert file.is_file()
+
+
+def test_files_that_were_not_used_for_long_are_removed(cache: Path) -> None:
+    make = Computed()
+    for number in range(MOST_FILES + 3):
+        kept("numbers", [str(number).encode()], make)
+        for age, file in enumerate(sorted(cache.iterdir(), key=lambda path: path.stat().st_mtime)):
+            os.utime(file, (age, age))
+        kept("numbers", [b"0"], make)  # its time of use is now
+    assert len(list(cache.iterdir())) == MOST_FILES
+    assert make.times == MOST_FILES + 3
+
+
+def test_map_of_kept_tables_is_that_of_computed_ones(cache: Path) -> None:
+    tracks = tuple(shipped_tracks("test")[:1])
+    computed = _computed_tables(tracks, 7.0, torch.float32)
+    for _ in range(2):
+        _tables.cache_clear()
+        assert equal(dict(TrackMap(tracks).named_buffers()), computed)
+    assert len(list(cache.iterdir())) == 1
+
+
+def test_map_of_other_tracks_has_its_own_tables(cache: Path, ring: Track) -> None:
+    (track,) = shipped_tracks("test")[:1]
+    moved = Track(track.name, track.left + 0.5, track.right + 0.5)
+    for tracks, sight in (([track], 7.0), ([moved], 7.0), ([track], 6.0), ([track, ring], 7.0)):
+        TrackMap(tracks, sight=sight)
+    assert len(list(cache.iterdir())) == 4
