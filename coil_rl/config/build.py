@@ -1,6 +1,6 @@
 """From a configuration to a run: its envs, guides, learner, evaluation and budget."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from tensordict import NestedKey
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 
+from coil_rl.config.beside import unread_controllers
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
@@ -208,9 +209,14 @@ def env_maker(config: DictConfig) -> EnvMaker:
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return build_bare_env(config, cases_node(config, rows, cases, count))
 
+    def of_agent(rows: int | None, cases: str, count: int | None) -> EnvBase:
+        unread = unread_controllers(config, _all_transforms(config))
+        return build_bare_env(config, cases_node(config, rows, cases, count), unread)
+
     curve = config.evaluation.curve
     return EnvMaker(
         bare,
+        of_agent=of_agent,
         transforms=partial(build_transforms, config),
         guides=lambda: build_guides(config) if config.guide else {},
         degrade=partial(build_all, config.degrade, "degrade"),
@@ -242,10 +248,26 @@ def cases_node(
     return {**curve.env, **number, **curve.cases[cases], **own}
 
 
-def build_bare_env(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> EnvBase:
-    """Return the env of a configuration without transforms."""
-    env: EnvBase = build(env_node(config, overrides), "env", EnvBase)
+def build_bare_env(
+    config: DictConfig,
+    overrides: Mapping[str, Any] | None = None,
+    without: Collection[str] = (),
+) -> EnvBase:
+    """Return the env of a configuration without transforms, and `without` some controllers."""
+    node = env_node(config, overrides)
+    if without:
+        beside = node["controllers"].items()
+        node["controllers"] = {name: thing for name, thing in beside if name not in without}
+    env: EnvBase = build(node, "env", EnvBase)
     return env
+
+
+def _all_transforms(config: DictConfig) -> list[Transform]:
+    """Return the transforms of all envs of an agent, if there are controllers beside the env."""
+    if not OmegaConf.select(config, "env.controllers"):
+        return []
+    kinds = ("", *config.evaluation.advice)
+    return [part for advice in kinds for part in build_transforms(config, advice)]
 
 
 def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:

@@ -45,6 +45,7 @@ class EnvMaker:
     Args:
         bare: makes the env without transforms for a number of rows, a set of cases and the number
             of different cases.
+        of_agent: makes it without what only guides that act alone read of it; None: it is the same.
         transforms: makes the transforms of the method; its argument is the name of a further kind
             of advice, or empty.
         guides: makes the guides by name.
@@ -54,6 +55,7 @@ class EnvMaker:
 
     bare: BareEnv
     _: KW_ONLY
+    of_agent: BareEnv | None = None
     transforms: Callable[[str], Sequence[Transform]] = lambda advice: ()
     guides: Callable[[], Mapping[str, TensorDictModuleBase]] = dict
     degrade: Callable[[], Sequence[Transform]] = tuple
@@ -81,7 +83,8 @@ class EnvMaker:
         Raises:
             UserError: if the transforms do not fit the env, or each other.
         """
-        return self.around(self.bare(rows, cases, count), advice)
+        bare = self.bare if self.of_agent is None else self.of_agent
+        return self.around(bare(rows, cases, count), advice)
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
         """Return any env with normalised actions and the transforms of the method.
