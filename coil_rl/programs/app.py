@@ -231,6 +231,7 @@ def _do(
 ) -> Any:
     """Do a task after a check of its configuration, and return its result."""
     _listen()
+    _draw_into_files()
     if Jobs.is_sweep() and "existing" in config:
         config.existing = "resume"  # so that a sweep goes on by the same command
     keep_written(config, str(HydraConfig.get().job.config_name), *typed())
@@ -249,6 +250,7 @@ def program(name: str) -> Iterator[None]:
     After one of the last three a training first ends its update and saves its state.
     """
     _listen()
+    _draw_into_files()
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     warnings.formatwarning = lambda message, *_, **__: f"{name}: {message}\n"
     sys.stdout, sys.stderr = SafeStream(sys.stdout), SafeStream(sys.stderr)
@@ -286,6 +288,15 @@ def _listen() -> None:
         # A program under nohup ignores SIGHUP.
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
             signal.signal(number, _interrupt)
+
+
+def _draw_into_files() -> None:
+    """Choose a backend for matplotlib that needs no window and no notebook, in this process.
+
+    `MPLBACKEND` may name one that does not exist here: a notebook sets it for all that it starts,
+    and matplotlib ends its import with an error.
+    """
+    os.environ["MPLBACKEND"] = "agg"
 
 
 def _interrupt(signum: int, frame: FrameType | None) -> None:

@@ -6,7 +6,7 @@ import sys
 import tomllib
 
 import pytest
-from programs import ROOT, environment, module
+from programs import ROOT, TINY, environment, module, program
 
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 PROGRAMS = sorted(script.removeprefix("coil-") for script in SCRIPTS if script != "coil-info")
@@ -67,3 +67,33 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
 def test_info_imports_nothing_heavy(tmp_path):
     ((code, _, _, heavy),) = start(tmp_path, ["info"])
     assert (code, heavy) == (0, set())
+
+
+BACKENDS = ["nonsense", "module://matplotlib_inline.backend_inline", "module://not.there", "tkagg"]
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_programs_draw_whatever_backend_the_environment_names(backend, tmp_path):
+    # What every program does around its task, and what a task does to draw.
+    script = (
+        "from coil_rl.programs.app import program\n"
+        "with program('train'):\n"
+        "    from matplotlib import pyplot\n"
+        "    pyplot.figure()\n"
+        "    print(pyplot.get_backend().lower())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment(tmp_path) | {"MPLBACKEND": backend},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "agg\n", "")
+
+
+@pytest.mark.slow
+def test_training_in_a_notebook_of_another_environment_ends_well(tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "nonsense")
+    program("train", *TINY, "hydra.run.dir=run", cwd=tmp_path)
+    assert (tmp_path / "run" / "lines.png").exists()
