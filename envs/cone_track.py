@@ -41,9 +41,22 @@ FINISH_RADIUS = 0.625  # m
 
 
 class SeededEnv(EnvBase):
-    """Env that draws all random numbers from `generator`, whose state is part of `state_dict`."""
+    """Env that draws all random numbers from `generator`, whose state is part of `state_dict`.
+
+    Attributes:
+        generator: of all random numbers.
+        different: number of rows that draw where their episodes begin, of B; row i begins as row
+            `i % different`. None: all rows draw.
+    """
 
     generator: torch.Generator
+    different: int | None = None
+
+    def _drawn(self, high: int) -> Tensor:
+        """Draw an integer below `high` for each row, the same for rows that begin alike, [B]."""
+        rows = self.batch_size.numel()
+        drawn = torch.randint(high, (self.different or rows,), generator=self.generator)
+        return drawn if self.different is None else drawn[torch.arange(rows) % self.different]
 
     def __setattr__(self, name: str, value: Any) -> None:
         # For a buffer, the checks of PyTorch take longer than an operation on it.
@@ -327,10 +340,10 @@ class ConeTrackEnv(SeededEnv):
         if self.assignment == "cyclic":
             return cars % count, steps
         # One draw per car, reset or not, keeps the random sequence independent of the data.
-        drawn = torch.randint(count, self.batch_size, generator=self.generator)
+        drawn = self._drawn(count)
         place = drawn.to(self.device).index_select(0, cars)
         if first and self.staggered and self.assignment == "random":
-            over = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
+            over = self._drawn(self.max_steps)
             steps = over.to(steps)
         return place, steps
 

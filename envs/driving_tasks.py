@@ -193,7 +193,7 @@ class DrivingTasksEnv(ConeTrackEnv):
         out = super()._reset(tensordict, **kwargs)
         if self.changing:
             # One draw per car, reset or not, as for the tracks.
-            drawn = torch.randint(len(self.tasks), self.batch_size, generator=self.generator)
+            drawn = self._drawn(len(self.tasks))
             drawn = drawn.to(self.device, non_blocking=True)
             mask = None if tensordict is None else tensordict.get("_reset", None)
             self.task = drawn if mask is None else torch.where(mask.view(-1), drawn, self.task)

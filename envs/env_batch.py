@@ -87,7 +87,7 @@ class SeededRows(SeededEnv):
         # One draw per row, reset or not, keeps the random sequence independent of the data.
         seeds = [(self.first_seed or 0) + row % self.cases for row in range(count)]
         if self.first_seed is None:
-            seeds = torch.randint(SEEDS, (count,), generator=self.generator).tolist()
+            seeds = self._drawn(SEEDS).tolist()
         self.seeds = self.seeds or seeds
         ended = list(range(count))
         if mask is not None:

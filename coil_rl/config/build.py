@@ -1,6 +1,6 @@
 """From a configuration to a run: its envs, guides, learner, evaluation and budget."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, Transform
 
 from coil_rl.config.beside import unread_controllers
 from coil_rl.config.nodes import build, build_all, find_target
+from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
 from coil_rl.config.saved import identity, settings
 from coil_rl.errors import UserError
 from coil_rl.learners.learner import Learner
@@ -24,6 +25,8 @@ from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.judge import Evaluation, Trial, evaluate_guides, guide_titles
 from coil_rl.run.parts import TEST, TESTS, TRAIN, EnvMaker
 from coil_rl.run.run import Budget, GuideReturns, Run
+from coil_rl.run.tuned_run import TunedRun
+from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import nested_key
 
@@ -40,7 +43,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
     from coil_rl.config.load import load_guides
 
     folder = Path(config.run_dir) if folder is None else folder
-    make_env = env_maker(config)
+    make_env = env_maker(config, folder)
     trains = trains_guides(config)
 
     def make_learner(env: EnvBase) -> Learner:
@@ -50,15 +53,19 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         each_phase = config.evaluation.guides == "phases"
         return [GuideReturns(make_env, learner.guides, each_phase=each_phase)] if trains else []
 
-    return Run(
+    has_learner = config.method.observes is not None and not config.method.search
+    make_run: Callable[..., Run] = Run
+    if config.method.search:
+        make_run = partial(TunedRun, **_searched(config))
+    return make_run(
         folder,
         make_env,
-        None if config.method.observes is None else make_learner,
+        make_learner if has_learner else None,
         partial(trial, config, make_env),
         budget(config),
         label=config.label,
         seed=config.seed,
-        watch=OmegaConf.to_container(config.watch),  # type: ignore[arg-type]
+        watch=OmegaConf.to_container(config.watch),
         failure=measures_of(config.evaluation.measures).get("crashed"),
         noise_correlation=config.training.noise_correlation,
         logger=partial(build, config.logger, "logger") if config.logger else None,
@@ -74,6 +81,15 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         settings=settings(config),
         identity=identity(config),
     )
+
+
+def _searched(config: DictConfig) -> dict[str, Any]:
+    """Return the arguments of a run that tunes its guide, besides those of any run."""
+    return {
+        "numbers": numbers_to_tune(config),
+        "make_guide": GuideWithNumbers(config),
+        "search": build(config.method.search, "method.search", Search),
+    }
 
 
 def budget(config: DictConfig) -> Budget:
@@ -111,7 +127,7 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         pictures=pictures,
         guides=guide_titles(config.guide),
         guide_results=partial(guide_results, config),
-        together=has_agent and advises_only(config),
+        together=has_agent and not config.method.search and advises_only(config),
         advice=list(config.evaluation.advice) if config.method.transforms else [],
         repeats=config.evaluation.repeats,
         compiled=config.compile,
@@ -203,8 +219,16 @@ def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationRe
     return evaluate_guides(make_env, evaluation, build_guides(config))
 
 
-def env_maker(config: DictConfig) -> EnvMaker:
-    """Return the maker of the envs of a configuration."""
+def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
+    """Return the maker of the envs of a configuration.
+
+    Args:
+        config: of `coil-train`, composed or read from a folder.
+        folder: of the run, which may have found other numbers for its guide.
+    """
+
+    def transforms(advice: str) -> list[Transform]:
+        return build_transforms(config if folder is None else with_tuned(config, folder), advice)
 
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return build_bare_env(config, cases_node(config, rows, cases, count))
@@ -217,7 +241,7 @@ def env_maker(config: DictConfig) -> EnvMaker:
     return EnvMaker(
         bare,
         of_agent=of_agent,
-        transforms=partial(build_transforms, config),
+        transforms=transforms,
         guides=lambda: build_guides(config) if config.guide else {},
         degrade=partial(build_all, config.degrade, "degrade"),
         sizes={str(cases): curve.num_envs for cases in curve.cases},
@@ -323,7 +347,12 @@ def observed_keys(config: DictConfig) -> list[NestedKey]:
 
 
 def learner_kind(config: DictConfig) -> str:
-    """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`."""
+    """Return the attribute `kind` of the learner class: `agent`, `imitation` or `guides`.
+
+    It is `none` for a method that has no learner.
+    """
+    if config.method.search:
+        return "none"
     target = find_target(config.learner.get("_target_"), "learner")
     if isinstance(target, type) and issubclass(target, Learner):
         return target.kind

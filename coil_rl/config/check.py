@@ -24,6 +24,7 @@ from coil_rl.config.distillation import (
 )
 from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
+from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
 from coil_rl.envs.env_batch import SeededRows
@@ -35,6 +36,7 @@ from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.run import HANDED_OVER
+from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.guide_actions import UnfitActionError
 
@@ -65,6 +67,7 @@ def check_parts(config: DictConfig) -> None:
     if has_agent:
         _check_kind(config)
     if trains:
+        _check_tuning(config)
         _check_delivery(config, has_agent=has_agent)
     make_env = build.env_maker(config)
     cases = len(build.build_evaluation(config).cases)
@@ -95,6 +98,30 @@ def _check_kind(config: DictConfig) -> None:
             f"method={config.method.name} needs a learner that {purpose}, such as "
             f"learner={example}, but {learner} is one that {KINDS[kind][0]}"
         )
+
+
+def _check_tuning(config: DictConfig) -> None:
+    """Raise a `UserError` for numbers that cannot be tuned, or that nothing tunes."""
+    if not config.method.search:
+        if config.tune:
+            raise UserError(
+                f"tune has no effect: method={config.method.name} does not tune its guide; give "
+                "method=tune, or leave tune out"
+            )
+        return
+    if config.delivery != "tested":
+        raise UserError(
+            f"delivery={config.delivery}: method={config.method.name} always tests what it hands "
+            "over; leave it out"
+        )
+    build_node(config.method.search, "method.search", Search)
+    numbers = numbers_to_tune(config)
+    make_guide = GuideWithNumbers(config)
+    for end in (0.0, 1.0):
+        try:
+            make_guide({number.name: number.value(end) for number in numbers})
+        except UserError as error:
+            raise UserError(f"tune: a bound is no value of the guide: {error}") from error
 
 
 def _check_delivery(config: DictConfig, *, has_agent: bool) -> None:
@@ -235,6 +262,10 @@ def _check_cases(cases: int, make: Callable[[], Any]) -> None:
 
 
 def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
+    if config.method.search:
+        _check_curve(config, make_env)
+        make_env()
+        return
     if not build.observed_keys(config):
         raise UserError(
             "observes=[]: the agent has no observations; give the entries of the env that it "

@@ -20,7 +20,7 @@ from torchrl.envs import (
     set_exploration_type,
 )
 
-from coil_rl.config.build import assemble, build_transforms
+from coil_rl.config.build import assemble
 from coil_rl.config.saved import read_config
 from coil_rl.errors import UserError
 from coil_rl.guides import PerRow
@@ -97,7 +97,7 @@ class _AllRows(TensorDictModuleBase):
         # The transforms need the specs of an env; some need at least two rows.
         env = run.make_env.bare(2, TRAIN, None)
         first = normalising(env)
-        env = TransformedEnv(env, Compose(*first, *build_transforms(config)))
+        env = TransformedEnv(env, Compose(*first, *run.make_env.transforms("")))
         self.policy = run.load_policy(env, which)
         memory = memory_keys(self.policy)
         self.in_keys, self.out_keys = list(self.policy.in_keys), ["action", *memory]

@@ -4,8 +4,9 @@ Where a name is not enough, an object may be given.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import resources
 from pathlib import Path
@@ -40,6 +41,7 @@ def train(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path | None = None,
+    tune: Mapping[str, Any] | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Train a policy, evaluate it beside its guide, and return the run.
@@ -56,6 +58,8 @@ def train(
         frames: length of the run; by default that of the env's file.
         seed: of everything.
         folder: for everything that the run writes; by default a new one in outputs/train.
+        tune: of method="tune": bounds of numbers of the guide by name, [low, high] or [low, high,
+            "log"].
         overrides: further words of the command line, such as "learner.gamma=0.98".
 
     Raises:
@@ -77,6 +81,7 @@ def train(
         frames=frames,
         seed=seed,
         folder=folder,
+        tune=tune,
         overrides=overrides,
     )
     return run.train()
@@ -90,6 +95,7 @@ def prepare(
     frames: int | None = None,
     seed: int = 0,
     folder: str | Path,
+    tune: Mapping[str, Any] | None = None,
     overrides: Sequence[str] = (),
 ) -> Run:
     """Return a run that is checked and ready to train.
@@ -101,27 +107,85 @@ def prepare(
         frames: as for `train`.
         seed: as for `train`.
         folder: as for `train`.
+        tune: as for `train`.
         overrides: as for `train`.
 
     Raises:
         UserError: for a mistake in an argument.
     """
-    env_words, env_nodes = _env(env, f"{folder}#env")
-    guide_words, guide_nodes = _guide(guide, f"{folder}#guide")
-    words = [*env_words, *guide_words]
+    given = named(env, guide, str(folder))
+    words = list(given.words)
     words.append(f"method={method or method_for(guide)}")
     if frames is not None:
         words.append(f"budget.frames={frames}")
+    if tune is not None:
+        given.nodes["tune"] = dict(tune)
     words += [f"seed={seed}", *overrides]
-    config = compose_train([*words, f"run_dir={quoted(str(folder))}"])
-    with open_dict(config):
-        for place, node in (env_nodes | guide_nodes).items():
-            OmegaConf.update(config, place, node, merge=False, force_add=True)
+    return prepared(Named(words, given.nodes), folder)
+
+
+@dataclass(frozen=True)
+class Named:
+    """What chooses an env and a guide, and everything else.
+
+    Args:
+        words: of the command line.
+        nodes: for objects that have no name, by their key.
+    """
+
+    words: list[str]
+    nodes: dict[str, Any]
+
+
+def named(env: Any, guide: Any, place: str) -> Named:
+    """Return what chooses an env and a guide.
+
+    Args:
+        env: as for `train`.
+        guide: as for `train`.
+        place: under which objects without a name are kept.
+
+    Raises:
+        UserError: for something that is no env or guide.
+    """
+    env_words, env_nodes = _env(env, f"{place}#env")
+    guide_words, guide_nodes = _guide(guide, f"{place}#guide")
+    return Named([*env_words, *guide_words], env_nodes | guide_nodes)
+
+
+def prepared(given: Named, folder: str | Path) -> Run:
+    """Return a run that is checked and ready to train.
+
+    Args:
+        given: everything that it consists of.
+        folder: of the run.
+
+    Raises:
+        UserError: for a mistake.
+    """
+    config = composed(given, folder)
     trust_own(config)
     check(config)
     run = assemble(config)
-    run.command = ["coil-train", *words]
+    run.command = ["coil-train", *given.words]
     return run
+
+
+def composed(given: Named, folder: str | Path) -> DictConfig:
+    """Return the configuration of a run.
+
+    Args:
+        given: everything that it consists of.
+        folder: of the run.
+
+    Raises:
+        UserError: for words that do not fit.
+    """
+    config = compose_train([*given.words, f"run_dir={quoted(str(folder))}"])
+    with open_dict(config):
+        for place, node in given.nodes.items():
+            OmegaConf.update(config, place, node, merge=False, force_add=True)
+    return config
 
 
 def _new_folder() -> Path:

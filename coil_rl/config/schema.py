@@ -138,14 +138,16 @@ class EvaluationConfig(NodeConfig):
 class MethodConfig(NodeConfig):
     """A method: transforms of the agent, the kind of its learner, and what it observes.
 
-    `observes` are entries besides those of the env.
+    `observes` are entries besides those of the env. `search` is for a method that tunes its guide
+    instead of training a learner; its learner is "none".
     """
 
     name: str = MISSING
     observes: list[Any] | None = MISSING  # None: no agent
     transforms: dict[str, Any] = field(default_factory=dict)
     needs_guide: bool = MISSING
-    learner: Annotated[str, one_of("agent", "imitation", "guides")] = "agent"
+    learner: Annotated[str, one_of("agent", "imitation", "guides", "none")] = "agent"
+    search: dict[str, Any] = field(default_factory=dict)  # of the numbers of a guide
 
 
 @dataclass
@@ -211,6 +213,7 @@ class TrainConfig(DrivingConfig):
     proxy: ProxyConfig | None = None
     checkpoint_every: Positive = 10
     delivery: Annotated[str, one_of("last", "tested")] = "last"
+    tune: Any = None  # bounds of numbers of the guide, by name
     existing: Annotated[str, one_of("refuse", "resume")] = "refuse"
     resume: str | None = None
     init: str | None = None

@@ -190,6 +190,11 @@ def check_read(config: DictConfig, task: Iterable[str], *, trains_guides: bool) 
                 f"{text} has no effect: method={config.method.name} trains no guides, for which a "
                 "proxy would stand; leave it out, or take method=dynamic_coil_sequential"
             )
+        if key.partition(".")[0] == "learner" and config.method.search:
+            raise UserError(
+                f"{text} has no effect: method={config.method.name} tunes its guide and has no "
+                "learner; leave it out"
+            )
         if "." not in key and key not in OF_CONES:
             continue
         if not any(_covers(each, key) for each in REFERRED):

@@ -6,8 +6,9 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
+from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.measures import Measure
 from coil_rl.output import progress
 from coil_rl.run.evaluation import Totals, episodes
@@ -48,12 +49,31 @@ class TrainingCases:
         """Begin a comparison: forget the env of the one before, of which nothing may be left."""
         self.env = None
 
-    def renew(self, count: int) -> None:
-        """Draw that many new cases."""
+    def renew(self, count: int, copies: int = 1) -> None:
+        """Draw that many new cases.
+
+        Args:
+            count: number of cases.
+            copies: number of rows that have each case; row i has case `i % count`. Only an env
+                for which `can_copy` holds has more than one.
+        """
         self.env_seed = int(torch.randint(SEEDS, (), generator=self.generator))
-        if self.env is None or self.env.batch_size.numel() != count:
+        self._build(count * copies)
+        seeded = seeded_env(self.env)
+        if seeded is not None:
+            seeded.different = count if copies > 1 else None
+
+    def can_copy(self) -> bool:
+        """Return whether several rows of the env can have the same case."""
+        if self.env is None:
+            self._build(1)
+        return seeded_env(self.env) is not None
+
+    def _build(self, rows: int) -> None:
+        """Make the env with that many rows, unless it has them."""
+        if self.env is None or self.env.batch_size.numel() != rows:
             with torch.random.fork_rng():
-                self.env = self.build(count)
+                self.env = self.build(rows)
 
     @torch.no_grad()
     def returns(self, policy: Callable[..., Any], *, sampled: bool = False) -> Tensor:
@@ -82,6 +102,12 @@ class TrainingCases:
         """Restore what `state_dict` returned."""
         self.generator.set_state(state["generator"])
         self.steps, self.calls = state["steps"], state["calls"]
+
+
+def seeded_env(env: EnvBase | None) -> SeededEnv | None:
+    """Return the env below all transforms, if its rows can begin alike; None for another env."""
+    base = env.base_env if isinstance(env, TransformedEnv) else env
+    return base if isinstance(base, SeededEnv) else None
 
 
 def guide_calls(env: EnvBase) -> int:

@@ -225,7 +225,13 @@ def handed_over(folder: Path) -> str | None:
         report = json.loads(read_file(file, LARGEST_NUMBERS))
         returns = {str(name): float(value) for name, value in report["returns"].items()}
         chosen, cases, frames = str(report["policy"]), int(report["cases"]), report["frames"]
-    names = {"last": "the last policy", "earlier": "an earlier policy", "first": "the first policy"}
+    names = {
+        "last": "the last policy",
+        "earlier": "an earlier policy",
+        "first": "the first policy",
+        "tuned": "the tuned guide",
+        "best_candidate": "the best candidate",
+    }
     if frames is not None:
         names["earlier"] = f"the policy after {int(frames):,} frames"
     listed = ", ".join(f"{names.get(name, name)} {value:.1f}" for name, value in returns.items())

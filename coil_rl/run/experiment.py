@@ -130,7 +130,8 @@ class Experiment:
         if state is not None:
             newest = self.folder / checkpoint.NEWEST
             with file_of_a_run(newest, PUT_BACK):
-                self.check_identity(state["identity"], newest)
+                lengths = (self.frames, *self.stages)
+                check_identity(state["identity"], self.identity, lengths, newest)
                 self.load_state_dict(state)
         self.metrics.truncate(self.updates + 1 if self.updates else 0)
         if self.curve is not None:
@@ -139,25 +140,6 @@ class Experiment:
         if not self.updates:
             where = "from the beginning: there is no checkpoint yet"
         say(f"{self.folder} continues {where}", error=True)
-
-    def check_identity(self, saved: Mapping[str, Any], file: Path) -> None:
-        """Check that a checkpoint belongs to this run.
-
-        A run that was made longer has the checkpoint of the shorter one.
-
-        Raises:
-            UserError: if it belongs to a run with another configuration.
-        """
-        length = ("budget.frames", "budget.stages")
-        ours = {key: value for key, value in self.identity.items() if key not in length}
-        theirs = {key: value for key, value in saved.items() if key not in length}
-        check_same(theirs, ours, f"{file} belongs to a run", PUT_BACK)
-        frames = saved.get("budget.frames", self.frames)
-        if frames not in (self.frames, *self.stages):
-            raise UserError(
-                f"{file} belongs to a run with budget.frames={frames}, not {self.frames}; "
-                f"{PUT_BACK}"
-            )
 
     def run(self, guide_return: float | None = None) -> list[dict[str, float]]:
         """Train to the end and return the rows of `metrics.csv`.
@@ -358,6 +340,34 @@ class Experiment:
         torch.set_rng_state(state["torch_rng"])
         if state["cuda_rng"]:
             torch.cuda.set_rng_state_all(state["cuda_rng"])
+
+
+def check_identity(
+    saved: Mapping[str, Any], ours: Mapping[str, Any], lengths: Sequence[int], file: Path
+) -> None:
+    """Check that a checkpoint belongs to a run.
+
+    A run that was made longer has the checkpoint of the shorter one.
+
+    Args:
+        saved: identity in the checkpoint.
+        ours: identity of the run.
+        lengths: of the run, and earlier ones, in frames.
+        file: of the checkpoint, for messages.
+
+    Raises:
+        UserError: if it belongs to a run with another configuration.
+    """
+    length = ("budget.frames", "budget.stages")
+    one, other = (
+        {key: value for key, value in each.items() if key not in length} for each in (saved, ours)
+    )
+    check_same(one, other, f"{file} belongs to a run", PUT_BACK)
+    frames = saved.get("budget.frames", lengths[0])
+    if frames not in lengths:
+        raise UserError(
+            f"{file} belongs to a run with budget.frames={frames}, not {lengths[0]}; {PUT_BACK}"
+        )
 
 
 class Checkpoints:

@@ -157,6 +157,11 @@ class Run:
         return self.make_trial()
 
     @property
+    def has_agent(self) -> bool:
+        """Whether the run has a policy, and not only a guide that acts alone."""
+        return self.make_learner is not None
+
+    @property
     def chosen(self) -> str:
         """Policy that is evaluated, "last" or "best"."""
         return self.file_of(self.which)
@@ -222,7 +227,7 @@ class Run:
             which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
         """
         env = self.make_env(1, TRAIN)
-        if self.make_learner is None:
+        if not self.has_agent:
             env, policy = self.make_env.guided(1, TRAIN)
             return Controller(env, policy, self.folder)
         return Controller(env, self.load_policy(env, which or self.which), self.folder)
@@ -234,7 +239,7 @@ class Run:
             env: of the run, such as `run.make_env(rows)`; by default a new one.
             which: policy, "handed_over", "last" or "best"; by default the one that is evaluated.
         """
-        if self.make_learner is None:
+        if not self.has_agent:
             return None
         return self.load_policy(self.make_env() if env is None else env, which or self.which)
 
@@ -308,7 +313,7 @@ class Run:
         try:
             if resumed:
                 report_changed_versions(self.folder)
-            policy = None if self.make_learner is None else self.learn(resumed=resumed)
+            policy = self.learn(resumed=resumed) if self.has_agent else None
             fallback = self.make_fallback(policy) if self.fallback else None
             judge(self._trial_with_reason(), policy, self.folder, self.seed, fallback)
             reward = report_outcome(self.folder)
@@ -326,7 +331,7 @@ class Run:
 
     def _say_next(self) -> None:
         """Print the command that usually follows a training."""
-        if self.make_learner is not None:
+        if self.has_agent:
             rows = read_curve(self.folder / "metrics.csv")
             say(next_step(self.folder, self.budget.frames, rows))
 
@@ -358,7 +363,7 @@ class Run:
             before: frames that were taken before it.
         """
         make_learner = self.make_learner
-        require_agent(make_learner, self.folder)
+        require_agent(self.folder, has_agent=self.has_agent)
         env = self.make_env(self.budget.rows)
         _say_units(env)
         if self.compiled:
@@ -457,7 +462,7 @@ class Run:
             UserError: if the policy is missing, damaged, or does not fit the configuration.
         """
         make_learner = self.make_learner
-        require_agent(make_learner, self.folder)
+        require_agent(self.folder, has_agent=self.has_agent)
         return self._loaded(make_learner(env).policy, env, which)  # type: ignore[misc]
 
     def _loaded(
@@ -496,7 +501,7 @@ class Run:
         The own env and tracks of the run are not built. Arguments and errors are those of
         `load_policy`; a policy that cannot act in this env is a `UserError` too.
         """
-        require_agent(self.make_learner, self.folder)
+        require_agent(self.folder, has_agent=self.has_agent)
         try:
             transformed = self.make_env.around(env)
             return transformed, self.load_policy(transformed, which)
@@ -641,7 +646,7 @@ def _say_units(env: EnvBase) -> None:
         say(f"action: {'; '.join(units.assumed)}", error=True)
 
 
-def require_agent(make_learner: Any, folder: Path) -> None:
+def require_agent(folder: Path, *, has_agent: bool) -> None:
     """Raise a `UserError` for a run without an agent."""
-    if make_learner is None:
+    if not has_agent:
         raise UserError(f"{folder} has no agent: its guide drives alone; give that guide instead")

@@ -158,9 +158,9 @@ class SimulatedRobotEnv(SeededEnv):
         # All robots draw and measure, reset or not: the order of random numbers must not depend on
         # the data.
         if self.assignment != "cyclic":
-            drawn = torch.randint(len(self.start_track), self.batch_size, generator=self.generator)
+            drawn = self._drawn(len(self.start_track))
             if mask is None and self.staggered and self.assignment == "random":
-                steps = torch.randint(self.max_steps, self.batch_size, generator=self.generator)
+                steps = self._drawn(self.max_steps)
             self.place = drawn if mask is None else torch.where(mask.view(-1), drawn, self.place)
         mask = torch.ones(self.batch_size, dtype=torch.bool) if mask is None else mask.view(-1)
         place = self.place

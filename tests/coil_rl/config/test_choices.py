@@ -13,8 +13,8 @@ from coil_rl.config.choices import WITH_CHOICES
 from coil_rl.errors import UserError
 
 METHODS = sorted(path.stem for path in (Path(__file__).parents[3] / "conf" / "method").glob("*"))
-# They have no agent, or need several guides.
-OTHERS = ("guide", "coil_multi")
+# They have no agent, or need several guides, or numbers of a guide.
+OTHERS = ("guide", "coil_multi", "tune")
 
 
 class Switches(gymnasium.Env):

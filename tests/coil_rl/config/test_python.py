@@ -1,6 +1,7 @@
 """Runs from Python: the lines of the docs on a stranger's package, and what an object may be."""
 
 import csv
+import json
 import math
 
 import numpy as np
@@ -248,3 +249,27 @@ def test_edited_configuration_of_a_finished_run_is_refused(tmp_path):
     file.write_text(file.read_text().replace("gamma: 0.99", "gamma: 0.9"))
     refused = called("train", f"resume={run.folder}", "trust=[thermostat]", code=2).stderr
     assert "belongs to a run with learner.gamma=0.99, not 0.9" in refused
+
+
+class Proportional:
+    """A controller with one gain."""
+
+    def __init__(self, gain=0.1):
+        self.gain = gain
+
+    def act(self, observation):
+        return [self.gain * float(observation[2])]
+
+
+def test_numbers_of_a_class_are_tuned(tmp_path):
+    run = coil_rl.train(
+        "Pendulum-v1",
+        guide=Proportional,
+        method="tune",
+        tune={"gain": [-2, 2]},
+        frames=700,
+        folder=tmp_path / "run",
+        overrides=SHORT,
+    )
+    assert set(json.loads((run.folder / "tuned.json").read_text())) == {"gain"}
+    assert run.controller().act(np.zeros(3, np.float32)).shape == (1,)

@@ -63,7 +63,8 @@ def refusal(method, learner):
     return REFUSED.get(method) or REFUSED_BY[learner].get(method)
 
 
-PAIRS = [(method, learner) for method in METHODS if method != "guide" for learner in GIVEN]
+WITHOUT = ("guide", "tune")
+PAIRS = [(method, learner) for method in METHODS if method not in WITHOUT for learner in GIVEN]
 # The other pairs are refused for the same reasons.
 REFUSED_FAST = [
     ("oil", "ppo"),

@@ -124,3 +124,17 @@ def test_cases_of_the_cone_world_are_new_places_with_the_whole_time_limit():
     assert len(env.start_track) == 2000
     assert make_env(2, TRAIN).base_env.assignment == "random"
     assert assemble(config).delivery == "tested"
+
+
+@pytest.mark.parametrize("env", ["env=pendulum", "env=cone_track track=generated env.rate=6"])
+def test_rows_may_begin_in_the_same_cases(env):
+    cases, _ = built(*env.split())
+    assert cases.can_copy()
+    cases.renew(2, copies=3)
+    first = cases.env.reset()["observation"].reshape(3, 2, -1)
+    assert torch.equal(first[0], first[1])
+    assert torch.equal(first[0], first[2])
+    assert not torch.equal(first[0, 0], first[0, 1])
+    cases.renew(6)
+    first = cases.env.reset()["observation"].reshape(6, -1)
+    assert len(first.unique(dim=0)) == 6

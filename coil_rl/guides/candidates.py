@@ -1,0 +1,60 @@
+"""Several guides as one, each on its own part of the rows: those that a search compares."""
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+
+from coil_rl.transforms.action_space import ActionSpace
+
+
+class Candidates(TensorDictModuleBase):
+    """Guide that acts by one of several guides of one kind in each part of the rows.
+
+    The rows are divided evenly: of [B] rows the first B / N are those of the first of N guides.
+
+    Args:
+        guides: of one class, with the same entries.
+    """
+
+    def __init__(self, guides: Sequence[TensorDictModuleBase]) -> None:
+        first = guides[0]
+        self.in_keys: list[NestedKey] = list(first.in_keys)
+        self.out_keys: list[NestedKey] = list(first.out_keys)
+        super().__init__()
+        self.foreign = getattr(first, "foreign", False)
+        self.space: ActionSpace | None = None
+        self.guides = nn.ModuleList(guides)
+
+    def replace(self, guides: Sequence[TensorDictModuleBase]) -> None:
+        """Act by other guides of the same class from here on, in new episodes.
+
+        Args:
+            guides: perhaps of another number.
+        """
+        self.guides = nn.ModuleList(guides)
+        if self.space is not None:
+            self.in_space(self.space)
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Tell the guides that ask for it which actions there are.
+
+        Args:
+            space: of the env.
+        """
+        self.space = space
+        for guide in self.guides:
+            if hasattr(guide, "in_space"):
+                guide.in_space(space)  # type: ignore[operator]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the actions, and what the guides remember for their next step."""
+        rows = len(tensordict) // len(self.guides)
+        parts = [
+            guide(part) for guide, part in zip(self.guides, tensordict.split(rows), strict=True)
+        ]
+        for key in self.out_keys:
+            tensordict.set(key, torch.cat([part[key] for part in parts]))
+        return tensordict

@@ -1,0 +1,103 @@
+"""The numbers of guides that `tune` names: which there are, and what is refused."""
+
+import pytest
+from hydra import compose, initialize_config_module
+
+from coil_rl.config.numbers import GuideWithNumbers, numbers_of, numbers_to_tune, with_numbers
+from coil_rl.errors import UserError
+
+
+class PID:
+    """A controller with three gains and a horizon."""
+
+    def __init__(self, kp=1.0, ki=0, kd=0.1, horizon: int = 5, name="mine", clip=True):
+        self.kp, self.horizon = kp, horizon
+
+    def act(self, observation):
+        return [self.kp * float(observation[0])]
+
+
+CONTROLLER = {
+    "_target_": "coil_rl.guides.ControllerGuide",
+    "of": f"{__name__}:PID",
+    "in_keys": None,
+    "options": {"kp": 2.0},
+}
+
+
+def composed(*overrides):
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        return compose("train", ["method=tune", "run_dir=unused", *overrides])
+
+
+def test_numbers_of_a_controller_are_the_arguments_of_its_class():
+    found = numbers_of(CONTROLLER, "guide.controller")
+    assert found == {"kp": (2, False), "ki": (0, False), "kd": (0.1, False), "horizon": (5, True)}
+
+
+def test_numbers_of_a_function_are_its_arguments_and_the_items_of_lists():
+    node = composed("env=cart_pole").guide.linear_feedback
+    assert numbers_of(node, "guide") == {
+        "weights.0": (0.1, False),
+        "weights.1": (0.3, False),
+        "weights.2": (1.0, False),
+        "weights.3": (0.5, False),
+    }
+
+
+def test_numbers_of_the_spline_guide_are_the_arguments_of_its_class():
+    assert {"gain", "smoothing", "sharpness"} <= set(
+        numbers_of(dict(composed().guide.spline), "guide.spline")
+    )
+
+
+def test_node_gets_other_numbers_and_keeps_the_rest():
+    changed = with_numbers(CONTROLLER, "guide.controller", {"ki": 0.5, "horizon": 3.0})
+    assert changed["options"] == {"kp": 2.0, "ki": 0.5, "horizon": 3}
+    assert CONTROLLER["options"] == {"kp": 2.0}
+
+
+def test_guide_is_built_with_other_items_of_a_list():
+    make = GuideWithNumbers(composed("env=cart_pole"))
+    guide = make({"weights.2": -1.0})
+    assert guide.module.keywords["weights"] == [0.1, 0.3, -1.0, 0.5]
+
+
+def test_bounds_are_read_with_the_own_value():
+    [kp] = numbers_to_tune(composed("env=pendulum", "tune={gain: [0.1, 10, log]}"))
+    assert (kp.name, kp.low, kp.high, kp.own, kp.log) == ("gain", 0.1, 10.0, 5.0, True)
+    assert kp.value(kp.place(2.5)) == pytest.approx(2.5)
+    assert kp.value(0.5) == pytest.approx(1.0)
+
+
+def test_items_of_lists_may_be_named_by_nested_keys():
+    config = composed("env=cart_pole", "tune={weights: {2: [0, 2]}}")
+    assert [number.name for number in numbers_to_tune(config)] == ["weights.2"]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "sentence"),
+    [
+        ("tune={gian: [0, 1]}", "tune.gian is no number of the guide; guide.swing_up has gain"),
+        ("tune={gain: [2, 1]}", "lower bound must be below"),
+        ("tune={gain: [1, 1]}", "lower bound must be below"),
+        ("tune={gain: [0, 1, log]}", "must be above 0"),
+        ("tune={gain: [-1, 1, log]}", "must be above 0"),
+        ("tune={gain: [a, 1]}", "'a' is not a number"),
+        ("tune={gain: [true, 2]}", "true is not a number"),
+        ("tune={gain: [.nan, 2]}", "is not a number"),
+        ("tune={gain: [0, .inf]}", "is not a number"),
+        ("tune={gain: [1]}", r"must be \[low, high\]"),
+        ("tune={gain: [1, 2, linear]}", r"or \[low, high, log\] to search"),
+        ("tune={gain: 3}", r"must be \[low, high\]"),
+        ("tune=gain", "must be the bounds by name"),
+        ("tune={}", "needs the numbers to tune"),
+        ("guide=zero tune={gain: [0, 1]}", "guide.zero has no numbers"),
+        ("guide=none tune={gain: [0, 1]}", "tunes one guide, but there is none"),
+        ("guide=[zero,swing_up] tune={gain: [0, 1]}", "but there is zero, swing_up"),
+    ],
+)
+def test_mistake_is_one_sentence_that_says_what_exists(overrides, sentence):
+    given = overrides.replace(" tune", "|tune").split("|")
+    with pytest.raises(UserError, match=sentence):
+        numbers_to_tune(composed("env=pendulum", *given))
