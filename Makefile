@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench reproduce test test-all test-bench kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -34,6 +34,11 @@ bench: test-bench ## measure the speed of everything, e.g. ARGS='--device cuda'
 
 reproduce: $(INSTALLED) ## make every result of the paper at the smallest budget (BUDGET=paper for the real one)
 	$(BIN)/coil-reproduce all=true budget=$(BUDGET) $(ARGS)
+
+# The source folder is the checkout, so that links lead to the same files as in the repository.
+docs: $(INSTALLED) ## build the documentation into build/docs, offline; a warning is an error
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -q -W --keep-going -c docs -b html . build/docs $(ARGS)
+	@echo "build/docs/index.html"
 
 test: $(INSTALLED) ## run the fast tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
