@@ -123,7 +123,6 @@ class ConeTrackEnv(SeededEnv):
         hold_boundary: whether the boundary estimate stays in place until a cone comes into view. It
             is then made without cones that share their x or y with a nearer one; a side with fewer
             than two lies at the origin.
-        late_observation: whether `observation` is the one of the step before; `cones` are not late.
         finish_in_sight: whether the finish line is between the first cones of the level file that
             are visible from the track's start, in place of the first ones.
         kept_cones: K, the nearest visible cones of each side that are written.
@@ -164,7 +163,6 @@ class ConeTrackEnv(SeededEnv):
         assignment: Literal["random", "drawn", "cyclic"] = "random",
         sight: float = SIGHT,
         hold_boundary: bool = False,
-        late_observation: bool = False,
         finish_in_sight: bool = False,
         kept_cones: int = 16,
         speed: float = 2.0,
@@ -204,7 +202,7 @@ class ConeTrackEnv(SeededEnv):
         self.kept_cones, self.speed, self.car_length = kept_cones, speed, car_length
         self.max_steering = math.radians(max_steering)
         self.fit, self.sight = spline_fit(spline, smoothing), sight
-        self.hold_boundary, self.late_observation = hold_boundary, late_observation
+        self.hold_boundary = hold_boundary
         if finish_in_sight:
             tracks = [begin_in_sight(track, sight, HALF_FIELD_OF_VIEW) for track in tracks]
         self.map = TrackMap(tracks, sight=sight, dtype=dtype).to(self.device)
@@ -271,8 +269,6 @@ class ConeTrackEnv(SeededEnv):
         # m, last boundary estimate, in world coordinates.
         self.samples: Tensor = zeros(2, SAMPLES, 2)
         self.sampled: Tensor = zeros(2)  # 1 for a side with an estimate
-        # Observation that is not yet output.
-        self.latest: Tensor = zeros(4 * SAMPLES if self.late_observation else 0)
         buffers = self.named_buffers(recurse=False)
         self.state_names = [name for name, _ in buffers if name != "weights"]
 
@@ -298,7 +294,6 @@ class ConeTrackEnv(SeededEnv):
             "lap_start": lap_start,
             "samples": samples,
             "sampled": sampled,
-            "latest": observation.t()[: len(self.latest)],
             "in_finish": _in_finish(location) & (lap_start > NEVER),
         }
         for name, value in buffers.items():
@@ -355,7 +350,7 @@ class ConeTrackEnv(SeededEnv):
             steps: [N], number of steps of the time limit that are over.
             start: takes a table over all places [..., P] and returns the columns of the cars.
         """
-        kept = ("track", "pose", "samples", "sampled", "latest")
+        kept = ("track", "pose", "samples", "sampled")
         copied = {name: start(getattr(self, f"start_{name}")) for name in kept}
         copied |= {"steps": steps, "in_finish": start(self.start_in_finish)}
         copied["lap_start"] = steps + start(self.start_lap_start)
@@ -443,14 +438,9 @@ class ConeTrackEnv(SeededEnv):
         return outcome, clearance
 
     def _next_observation(self, frame: Frame, visible: View, cones: Tensor, new: Tensor) -> Tensor:
-        """Estimate the boundaries, and return the observation to output [B, 20].
-
-        With `late_observation` that is the one of the step before.
-        """
+        """Estimate the boundaries, and return the observation [B, 20]."""
         observed = self._observe(frame, visible, cones, new, self.samples, self.sampled)
         observation, self.samples, self.sampled = observed
-        if self.late_observation:
-            observation, self.latest = self.latest.t(), observation.t()
         return observation
 
     def _judged(

@@ -71,7 +71,6 @@ class DrivingTasksEnv(ConeTrackEnv):
             places.
         sight: m, range of view.
         hold_boundary: whether the boundary estimate stays in place until a cone comes into view.
-        late_observation: whether `observation` is the one of the step before.
         finish_in_sight: whether the finish line is between the first cones that are visible from
             the track's start, in place of the first cones of the level file.
         kept_cones: K, the nearest visible cones of each side that are written.
@@ -116,7 +115,6 @@ class DrivingTasksEnv(ConeTrackEnv):
         assignment: Literal["random", "drawn", "cyclic"] = "random",
         sight: float = SIGHT,
         hold_boundary: bool = False,
-        late_observation: bool = False,
         finish_in_sight: bool = False,
         kept_cones: int = 16,
         speed: float = 2.0,
@@ -152,7 +150,6 @@ class DrivingTasksEnv(ConeTrackEnv):
             assignment=assignment,
             sight=sight,
             hold_boundary=hold_boundary,
-            late_observation=late_observation,
             finish_in_sight=finish_in_sight,
             kept_cones=kept_cones,
             speed=speed,

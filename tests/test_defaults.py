@@ -24,6 +24,7 @@ VARIATIONS = {
     ],  # None in the constructor: no options, no controllers
     "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["car_length"],
+    "disturb/late.yaml": ["min_lag", "max_lag", "in_keys", "memory_key"],
     "guide/authors.yaml": ["oddities"],
     "guide/undertuned.yaml": ["gain"],
     "learner/ppo_sb3.yaml": ["learner."],

@@ -198,22 +198,9 @@ class _DrawnAdvice(DegradedAdvice):
         self.rng = SeededGenerator(seed)
 
     def _draw(self, sample: Callable[..., Tensor], advice: Tensor, after_reset: bool) -> Tensor:
-        """Draw one random number for each number of the advice.
-
-        A step draws two and uses the first. A partial reset uses the second of the next step,
-        without advancing the generator: later draws then do not depend on when other rows are
-        reset.
-
-        Args:
-            sample: draws a tensor of a shape with a generator, such as `torch.randn`.
-            advice: the advice.
-            after_reset: whether this is a partial reset.
-        """
-        state = self.rng.generator.get_state() if after_reset else None
-        draws = sample(2, *advice.shape, generator=self.rng.generator)
-        if state is not None:
-            self.rng.generator.set_state(state)
-        return draws[int(after_reset)].to(advice)
+        """Draw one random number for each number of the advice, see `SeededGenerator.draw`."""
+        (draws,) = self.rng.draw(sample, [advice.shape], after_reset=after_reset)
+        return draws.to(advice)
 
     def degrade(self, advice: Tensor, after_reset: bool = False) -> Tensor:
         """Return the degraded advice, [*batch, n_guides, A], in a step or after a partial reset."""

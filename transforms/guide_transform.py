@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import NestedKey, TensorDictBase
@@ -131,6 +131,26 @@ class SeededGenerator(nn.Module):
     def __init__(self, seed: int) -> None:
         super().__init__()
         self.generator = torch.Generator().manual_seed(seed)
+
+    def draw(
+        self, sample: Callable[..., Tensor], shapes: Sequence[torch.Size], *, after_reset: bool
+    ) -> list[Tensor]:
+        """Draw a tensor of each shape, for a step or for the state after a partial reset.
+
+        A step draws two of each and uses the first. A partial reset uses the second of the next
+        step, without advancing the generator: later draws then do not depend on when other rows are
+        reset.
+
+        Args:
+            sample: draws a tensor of a shape with a generator, such as `torch.randn`.
+            shapes: of the tensors.
+            after_reset: whether this is a partial reset.
+        """
+        state = self.generator.get_state() if after_reset else None
+        draws = [sample(2, *shape, generator=self.generator) for shape in shapes]
+        if state is not None:
+            self.generator.set_state(state)
+        return [pair[int(after_reset)] for pair in draws]
 
     def get_extra_state(self) -> Tensor:
         """Return the state of the generator."""

@@ -202,6 +202,7 @@ def advises_only(config: DictConfig) -> bool:
 def guide_results(config: DictConfig, evaluation: Evaluation) -> Mapping[str, EvaluationResult]:
     """Evaluate each guide of a configuration alone; the runs of a sweep share the results."""
     nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
+    nodes["disturb"] = disturbances(config, TEST)
     if not nodes["guide"]:
         return {}
     node = env_node(config, config.evaluation.env)
@@ -215,7 +216,11 @@ def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationRe
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
         return build_bare_env(config, {"num_envs": rows})
 
-    make_env = EnvMaker(bare, degrade=partial(build_all, config.degrade, "degrade"))
+    make_env = EnvMaker(
+        bare,
+        disturb=lambda cases: build_all(config.disturb, "disturb"),
+        degrade=partial(build_all, config.degrade, "degrade"),
+    )
     return evaluate_guides(make_env, evaluation, build_guides(config))
 
 
@@ -241,6 +246,7 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
     return EnvMaker(
         bare,
         of_agent=of_agent,
+        disturb=partial(build_disturbances, config),
         transforms=transforms,
         guides=lambda: build_guides(config) if config.guide else {},
         degrade=partial(build_all, config.degrade, "degrade"),
@@ -305,6 +311,23 @@ def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> 
                 OmegaConf.update(node, key, value, merge=False)
     resolved: Any = OmegaConf.to_container(node, resolve=True)
     return dict(resolved)
+
+
+def build_disturbances(config: DictConfig, cases: str) -> list[Transform]:
+    """Return the transforms that disturb the env of a configuration in a set of cases."""
+    return build_all(disturbances(config, cases), "disturb")
+
+
+def disturbances(config: DictConfig, cases: str) -> dict[str, Any]:
+    """Return the nodes of what disturbs the env in a set of cases, by name.
+
+    They are `disturb` with the overrides of the training or of the evaluation; null leaves one out.
+    """
+    part = config.training if cases in (TRAIN, TESTS) else config.evaluation
+    with open_dict(config):  # `build` checks the keys
+        merged = OmegaConf.merge(config.disturb, part.disturb)
+    nodes: Any = OmegaConf.to_container(merged, resolve=True)
+    return {name: node for name, node in nodes.items() if node is not None}
 
 
 def build_transforms(config: DictConfig, advice: str = "") -> list[Transform]:

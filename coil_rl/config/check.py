@@ -34,7 +34,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
-from coil_rl.run.parts import TEST, EnvMaker
+from coil_rl.run.parts import TEST, EnvMaker, transformed
 from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
@@ -174,6 +174,8 @@ def _check_env(
     for name, guide in guides.items():
         check_guide_in_env(guide, env, f"guide.{name}")
     build_all(config.degrade, "degrade")
+    if build.build_disturbances(config, TEST):
+        transformed(env, make_env.disturb(TEST), "disturb")
     if config.degrade:
         _check_cases(cases, partial(make_env.guided, cases, TEST, guides))
 

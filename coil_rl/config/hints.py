@@ -36,7 +36,7 @@ OTHER_NAMES = {
     "learning_starts": "starts",
     "env_id": "id",
 }
-SEVERAL = ("guide", "degrade")  # groups whose files are nodes by their names
+SEVERAL = ("guide", "disturb", "degrade")  # groups whose files are nodes by their names
 OF_ENVS = {"env.id": "gym", "env.of": "torchrl", "env.options": "gym", "env.wrappers": "gym"}
 MOST = 2  # places that a hint names
 
@@ -103,7 +103,7 @@ def unchosen(key: str, typed: str) -> str:
         return ""
     if not Path(conf.__file__).with_name(group).joinpath(f"{name}.yaml").is_file():
         return ""
-    chosen = f"[{name}]" if group == "degrade" else name
+    chosen = name if group == "guide" else f"[{name}]"
     return f"; it belongs to {group}={name}: write {group}={chosen} {typed}=VALUE"
 
 

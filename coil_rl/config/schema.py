@@ -90,7 +90,7 @@ class TrainingConfig(NodeConfig):
     """Training values for an env, and overrides of `env` in training.
 
     `imitation_env` is for methods that imitate, `tests` for the cases in which a training compares
-    policies.
+    policies. `disturb` has overrides of `disturb` in both.
     """
 
     learning_rate: float = 1e-3  # of PPO, at the start of a run
@@ -101,6 +101,7 @@ class TrainingConfig(NodeConfig):
     env: dict[str, Any] = field(default_factory=dict)
     imitation_env: dict[str, Any] = field(default_factory=dict)
     tests: dict[str, Any] = field(default_factory=dict)
+    disturb: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass
@@ -118,13 +119,17 @@ class MeasureConfig(NodeConfig):
 
 @dataclass
 class EvaluationConfig(NodeConfig):
-    """Evaluation of a policy; `cases` is their number, or a node that gives their names."""
+    """Evaluation of a policy; `cases` is their number, or a node that gives their names.
+
+    `disturb` has overrides of `disturb` in the evaluation and in its curve.
+    """
 
     cases: Any = 1
     measures: dict[str, Any] = field(default_factory=dict)  # of `MeasureConfig`, see `measured`
     pictures: dict[str, Any] = field(default_factory=dict)
     sections: dict[str, Any] | None = None  # of coil-listen
     env: dict[str, Any] = field(default_factory=dict)
+    disturb: dict[str, Any] = field(default_factory=dict)
     curve: CurveConfig = field(default_factory=CurveConfig)
     advice: dict[str, Any] = field(default_factory=dict)
     repeats: Repeats = 5
@@ -187,6 +192,7 @@ class DrivingConfig(ProgramConfig):
     track: dict[str, Any] = field(default_factory=dict)
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = MISSING
+    disturb: dict[str, Any] = field(default_factory=dict)
     degrade: dict[str, Any] = field(default_factory=dict)
     method: MethodConfig = field(default_factory=MethodConfig)
     observes: list[Any] = field(default_factory=lambda: ["observation"])

@@ -29,7 +29,7 @@ REFERRED = (
     "training.imitation_env",
     "budget.minibatches",
 )
-SEVERAL = ("guide", "degrade")  # groups of which several files may be chosen
+SEVERAL = ("guide", "disturb", "degrade")  # groups of which several files may be chosen
 REFERENCE = re.compile(r"\$\{(?:oc\.select:)?([\w.]+)")
 
 

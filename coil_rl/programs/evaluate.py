@@ -13,7 +13,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "track", "degrade", "evaluation")
+OF_A_RUN = ("run", "track", "disturb", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
 OWN = (
     "repeats",
@@ -83,7 +83,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
 def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the keys of `evaluation` that the command line changes.
 
-    The tracks that it gives are set.
+    The tracks and the disturbances that it gives are set.
     """
     from coil_rl.errors import UserError
 
@@ -94,6 +94,9 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
                 raise UserError(f"{text} has no effect: run={folder} has no tracks; leave it out")
             config.track = resolved["track"]
             changed += OF_A_TRACK
+        elif key.partition(".")[0] == "disturb":
+            config.disturb = resolved["disturb"]
+            changed.append("disturb")
         elif key.startswith("evaluation."):
             changed.append(key.removeprefix("evaluation."))
     return changed

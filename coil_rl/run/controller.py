@@ -3,7 +3,7 @@
 A policy alone is not enough: its action may be a residual that is added to a guide's, it observes
 advice, and it may have a memory. Here the whole chain of the run is applied to observations that
 come from anywhere: guides, transforms, normaliser, policy, and what the transforms make of its
-action. It is the chain of an evaluation, step for step, without the env itself.
+action. It is the chain of an evaluation, step for step, without the env and what disturbs it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type
 
 from coil_rl.envs.gymnasium_env import GymnasiumEnv
-from coil_rl.transforms import GuideActions
+from coil_rl.transforms import GuideActions, undisturbed
 
 
 class Controller:
@@ -32,7 +32,8 @@ class Controller:
 
     Args:
         env: env of one row with the transforms of the run. It gives the specs and converts
-            observations and actions; it is never stepped.
+            observations and actions; it is never stepped. Its disturbances are taken off: a machine
+            has its own delays and noise.
         policy: of the run, for this env.
         folder: of the run, if it has one.
 
@@ -48,7 +49,7 @@ class Controller:
     ) -> None:
         if not isinstance(env, TransformedEnv) or env.batch_size.numel() != 1:
             raise ValueError(f"a controller needs an env of one row, not {list(env.batch_size)}")
-        self.env, self.policy = env.eval(), policy
+        self.env, self.policy = undisturbed(env.eval()), policy
         self.plant, self.folder = env.base_env, folder
         self._check_read()
         self.reset()

@@ -46,6 +46,8 @@ class EnvMaker:
         bare: makes the env without transforms for a number of rows, a set of cases and the number
             of different cases.
         of_agent: makes it without what only guides that act alone read of it; None: it is the same.
+        disturb: makes the transforms that disturb the env, for a set of cases; the guides of the
+            method are behind them.
         transforms: makes the transforms of the method; its argument is the name of a further kind
             of advice, or empty.
         guides: makes the guides by name.
@@ -56,6 +58,7 @@ class EnvMaker:
     bare: BareEnv
     _: KW_ONLY
     of_agent: BareEnv | None = None
+    disturb: Callable[[str], Sequence[Transform]] = lambda cases: ()
     transforms: Callable[[str], Sequence[Transform]] = lambda advice: ()
     guides: Callable[[], Mapping[str, TensorDictModuleBase]] = dict
     degrade: Callable[[], Sequence[Transform]] = tuple
@@ -84,10 +87,12 @@ class EnvMaker:
             UserError: if the transforms do not fit the env, or each other.
         """
         bare = self.bare if self.of_agent is None else self.of_agent
-        return self.around(bare(rows, cases, count), advice)
+        return self._around(bare(rows, cases, count), self.disturb(cases), advice)
 
     def around(self, env: EnvBase, advice: str = "") -> EnvBase:
         """Return any env with normalised actions and the transforms of the method.
+
+        Nothing disturbs it: a recording, or a machine, has its own delays.
 
         Args:
             env: the env.
@@ -96,12 +101,16 @@ class EnvMaker:
         Raises:
             UserError: as above.
         """
+        return self._around(env, (), advice)
+
+    def _around(self, env: EnvBase, disturb: Sequence[Transform], advice: str) -> EnvBase:
         try:
             first = normalising(env)
         except ValueError as error:
             raise UserError(f"env: {error}") from error
-        transforms = [*first, *self.transforms(advice)]
-        return transformed(env, transforms, "method.transforms")
+        transforms = [*first, *disturb, *self.transforms(advice)]
+        name = "disturb, method.transforms" if disturb else "method.transforms"
+        return transformed(env, transforms, name)
 
     def guided(
         self,
@@ -113,7 +122,7 @@ class EnvMaker:
     ) -> tuple[EnvBase, TensorDictModuleBase]:
         """Return an env in which the guides act alone, and the policy that does so.
 
-        Their advice is degraded as the run says.
+        The env is disturbed, and their advice degraded, as the run says.
 
         Its actions are in the unit of the env.
 
@@ -125,7 +134,9 @@ class EnvMaker:
         """
         guides = guides or self.guides()
         env = self.bare(rows * len(guides), cases, count)
-        env = transformed(env, [GuideActions(guides), *self.degrade()], "degrade")
+        disturb = self.disturb(cases)
+        transforms = [*disturb, GuideActions(guides), *self.degrade()]
+        env = transformed(env, transforms, "disturb, degrade" if disturb else "degrade")
         of_row = [guide for guide in range(len(guides)) for _ in range(rows)]
         return env, FollowAdvice(env, of_row)
 

@@ -25,7 +25,6 @@ AUTHORS: dict[str, Any] = {
     "held_steps": 2,
     "sight": 7.03125,
     "hold_boundary": True,
-    "late_observation": True,
     "finish_in_sight": True,
 }
 

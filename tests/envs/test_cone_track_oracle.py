@@ -8,10 +8,12 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from oracle import OneCar, Outcome, guide_action, midpoints
+from torchrl.envs import TransformedEnv
 
 from coil_rl.envs import ConeTrackEnv, Track, random_tracks, shipped_tracks
 from coil_rl.envs.reward import TERMS
 from coil_rl.guides.spline import SplineGuide
+from coil_rl.transforms import ObservationDelay
 
 Array = NDArray[np.float64]
 
@@ -57,7 +59,10 @@ def drive(
     dtype: torch.dtype = torch.float64,
 ) -> dict[str, Array]:
     """Drive one episode per track in one batch; return the outputs, [steps, cars, ...] each."""
-    env = ConeTrackEnv(tracks, len(tracks), assignment="cyclic", dtype=dtype, **preset.env)
+    options = dict(preset.env)
+    lag = int(options.pop("late_observation", False))
+    cars = ConeTrackEnv(tracks, len(tracks), assignment="cyclic", dtype=dtype, **options)
+    env = TransformedEnv(cars, ObservationDelay(lag, lag, ["observation"]))
     guide = SplineGuide(**preset.guide)
     rng = np.random.default_rng(seed)
     noise = np.zeros(len(tracks))

@@ -10,14 +10,16 @@ from coil_rl.config.build import (
     build_guides,
     build_learner,
     cases_node,
+    disturbances,
     env_maker,
     trains_guides,
 )
 from coil_rl.config.distillation import guides_with_untrained_proxies
 from coil_rl.config.nodes import build
 from coil_rl.errors import UserError
-from coil_rl.run.parts import TRAIN
+from coil_rl.run.parts import TEST, TESTS, TRAIN
 from coil_rl.testing import check_env, check_guide
+from coil_rl.transforms import ActionDelay, GuideActions, ObservationDelay
 
 CONF = Path(__file__).parents[3] / "conf"
 SMALL = [
@@ -160,3 +162,40 @@ def test_cases_of_several_drivers_are_the_same_ones(env, key):
     stored = OmegaConf.create({"evaluation": OmegaConf.to_container(evaluation, resolve=True)})
     node = cases_node(stored, 6, "selection", 3)
     assert (node[key], node["num_envs"]) == (3, 6)
+
+
+def test_disturbances_hold_in_training_and_evaluation_unless_one_of_them_has_its_own():
+    both = composed("disturb=[observation_delay]")
+    assert disturbances(both, TRAIN) == disturbances(both, TEST)
+    longer = composed(
+        "disturb=[observation_delay,action_delay]",
+        "+evaluation.disturb.observation_delay.max_lag=7",
+        "+training.disturb.action_delay=null",
+    )
+    lags = {
+        cases: {name: node["max_lag"] for name, node in disturbances(longer, cases).items()}
+        for cases in (TRAIN, TESTS, TEST, "evaluation")
+    }
+    assert lags[TRAIN] == lags[TESTS] == {"observation_delay": 2}
+    assert lags[TEST] == lags["evaluation"] == {"observation_delay": 7, "action_delay": 2}
+
+
+def test_disturbances_come_before_the_guides_and_only_in_the_own_env_of_a_run():
+    config = composed("disturb=[observation_delay,action_delay]", "method=coil")
+    make_env = env_maker(config)
+    for env in (make_env(), make_env.guided(2, TEST)[0]):
+        kinds = [type(part) for part in env.transform]
+        assert kinds.index(ObservationDelay) < kinds.index(ActionDelay) < kinds.index(GuideActions)
+    around = make_env.around(build_bare_env(config))
+    assert ObservationDelay not in [type(part) for part in around.transform]
+
+
+def test_the_authors_observe_late_in_their_world_and_nowhere_else():
+    assert disturbances(composed("preset=authors"), TRAIN)["late"]["min_lag"] == 1
+    assert not disturbances(composed("env=simulated_robot", "preset=authors"), TRAIN)
+
+
+def test_the_view_of_the_agent_alone_is_late_behind_the_guides():
+    config = composed("+disturb@method.transforms.view=observation_delay", "method=coil")
+    kinds = [type(part) for part in env_maker(config)().transform]
+    assert kinds.index(GuideActions) < kinds.index(ObservationDelay)

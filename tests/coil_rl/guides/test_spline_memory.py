@@ -22,7 +22,6 @@ AUTHORS: dict[str, Any] = {
     "held_steps": 2,
     "sight": SIGHT,
     "hold_boundary": True,
-    "late_observation": True,
     "finish_in_sight": True,
 }
 ODD = {"oddities": True, "sight": SIGHT, "gain": 80 / 120}

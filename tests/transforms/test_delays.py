@@ -1,0 +1,246 @@
+"""Delays: each row of each episode has its own lag, and nothing else changes."""
+
+import pytest
+import torch
+import worlds
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, Composite, MultiCategorical, OneHot, Unbounded
+from torchrl.envs import Compose, EnvBase, TransformedEnv
+
+from coil_rl.envs import ConeTrackEnv, shipped_tracks
+from coil_rl.guides import SplineGuide
+from coil_rl.testing import check_env, check_transform
+from coil_rl.transforms import (
+    ActionDelay,
+    GuideActions,
+    LastAction,
+    ObservationDelay,
+    ObservationNoise,
+    undisturbed,
+)
+
+ACTIONS = {
+    "numbers": Bounded(-1, 1, (3, 2)),
+    "one choice": Categorical(4, (3,)),
+    "one-hot choice": OneHot(4, (3, 4)),
+    "two choices": MultiCategorical([2, 3], (3, 2)),
+}
+
+
+class Counter(EnvBase):
+    """Three rows that show the number of their step, nested and as a vector, and the action.
+
+    The episodes of the rows take 4, 5 and 6 steps.
+    """
+
+    def __init__(self, action=ACTIONS["numbers"]):
+        super().__init__(batch_size=[3])
+        self.action_spec = action.clone()
+        self.observation_spec = Composite(
+            observation=Unbounded((3, 2)),
+            inner=Composite(count=Unbounded((3, 1), dtype=torch.int64), shape=(3,)),
+            info=Composite(step=Unbounded((3, 1)), shape=(3,)),
+            executed=Unbounded(action.shape, dtype=action.dtype),
+            shape=(3,),
+        )
+        self.reward_spec = Unbounded((3, 1))
+        self.count = torch.zeros(3, 1)
+
+    def _shown(self, executed):
+        inner = TensorDict({"count": self.count.long()}, [3])
+        entries = {
+            "observation": self.count.expand(3, 2).clone(),
+            "inner": inner,
+            "info": TensorDict({"step": self.count.clone()}, [3]),
+            "executed": executed,
+        }
+        return TensorDict(entries, [3])
+
+    def _reset(self, tensordict=None, **_):
+        mask = tensordict["_reset"] if tensordict is not None and "_reset" in tensordict else True
+        self.count = torch.where(torch.as_tensor(mask), torch.zeros(3, 1), self.count)
+        return self._shown(self.action_spec.zero())
+
+    def _step(self, tensordict):
+        self.count = self.count + 1
+        done = self.count >= torch.tensor([[4], [5], [6]])
+        shown = self._shown(tensordict["action"])
+        return shown.update({"reward": torch.zeros(3, 1), "done": done, "terminated": done})
+
+    def _set_seed(self, seed):
+        pass
+
+
+def driven(env, steps=24):
+    """Return what a rollout with resets writes before and after each step, [3, steps]."""
+    torch.manual_seed(0)
+    state, rows = env.reset(), []
+    for _ in range(steps):
+        step, state = env.step_and_maybe_reset(env.rand_action(state))
+        rows.append(step)
+    return torch.stack(rows, 1)
+
+
+def test_observations_are_those_of_the_lag_of_their_row_and_episode():
+    env = TransformedEnv(Counter(), ObservationDelay(1, 3, seed=5))
+    seen = driven(env)["next"]
+    lag, true = seen["late_observations", "lag"], seen["info", "step"]
+    assert torch.equal(seen["observation"], (true - lag).clamp(min=0).expand(3, 24, 2))
+    assert torch.equal(seen["inner", "count"], (true - lag).clamp(min=0).long())
+    starts = true == 1
+    assert set(lag[starts].tolist()) == {1, 2, 3}
+    # A lag holds for its episode, whichever other rows begin another one meanwhile.
+    assert torch.equal(lag[:, 1:][~starts[:, 1:]], lag[:, :-1][~starts[:, 1:]])
+
+
+def test_only_the_entries_that_are_named_are_late():
+    env = TransformedEnv(Counter(), ObservationDelay(2, 2, [["inner", "count"]]))
+    seen = driven(env)["next"]
+    assert torch.equal(seen["observation"][..., :1], seen["info", "step"])
+    assert torch.equal(seen["inner", "count"], (seen["info", "step"] - 2).clamp(min=0).long())
+
+
+@pytest.mark.parametrize("kind", ACTIONS)
+def test_actions_take_effect_after_the_lag_and_the_first_one_until_then(kind):
+    env = TransformedEnv(Counter(ACTIONS[kind]), ActionDelay(0, 3, seed=1))
+    data = driven(env)
+    lags = set()
+    for row in range(3):
+        begin = 0
+        for step in range(24):
+            if data["info", "step"][row, step] == 0:
+                begin = step
+            lag = int(data["late_actions", "lag"][row, step])
+            lags.add(lag)
+            given = data["action"][row, max(begin, step - lag)]
+            assert torch.equal(data["next", "executed"][row, step], given)
+    assert lags == {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("kind", ACTIONS)
+def test_last_actions_are_those_that_the_agent_chose(kind):
+    env = TransformedEnv(Counter(ACTIONS[kind]), Compose(ActionDelay(2, 2), LastAction(steps=2)))
+    data = driven(env, 4)
+    vectors = env.transform[1].action_space.vectors(data["action"])
+    size = vectors.shape[-1]
+    assert data["last_action"][:, 0].eq(0).all()
+    assert torch.equal(data["next", "last_action"][..., :size], vectors)
+    assert torch.equal(data["next", "last_action"][:, 1:, size:], vectors[:, :-1])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda seed: ObservationDelay(1, 3, seed=seed),
+        lambda seed: ActionDelay(0, 2, seed=seed),
+        lambda seed: ObservationNoise(0.2, seed=seed),
+        lambda seed: LastAction(3),
+        lambda seed: Compose(
+            ObservationDelay(0, 2, seed=seed), ActionDelay(1, 2, seed=seed), ObservationNoise()
+        ),
+    ],
+)
+def test_contract_holds_and_a_restored_env_goes_on_to_the_bit(make):
+    check_transform(Counter(), make(0))
+    check_env(worlds.cones(make(0)).train(), steps=4)
+    check_env(TransformedEnv(worlds.cones().base_env, make(0)), steps=4)
+
+    def env(seed):
+        cars = ConeTrackEnv(shipped_tracks("test"), 6, time_limit=0.5)
+        return TransformedEnv(cars, make(seed)).train()
+
+    first, second = env(1), env(2)
+    _, carrier = worlds.drive(first, 20)
+    carrier = worlds.reloaded(carrier.to_dict())
+    for part in (lambda env: env, lambda env: env.base_env):
+        part(second).load_state_dict(worlds.reloaded(part(first).state_dict()))
+    one, _ = worlds.drive(first, 20, TensorDict(carrier, [6]), seed=1)
+    other, _ = worlds.drive(second, 20, TensorDict(carrier, [6]), seed=1)
+    assert worlds.same(one, other)
+
+
+@pytest.mark.parametrize("delay", [ObservationDelay, ActionDelay])
+def test_envs_without_batch_and_with_choices_are_delayed_too(delay):
+    check_env(worlds.pendulum(delay(1, 2)).train(), steps=4)
+    for categorical in (True, False):
+        check_env(worlds.carts(delay(1, 2), categorical=categorical).train(), steps=4)
+
+
+@pytest.mark.parametrize("delay", [ObservationDelay, ActionDelay])
+def test_no_lag_changes_nothing(delay):
+    plain, delayed = driven(Counter()), driven(TransformedEnv(Counter(), delay(0, 0)))
+    assert (plain == delayed).all()
+
+
+def test_a_guide_sees_what_comes_before_it_in_the_chain():
+    def advice(*transforms):
+        cars = ConeTrackEnv(shipped_tracks("test"), 3)
+        env = TransformedEnv(cars, Compose(*transforms))
+        return torch.stack([step["guide_action"] for step in worlds.drive(env, 6)[0]])
+
+    def guide():
+        return GuideActions({"spline": SplineGuide()})
+
+    exact = advice(guide())
+    late = advice(ObservationDelay(2, 2), guide())
+    assert torch.equal(late[2:], exact[:-2])
+    assert torch.equal(advice(guide(), ObservationDelay(2, 2)), exact)
+    both = ObservationDelay(2, 2, ["observation", "guide_action"])
+    assert torch.equal(advice(guide(), both), late)
+
+
+def test_a_machine_is_not_disturbed():
+    transforms = Compose(ObservationDelay(2, 2), ActionDelay(2, 2), ObservationNoise(0.5))
+    plain, off = driven(Counter()), driven(undisturbed(TransformedEnv(Counter(), transforms)))
+    assert all(torch.equal(value, off[key]) for key, value in plain.items(True, True))
+
+
+def test_noise_has_its_standard_deviation_and_stays_within_the_bounds():
+    cars = ConeTrackEnv(shipped_tracks("test"), 64, assignment="cyclic")
+    plain = worlds.drive(cars, 8)[0]
+    cars = ConeTrackEnv(shipped_tracks("test"), 64, assignment="cyclic")
+    noisy = worlds.drive(TransformedEnv(cars, ObservationNoise(0.1)), 8)[0]
+    values = torch.stack([step["observation"] for step in plain])
+    noise = torch.stack([step["observation"] for step in noisy]) - values
+    assert abs(float(noise[values.abs() < 0.5].std()) - 0.1) < 0.003
+    assert float((values + noise).abs().max()) <= 1
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ObservationDelay(2, 1), "min_lag=2 must be at most max_lag=1"),
+        (lambda: ActionDelay(-1, 1), "min_lag=-1 must be at least 0"),
+        (lambda: ActionDelay(0, 10**6), "max_lag=1000000 must be at least 0 and at most 10000"),
+        (lambda: ObservationDelay(0, 0.5), "max_lag=0.5 must be a whole number of steps"),
+        (lambda: ActionDelay(False, 1), "min_lag=False must be a whole number of steps"),
+        (lambda: ObservationNoise(-1), "sigma=-1 must be a finite number of at least 0"),
+        (lambda: ObservationNoise(float("nan")), "sigma=nan must be a finite number"),
+        (lambda: ObservationNoise(0.1, []), "in_keys is empty"),
+        (lambda: LastAction(0), "steps=0 must be at least 1"),
+        (
+            lambda: TransformedEnv(Counter(), ObservationDelay(0, 1, ["scan"])).observation_spec,
+            "in_keys has 'scan', but the env writes these numbers: 'observation'",
+        ),
+        (
+            lambda: (
+                TransformedEnv(
+                    Counter(), ObservationNoise(0.1, [("inner", "count")])
+                ).observation_spec
+            ),
+            r"in_keys has \('inner', 'count'\), but the env writes these real numbers",
+        ),
+        (
+            lambda: (
+                TransformedEnv(
+                    Counter(), Compose(ActionDelay(0, 1), ActionDelay(0, 1))
+                ).observation_spec
+            ),
+            "keeps the past in 'late_actions', which exists already; give each delay a memory_key",
+        ),
+        (lambda: ActionDelay()(TensorDict()), "ActionDelay needs the previous steps"),
+    ],
+)
+def test_wrong_arguments_are_refused_in_a_sentence(make, message):
+    with pytest.raises((ValueError, TypeError, RuntimeError), match=message):
+        make()

@@ -1,0 +1,102 @@
+"""Actions that take effect late, as by a network, a motor controller or a slow policy."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, TensorSpec, Unbounded
+
+from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.disturbance import Delay
+
+
+class ActionDelay(Delay):
+    """Actions take effect some steps later; until then the first action of the episode does.
+
+    Each row draws its delay for each episode, uniformly from `min_lag` to `max_lag` steps. The
+    action may be numbers or choices. The agent's own action stays in the data; guides that read
+    `last_action` are told the one in force. With `LastAction` an agent can know what is on its way.
+
+    Args:
+        min_lag: smallest delay in steps.
+        max_lag: largest delay in steps, at most 10,000.
+        action_key: entry of the action.
+        seed: of the draws.
+        memory_key: entry for the lag of each row, and for the actions on their way, oldest first.
+
+    Raises:
+        TypeError: for a delay that is not a whole number.
+        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> cars = ConeTrackEnv(shipped_tracks("train"), num_envs=8)
+        >>> env = TransformedEnv(cars, ActionDelay(min_lag=2, max_lag=2))
+        >>> step = env.rollout(4)
+        >>> torch.equal(step["next", "steering"][:, 3], step["action"][:, 1])
+        True
+    """
+
+    def __init__(
+        self,
+        min_lag: int = 0,
+        max_lag: int = 2,
+        action_key: NestedKey = "action",
+        seed: int = 0,
+        memory_key: NestedKey = "late_actions",
+    ) -> None:
+        super().__init__(min_lag, max_lag, seed, memory_key)
+        self.action_key: NestedKey = nested_key(action_key)
+        self._chosen_key: NestedKey = self._of_memory("chosen")
+
+    def _kept(self) -> dict[NestedKey, TensorSpec]:
+        # Not the spec of the action, as zeros, which stand for no action yet, need not be one.
+        spec = self.parent.full_action_spec[self.action_key]
+        kept = Unbounded(spec.shape, device=spec.device, dtype=spec.dtype)
+        return {self._of_memory("past"): kept}
+
+    def _memory_spec(self) -> dict[NestedKey, TensorSpec]:
+        shape, device = (*self.parent.batch_size, 1), self.parent.device
+        age = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
+        return {**super()._memory_spec(), self._of_memory("age"): age}
+
+    @cached_property
+    def _empty(self) -> dict[NestedKey, Tensor]:
+        """The memory at the start of an episode."""
+        return {key: spec.zero() for key, spec in self._memory_spec().items()}
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.max_lag:
+            return tensordict
+        chosen = tensordict[self.action_key]
+        lag, age = tensordict[self._of_memory("lag")], tensordict[self._of_memory("age")]
+        late = self._late(self._values(tensordict, chosen), torch.minimum(lag, age))
+        return tensordict.set(self._chosen_key, chosen).set(self.action_key, late)
+
+    def _values(self, tensordict: TensorDictBase, chosen: Tensor) -> Tensor:
+        """Return the past actions and the one that was chosen, [*batch, max_lag + 1, *A]."""
+        dim = tensordict.ndim
+        return torch.cat([tensordict[self._of_memory("past")], chosen.unsqueeze(dim)], dim)
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.max_lag:
+            return next_tensordict
+        values = self._values(tensordict, tensordict[self._chosen_key])
+        age = (tensordict[self._of_memory("age")] + 1).clamp(max=self.max_lag)
+        next_tensordict.set(self._of_memory("lag"), tensordict[self._of_memory("lag")])
+        next_tensordict.set(self._of_memory("age"), age)
+        past = values.narrow(next_tensordict.ndim, 1, self.max_lag)
+        return next_tensordict.set(self._of_memory("past"), past)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if not self.max_lag:
+            return tensordict_reset
+        for key, value in self._empty.items():
+            tensordict_reset.set(key, value)
+        return tensordict_reset.set(self._of_memory("lag"), self._drawn(tensordict_reset))

@@ -1,0 +1,147 @@
+"""What stands between an agent and an ideal world: base of delays and noise, and the lag of a row.
+
+A disturbance belongs to the env, whatever the method: what comes behind it in the chain, guides
+too, sees the disturbed observation. A policy that is handed to a machine takes it off, as a machine
+has its own delays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite, TensorSpec
+from torchrl.envs import EnvBase, Transform
+
+from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.guide_transform import SeededGenerator
+
+LONGEST_LAG = 10_000  # steps, each of which is kept for every row
+
+
+class Disturbance(Transform):
+    """Base class of transforms that disturb observations or actions.
+
+    Attributes:
+        active: whether it disturbs; else it passes on what comes, see `undisturbed`.
+    """
+
+    active = True
+
+
+def undisturbed(env: EnvBase) -> EnvBase:
+    """Return an env after its disturbances were taken off.
+
+    Args:
+        env: with transforms; it is changed in place, from the next reset on.
+    """
+    for module in env.modules():
+        if isinstance(module, Disturbance):
+            module.active = False
+    return env
+
+
+class Delay(Disturbance):
+    """Base class of delays by a number of steps that each row draws anew for each episode.
+
+    The past is kept in the data, as `(memory_key, ...)`, so it is in checkpoints too.
+
+    Args:
+        min_lag: smallest delay in steps.
+        max_lag: largest delay in steps.
+        seed: of the draws.
+        memory_key: entry for the lag of each row, [*batch, 1], and for its past.
+
+    Raises:
+        TypeError: for a delay that is not a whole number.
+        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`.
+    """
+
+    def __init__(self, min_lag: int, max_lag: int, seed: int, memory_key: NestedKey) -> None:
+        for name, lag in (("min_lag", min_lag), ("max_lag", max_lag)):
+            if isinstance(lag, bool) or not isinstance(lag, int):
+                raise TypeError(f"{name}={lag} must be a whole number of steps, such as 2")
+            if not 0 <= lag <= LONGEST_LAG:
+                raise ValueError(f"{name}={lag} must be at least 0 and at most {LONGEST_LAG} steps")
+        if min_lag > max_lag:
+            raise ValueError(
+                f"min_lag={min_lag} must be at most max_lag={max_lag}; for a fixed delay give both "
+                "the same number"
+            )
+        super().__init__(in_keys=[], out_keys=[])
+        self.min_lag, self.max_lag = min_lag, max_lag
+        self.memory_key: NestedKey = nested_key(memory_key)
+        self.rng = SeededGenerator(seed)
+
+    def _of_memory(self, *key: str) -> NestedKey:
+        """Return the full key of an entry of the memory."""
+        first = self.memory_key if isinstance(self.memory_key, tuple) else (self.memory_key,)
+        return (*first, *key)
+
+    def _drawn(self, tensordict: TensorDictBase) -> Tensor:
+        """Return new lags [*batch, 1]; those of all rows are drawn, whichever of them begin."""
+        shape = (*tensordict.batch_size, 1)
+        lag = torch.randint(self.min_lag, self.max_lag + 1, shape, generator=self.rng.generator).to(
+            tensordict.device or "cpu"
+        )
+        return lag if self.active else torch.zeros_like(lag)
+
+    def _late(self, values: Tensor, lag: Tensor) -> Tensor:
+        """Return the value of each row that is `lag` [*batch, 1] steps old.
+
+        Args:
+            values: [*batch, max_lag + 1, *shape], oldest first.
+            lag: at most `max_lag`.
+        """
+        dim = lag.ndim - 1
+        rest = values.shape[dim + 1 :]
+        index = (self.max_lag - lag).reshape(*lag.shape, *(1 for _ in rest))
+        return values.gather(dim, index.expand(*lag.shape, *rest)).squeeze(dim)
+
+    def _memory_spec(self) -> dict[NestedKey, TensorSpec]:
+        """Return the specs of the memory by key."""
+        shape, device = (*self.parent.batch_size, 1), self.parent.device
+        lag = Bounded(0, self.max_lag, shape, device=device, dtype=torch.int64)
+        specs = {self._of_memory("lag"): lag}
+        dim = len(self.parent.batch_size)
+        for key, spec in self._kept().items():
+            size = (*spec.shape[:dim], self.max_lag, *spec.shape[dim:])
+            specs[key] = spec.unsqueeze(dim).expand(size).clone()
+        return specs
+
+    def _kept(self) -> Mapping[NestedKey, TensorSpec]:
+        """Return for each key of the memory the spec of what it keeps of one step."""
+        raise NotImplementedError
+
+    def _check_env(self, spec: Composite) -> None:
+        """Raise a `ValueError` for an env in which the past cannot be kept."""
+        name = type(self).__name__
+        if self.memory_key in spec.keys(True):
+            raise ValueError(
+                f"{name} keeps the past in {self.memory_key!r}, which exists already; give each "
+                "delay a memory_key of its own"
+            )
+        if "_reset" not in self.parent.reset_keys:
+            raise ValueError(f"{name} needs one episode a row, but the env resets its agents alone")
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory; raises a `ValueError` if it cannot be kept."""
+        self._check_env(observation_spec)
+        return observation_spec.update(self._memory_spec()) if self.max_lag else observation_spec
+
+    def transform_input_spec(self, input_spec: Composite) -> Composite:
+        """Add the memory, which is an input of steps."""
+        if self.max_lag:
+            state = input_spec["full_state_spec"] or Composite(
+                shape=input_spec.shape, device=input_spec.device
+            )
+            input_spec["full_state_spec"] = state.update(self._memory_spec())
+        return input_spec
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Raise a `RuntimeError`: stored data do not have the steps before."""
+        raise RuntimeError(
+            f"{type(self).__name__} needs the previous steps: use it in a TransformedEnv"
+        )

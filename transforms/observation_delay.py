@@ -1,0 +1,112 @@
+"""Observations that come late, as from a sensor, a network or a slow perception."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Composite, NonTensor, TensorSpec
+
+from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.disturbance import Delay
+
+EVALUATION_ONLY = "info"  # entries that nobody acts on
+
+
+class ObservationDelay(Delay):
+    """Observations of an earlier step; at first the first observation of the episode.
+
+    Each row draws its delay for each episode, uniformly from `min_lag` to `max_lag` steps. All
+    entries of a row are equally late. In front of `GuideActions` the guides see the late
+    observation too; behind it only the agent does.
+
+    Args:
+        min_lag: smallest delay in steps.
+        max_lag: largest delay in steps, at most 10,000.
+        in_keys: entries that are late; None for all numbers that the env itself writes, but for
+            those under `info`.
+        seed: of the draws.
+        memory_key: entry for the lag of each row and for its past observations, oldest first.
+
+    Raises:
+        TypeError: for a delay that is not a whole number.
+        ValueError: for a negative or too long delay, and for `min_lag` above `max_lag`; in an env
+            also for an entry that does not exist or has no numbers.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> cars = ConeTrackEnv(shipped_tracks("train"), num_envs=8)
+        >>> env = TransformedEnv(cars, ObservationDelay(min_lag=1, max_lag=3))
+        >>> env.reset()["late_observations", "lag"].shape
+        torch.Size([8, 1])
+    """
+
+    def __init__(
+        self,
+        min_lag: int = 0,
+        max_lag: int = 2,
+        in_keys: Sequence[NestedKey] | None = None,
+        seed: int = 0,
+        memory_key: NestedKey = "late_observations",
+    ) -> None:
+        super().__init__(min_lag, max_lag, seed, memory_key)
+        self.given_keys = None if in_keys is None else [nested_key(key) for key in in_keys]
+
+    @cached_property
+    def late_keys(self) -> list[NestedKey]:
+        """The keys of the entries that are late."""
+        specs = self.parent.full_observation_spec
+        if self.given_keys is None:
+            own = self.parent.base_env.full_observation_spec.keys(True, True)
+            keys = [key for key in own if key != EVALUATION_ONLY and key[0] != EVALUATION_ONLY]
+            return [key for key in keys if not isinstance(specs.get(key, None), NonTensor | None)]
+        known = [key for key in specs.keys(True, True) if not isinstance(specs[key], NonTensor)]
+        for key in self.given_keys:
+            if key not in known:
+                raise ValueError(
+                    f"ObservationDelay: in_keys has {key!r}, but the env writes these numbers: "
+                    f"{', '.join(map(repr, known))}"
+                )
+        return self.given_keys
+
+    def _past_key(self, key: NestedKey) -> NestedKey:
+        return self._of_memory("past", *((key,) if isinstance(key, str) else key))
+
+    def _kept(self) -> dict[NestedKey, TensorSpec]:
+        specs = self.parent.full_observation_spec
+        return {self._past_key(key): specs[key] for key in self.late_keys}
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if not self.max_lag:
+            return tensordict_reset
+        tensordict_reset.set(self._of_memory("lag"), self._drawn(tensordict_reset))
+        dim = tensordict_reset.ndim
+        for key in self.late_keys:
+            first = tensordict_reset[key].unsqueeze(dim)
+            past = first.repeat_interleave(self.max_lag, dim)
+            tensordict_reset.set(self._past_key(key), past)
+        return tensordict_reset
+
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        if not self.max_lag:
+            return next_tensordict
+        lag: Tensor = tensordict[self._of_memory("lag")]
+        next_tensordict.set(self._of_memory("lag"), lag)
+        dim = next_tensordict.ndim
+        for key in self.late_keys:
+            newest = next_tensordict[key].unsqueeze(dim)
+            values = torch.cat([tensordict[self._past_key(key)], newest], dim)
+            next_tensordict.set(self._past_key(key), values.narrow(dim, 1, self.max_lag))
+            next_tensordict.set(key, self._late(values, lag))
+        return next_tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Add the memory; raises a `ValueError` if it cannot be kept."""
+        self.late_keys  # noqa: B018  checks the keys, also where nothing is late
+        return super().transform_observation_spec(observation_spec)

@@ -1,0 +1,100 @@
+"""Noise on observations, as of a sensor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+from torchrl.data import Bounded, Composite
+
+from coil_rl.transforms.action_space import nested_key
+from coil_rl.transforms.disturbance import Disturbance
+from coil_rl.transforms.guide_transform import SeededGenerator
+
+
+class ObservationNoise(Disturbance):
+    """Observations with Gaussian noise, independent at every step, within the bounds of the entry.
+
+    In front of `GuideActions` the guides see the noise too, where they read these entries; behind
+    it only the agent does.
+
+    Args:
+        sigma: standard deviation in the unit of the entries, finite and at least 0.
+        in_keys: entries of real numbers.
+        seed: of the draws.
+
+    Raises:
+        ValueError: for a `sigma` outside its range and without entries; in an env also for an entry
+            that does not exist or is not of real numbers.
+
+    Example:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from coil_rl.envs import ConeTrackEnv, shipped_tracks
+        >>> cars = ConeTrackEnv(shipped_tracks("train"), num_envs=8)
+        >>> env = TransformedEnv(cars, ObservationNoise(0.1))
+        >>> bool((env.reset()["observation"] == cars.start_observation.mT[:1]).all())
+        False
+    """
+
+    def __init__(
+        self, sigma: float = 0.1, in_keys: Sequence[NestedKey] = ("observation",), seed: int = 0
+    ) -> None:
+        if not 0 <= sigma < math.inf:
+            raise ValueError(f"sigma={sigma} must be a finite number of at least 0")
+        if not in_keys:
+            raise ValueError("in_keys is empty; give the entries that are noisy")
+        keys = [nested_key(key) for key in in_keys]
+        super().__init__(in_keys=keys, out_keys=keys)
+        self.sigma, self.rng = sigma, SeededGenerator(seed)
+
+    @cached_property
+    def bounds(self) -> dict[NestedKey, tuple[Tensor, Tensor]]:
+        """Bounds of the entries that have any; empty outside an env."""
+        env = self.parent
+        if env is None:
+            return {}
+        specs, first = env.full_observation_spec, (0,) * len(env.batch_size)
+        spaces = {key: specs[key].space for key in self.in_keys if isinstance(specs[key], Bounded)}
+        return {key: (space.low[first], space.high[first]) for key, space in spaces.items()}
+
+    def _noisy(self, tensordict: TensorDictBase, after_reset: bool = False) -> TensorDictBase:
+        shapes = [tensordict[key].shape for key in self.in_keys]
+        draws = self.rng.draw(torch.randn, shapes, after_reset=after_reset)
+        if not self.active:
+            return tensordict
+        for key, draw in zip(self.in_keys, draws, strict=True):
+            values = tensordict[key]
+            noisy = torch.add(values, draw.to(values), alpha=self.sigma)
+            if key in self.bounds:
+                noisy = noisy.clamp(*self.bounds[key])
+            tensordict.set(key, noisy)
+        return tensordict
+
+    def _call(self, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._noisy(next_tensordict)
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        after_reset = tensordict.get("_reset", None) is not None
+        return self._noisy(tensordict_reset, after_reset)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Add noise to stored data."""
+        return self._noisy(tensordict)
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Check the entries; raises a `ValueError` for one that cannot be noisy."""
+        specs = {key: observation_spec[key] for key in observation_spec.keys(True, True)}
+        real = [key for key, spec in specs.items() if (spec.dtype or torch.int).is_floating_point]
+        for key in self.in_keys:
+            if key not in real:
+                raise ValueError(
+                    f"ObservationNoise: in_keys has {key!r}, but the env writes these real "
+                    f"numbers: {', '.join(map(repr, real))}"
+                )
+        return observation_spec
