@@ -1,0 +1,86 @@
+"""The README and the pages: links lead somewhere, code runs, programs exist, the index has all."""
+
+import re
+import tomllib
+from functools import cache
+
+import pytest
+from programs import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted([*DOCS.rglob("*.md"), *(ROOT / "paper").rglob("*.md"), *ROOT.glob("*.md")])
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+# Their blocks need nothing but the installation, and run one after the other.
+EXECUTED = ("python.md", "recordings.md", "coil.md")
+
+
+@cache
+def text_without_code(page):
+    return re.sub(r"^```.*?^```|`[^`\n]*`", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def code_of(page):
+    """Return the blocks of a page, and what is code in its lines, a line each."""
+    blocks = re.findall(r"^```\w*\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`([^`\n]+)`", page.read_text())
+    return "\n".join([*blocks, *inline])
+
+
+@cache
+def anchors(page):
+    """Return the anchors of the headings of a page, also of those that the build makes."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), flags=re.MULTILINE)
+    if page == DOCS / "configuration.md":
+        headings += [folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()]
+    return {re.sub(r"[^\w -]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_links_and_anchors_lead_somewhere(page):
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text_without_code(page)):
+        file, _, anchor = link.partition("#")
+        target = (page.parent / file).resolve() if file else page
+        assert target.is_file(), link
+        assert not anchor or anchor in anchors(target), link
+
+
+@pytest.mark.parametrize("page", PAGES, ids=NAMES)
+def test_programs_and_targets_of_make_exist(page):
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    makefile = (ROOT / "Makefile").read_text()
+    code = code_of(page)
+    assert {*re.findall(r"^(coil-[a-z]+)(?: |$)", code, flags=re.MULTILINE)} <= {*scripts}
+    for target in re.findall(r"^make ([a-z-]+)", code, flags=re.MULTILINE):
+        assert re.search(rf"^{target}:", makefile, flags=re.MULTILINE), target
+
+
+def toctree_entries(page):
+    trees = re.findall(r"^```\{toctree\}\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.M)
+    lines = [line for tree in trees for line in tree.splitlines()]
+    return [line for line in lines if line and not line.startswith(":")]
+
+
+def test_every_page_is_in_the_contents():
+    found = set()
+    for page in (DOCS / "index.md", DOCS / "methods" / "README.md", DOCS / "paper.md"):
+        for entry in toctree_entries(page):
+            folder = page.parent
+            while entry.startswith("../"):
+                entry, folder = entry.removeprefix("../"), folder.parent
+            found |= {*folder.glob(f"{entry.removesuffix('*')}{'*' * entry.endswith('*')}.md")}
+    outside = {ROOT / "README.md", DOCS / "index.md"}
+    assert {page for page in PAGES if page.parent != ROOT} - found - outside == set()
+
+
+@pytest.mark.parametrize("name", EXECUTED)
+def test_code_runs_as_printed(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"^```python\n(.*?)^```", (DOCS / name).read_text(), re.DOTALL | re.M)
+    assert blocks
+    found: dict = {}
+    for block in blocks:
+        exec(compile(block, name, "exec"), found)
+    if "batch" in found:
+        assert found["batch"]["guide_action"].shape == (64, 100, 1, 1)
+    if "steps" in found:
+        assert found["steps"]["cone_count"].sum() > 200
