@@ -27,18 +27,19 @@ def complete_measures(config: DictConfig) -> None:
     """
     measures = OmegaConf.select(config, "evaluation.measures")
     for name in measures or ():
-        key = f"evaluation.measures.{name}"
         if name in TAKEN:
             raise UserError(
-                f"{key}: {name} is already a column of the tables; give the measure another name"
+                f"evaluation.measures.{name}: {name} is already a column of the tables; give the "
+                "measure another name"
             )
         if not isinstance(measures[name], Mapping):
             raise UserError(
-                f"{key}={measures[name]} is no measure; write {key}.entry=ENTRY and, where it is "
-                "not the mean over the steps, its reduction"
+                f"evaluation.measures.{name}={measures[name]} is no measure; write "
+                f"evaluation.measures.{name}.entry=ENTRY and, where it is not the mean over the "
+                "steps, its reduction"
             )
         try:
             typed = OmegaConf.merge(OmegaConf.structured(MeasureConfig), measures[name])
         except OmegaConfBaseException as error:
-            raise UserError(f"{key}: {sentence(error)}") from error
-        OmegaConf.update(config, key, typed, merge=False)
+            raise UserError(f"evaluation.measures.{name}: {sentence(error)}") from error
+        OmegaConf.update(config, f"evaluation.measures.{name}", typed, merge=False)
