@@ -37,7 +37,7 @@ class Picture:
     record: ClassVar[Mapping[str, NestedKey]] = {}
 
     def watch(self, env: EnvBase) -> None:
-        """See the env before each step of the agent's episodes; by default do nothing.
+        """See the env after each step of the agent's first episode; by default do nothing.
 
         Args:
             env: of the evaluation.
@@ -133,7 +133,7 @@ class Film(Picture):
         self.steps = 0
 
     def watch(self, env: EnvBase) -> None:
-        """Take a frame if it is time, and the first episode still runs.
+        """Take a frame if it is time.
 
         Args:
             env: of the evaluation; it can render.

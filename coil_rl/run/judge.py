@@ -229,8 +229,8 @@ def _evaluate_with(
     if beside:
         policy = PolicyAndGuides(env, policy, own, len(beside))
     sampled = repeats > 0 and (rows >= count) & (rows < own)
-    tick = partial(_tick, env, watching, bar.update)
-    result = trial.evaluation.run(env, policy, sampled=sampled, tick=tick)
+    watch = partial(_watch, env, watching) if watching else None
+    result = trial.evaluation.run(env, policy, sampled=sampled, tick=bar.update, watch=watch)
     if beside:
         for name, of_guide in zip(beside, result[own:].split(len(beside)), strict=True):
             judgement.add(of_guide, name)
@@ -309,9 +309,8 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> s
     )
 
 
-def _tick(env: EnvBase, pictures: list[Picture], update: Callable[[], Any]) -> None:
+def _watch(env: EnvBase, pictures: list[Picture]) -> None:
     """Show an env to pictures; one that fails is taken out of the list."""
-    update()
     for picture in list(pictures):
         pictures.remove(picture)
         with decoration(f"the picture {type(picture).__name__}"):
