@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 GIF_RESOLUTION = 100  # dpi
 TAIL = 0.6  # seconds of the animation, the line behind a car
-FPS = 20  # GIFs count in hundredths of a second: 20, 25 and 50 are exact
+FPS = 10  # GIFs count in hundredths of a second: 10, 20, 25 and 50 are exact; a frame takes 8 ms
 PAUSE = 1.2  # seconds at the end of the animation
 CAR: dict[str, Any] = {"marker": "o", "ms": 6.5, "mec": style.BACKGROUND, "mew": 1.0, "ls": ""}
 CRASH: dict[str, Any] = {"marker": "X", "ms": 8, "mec": style.BACKGROUND, "mew": 0.8, "ls": ""}

@@ -82,7 +82,7 @@ def test_animation_moves_repeats_and_is_small(tmp_path):
             for frame in ImageSequence.Iterator(image)
         ]
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(image)]
-    assert durations == [50] * 20 + [1200]
+    assert durations == [100] * 10 + [1200]
     assert all((before != after).any() for before, after in itertools.pairwise(frames))
     assert path.stat().st_size < 250_000
 
