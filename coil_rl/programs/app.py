@@ -237,6 +237,7 @@ def _do(
     keep_written(config, str(HydraConfig.get().job.config_name), *typed())
     trust_packages(config.get("trust", []), config)
     check(config)
+    programs.imported()
     if _interrupts:
         raise KeyboardInterrupt
     return task(config)

@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
-from coil_rl.programs import app, folders, plan
+from coil_rl.programs import app, folders, imported, plan
 
 # What may be given beside resume=FOLDER.
 BESIDE_RESUME = ("trust=", "budget.frames=")
@@ -52,6 +52,7 @@ def resume(folder: Path, frames: int | None = None) -> float:
     from coil_rl.run.folder import is_evaluated, locked
 
     config = read_config(folder, "resume")
+    imported()
     folder = folder.absolute()
     link = next((path for path in folder.rglob("*") if path.is_symlink()), None)
     if link is not None:
