@@ -6,7 +6,6 @@ leads to the same file here and in the repository.
 
 import sys
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -52,11 +51,15 @@ nb_execution_cache_path = str(Path(__file__).parents[1] / "build" / "notebooks")
 nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
+nb_output_stderr = "remove"  # progress bars
 
 suppress_warnings = ["myst.header"]  # the pages of the paper's results begin below a common title
 
 # Pages: what they load lies beside them.
 html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["wide.css"]
+highlight_language = "text"  # of a block that names none: mostly commands
 html_title = "coil-rl"
 html_copy_source = False
 html_show_sourcelink = False
@@ -64,4 +67,3 @@ html_show_sphinx = False
 html_show_copyright = False
 html_additional_pages = {"index": "start.html"}  # the site begins in docs/
 templates_path = ["templates"]
-html_theme_options: dict[str, Any] = {"navigation_with_keys": True}

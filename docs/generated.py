@@ -236,8 +236,11 @@ def own_signature(
 def plain_docstring(
     app: Sphinx, what: str, name: str, thing: Any, options: Any, lines: list[str]
 ) -> None:
-    """Escape what a docstring means as it stands: the shape [*batch], the size |a|."""
+    """Escape what a docstring means as it stands: the shape [*batch], the size |a|, a colon."""
     for index, line in enumerate(lines):
+        if index and lines[index - 1].strip() == "Returns:":
+            # What is before the first colon would be taken for a type.
+            lines[index] = line = re.sub(r"^( *)", r"\1: ", line)
         if not line.lstrip().startswith((">>>", "...")):
             parts = line.split("`")  # every second one is code
             parts[::2] = [MARKUP.sub(r"\\\g<0>", part) for part in parts[::2]]

@@ -1,0 +1,33 @@
+"""The notebooks of the docs run from top to bottom, as in Jupyter."""
+
+import jupytext
+import pytest
+from nbclient import NotebookClient
+from programs import ROOT
+
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
+# A part of what a cell of each must show.
+SHOWN = {
+    "your_env_and_controller": ("coil_anchored", "l/s"),
+    "from_a_recording": ("scans with a command", "network  reward"),
+}
+
+
+def test_each_notebook_is_tested():
+    assert {notebook.stem for notebook in NOTEBOOKS} == {*SHOWN}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[notebook.stem for notebook in NOTEBOOKS])
+def test_it_runs_with_the_backend_that_a_notebook_sets(notebook, tmp_path, monkeypatch):
+    monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    cells = jupytext.read(notebook, fmt="py:percent")
+    NotebookClient(cells, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    outputs = [output for cell in cells.cells for output in cell.get("outputs", ())]
+    texts = [output.get("text", "") for output in outputs]
+    data = [output.get("data", {}) for output in outputs]
+    everything = "".join([*texts, *(each.get("text/html", "") for each in data)])
+    for part in SHOWN[notebook.stem]:
+        assert part in everything
+    assert any("image/png" in each for each in data)
