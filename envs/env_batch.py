@@ -8,7 +8,7 @@ resumed run begins the episode again and repeats the actions.
 import warnings
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -39,7 +39,9 @@ class SeededRows(SeededEnv):
 
     Args:
         rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or
-            none if the episode is over; then the row stays as it is, with reward 0.
+            none if the episode is over; then the row stays as it is, with reward 0. A subclass may
+            have them elsewhere, see `begin_rows`.
+        count: B, number of rows.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
             draw the seeds.
@@ -55,6 +57,7 @@ class SeededRows(SeededEnv):
     def __init__(
         self,
         rows: Sequence[Any],
+        count: int,
         seed: int,
         first_seed: int | None,
         cases: int | None,
@@ -64,11 +67,11 @@ class SeededRows(SeededEnv):
         check_range(1, cases=1 if cases is None else cases)
         if cases is not None and first_seed is None:
             raise ValueError(f"cases={cases} needs first_seed, the seed of the first case")
-        super().__init__(device=torch.device(device), batch_size=torch.Size([len(rows)]))
-        self.rows, self.first_seed, self.cases = rows, first_seed, cases or len(rows)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([count]))
+        self.rows, self.first_seed, self.cases = rows, first_seed, cases or count
         self.generator = torch.Generator()
         self.seeds: list[int] = []  # of the running episodes; none before the first reset
-        self.ages = np.zeros(len(rows), dtype=np.int64)  # steps since the reset
+        self.ages = np.zeros(count, dtype=np.int64)  # steps since the reset
         self.actions: deque[NDArray[Any]] = deque(maxlen=REMEMBERED)
         self.continues = True
         self.set_seed(seed)
@@ -81,9 +84,30 @@ class SeededRows(SeededEnv):
     def _output(self, *, stepped: bool) -> TensorDict:
         """Return the entries of all rows after a reset, or after a step."""
 
+    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
+        """Begin episodes, and take some actions in each.
+
+        Args:
+            seeds: by row.
+            actions: by row, as `_decode` returns them; a row that is missing takes none.
+        """
+        for row, seed in seeds.items():
+            self.rows[row].begin(seed)
+            for action in actions.get(row, ()):
+                self.rows[row].step(action)
+
+    def step_rows(self, actions: Any) -> None:
+        """Take a step in all rows.
+
+        Args:
+            actions: of all rows, as `_decode` returns them.
+        """
+        for row, action in zip(self.rows, actions, strict=True):
+            row.step(action)
+
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None or not self.seeds else tensordict.get("_reset", None)
-        count = len(self.rows)
+        count = self.batch_size[0]
         # One draw per row, reset or not, keeps the random sequence independent of the data.
         seeds = [(self.first_seed or 0) + row % self.cases for row in range(count)]
         if self.first_seed is None:
@@ -92,8 +116,8 @@ class SeededRows(SeededEnv):
         ended = list(range(count))
         if mask is not None:
             ended = mask.view(-1).nonzero().view(-1).tolist()
+        self.begin_rows({row: seeds[row] for row in ended}, {})
         for row in ended:
-            self.rows[row].begin(seeds[row])
             self.seeds[row], self.ages[row] = seeds[row], 0
         while len(self.actions) > self.ages.max():
             self.actions.popleft()
@@ -103,8 +127,7 @@ class SeededRows(SeededEnv):
         actions = tensordict[self.action_key].detach().cpu().numpy().copy()
         self.actions.append(actions)
         self.ages += 1
-        for row, action in zip(self.rows, self._decode(actions), strict=True):
-            row.step(action)
+        self.step_rows(self._decode(actions))
         return self._output(stepped=True)
 
     def unrepeated(self, steps: int = 10) -> NestedKey | None:
@@ -128,12 +151,10 @@ class SeededRows(SeededEnv):
 
     def _driven(self, seed: int, actions: Sequence[NDArray[Any]]) -> list[TensorDict]:
         """Return the entries of an episode that begins with a seed in every row."""
-        for row in self.rows:
-            row.begin(seed)
+        self.begin_rows(dict.fromkeys(range(self.batch_size[0]), seed), {})
         data = [self._output(stepped=False).clone()]
         for action in actions:
-            for row, chosen in zip(self.rows, self._decode(action), strict=True):
-                row.step(chosen)
+            self.step_rows(self._decode(action))
             data.append(self._output(stepped=True).clone())
         return data
 
@@ -164,11 +185,10 @@ class SeededRows(SeededEnv):
         self.actions.extend(actions)
         steps, longest = self._decode(actions), len(actions)
         self.continues = longest >= self.ages.max()
-        for row, (seed, age) in enumerate(zip(self.seeds, self.ages, strict=True)):
-            self.rows[row].begin(seed)
-            if self.continues:
-                for step in steps[longest - age :]:
-                    self.rows[row].step(step[row])
+        taken = {}
+        if self.continues:
+            taken = {row: steps[longest - age :, row] for row, age in enumerate(self.ages)}
+        self.begin_rows(dict(enumerate(self.seeds)), taken)
         self.continues = self.continues and _same(self._observed().to_dict(), state["observed"])
         if not self.continues:
             warnings.warn(
@@ -306,6 +326,7 @@ class EnvBatch(SeededRows):
         limit = None if names_limit(one) else LIMIT
         super().__init__(
             [_EnvRow(env, number, limit) for number, env in enumerate(envs)],
+            num_envs,
             seed,
             first_seed,
             cases,

@@ -48,9 +48,11 @@ from coil_rl.envs.gymnasium_spaces import (
     lowest_choices,
 )
 from coil_rl.envs.limits import check_range
+from coil_rl.envs.workers import AUTO, Entries, Workers, choose, timed
 
 # What an error about a missing package mentions, and the extra of coil-rl that installs it.
 EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
+MOST_WORKERS = 256
 RESERVED = ("action", "reward", "done", "terminated", "truncated", "info", "controller", "next")
 
 Env = gymnasium.Env[Any, Any]
@@ -59,7 +61,7 @@ Env = gymnasium.Env[Any, Any]
 class GymnasiumEnv(SeededRows):
     """Gymnasium envs as one env of batch size [num_envs].
 
-    They are stepped one after the other in this process.
+    They are stepped one after the other in this process, or in several ones at once (`workers`).
 
     Reads `action`. Writes `reward`, `done`, `terminated`, `truncated` [B, 1] and the observation:
     `observation`, or one entry a key of a Dict space (nested as there; a Tuple has the keys "0",
@@ -97,6 +99,9 @@ class GymnasiumEnv(SeededRows):
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
         render: whether `render` gives pictures.
+        workers: number of processes over which the rows are spread, 0 for none besides this one;
+            "auto" for as many as there are cores if a timed step is long enough. The digits are
+            the same.
         device: of all tensors.
         dtype: of all floating-point tensors.
 
@@ -130,36 +135,41 @@ class GymnasiumEnv(SeededRows):
         controllers: Mapping[str, str | Callable[..., Any]] | None = None,
         fresh: bool = False,
         render: bool = False,
+        workers: int | str = 0,
         device: torch.device | str = "cpu",
         dtype: torch.dtype = torch.float32,
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
+        _check_workers(workers)
         makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
         maker = _maker(id)
-        makes = [partial(_make, maker, wrappers, settings)] * num_envs
-        self.shown = render and "rgb_array" in _metadata(makes[0](), "render_modes", ())
+        make = partial(_make, maker, wrappers, settings)
+        first = make
+        self.shown = render and "rgb_array" in _metadata(make(), "render_modes", ())
         if self.shown:
-            makes[0] = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
+            first = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name, self.floats = _name(maker), torch.empty(0, dtype=dtype).numpy().dtype
-        rows = [
-            _Row(make, makers, fresh, name, number, self.floats)
-            for number, make in enumerate(makes)
-        ]
-        super().__init__(rows, seed, first_seed, cases, device)
-        env = rows[0].gate.env
+
+        def make_row(number: int) -> _Row:
+            return _Row(make if number else first, makers, fresh, name, number, self.floats)
+
+        self.make_row, self.asked = make_row, workers
+        self.kind = f"{settings} {wrappers} {makers}"
+        self.workers: Workers | None = None
         self.info = tuple(info)
+        # With processes, row 0 of this one only says what the spaces are.
+        self.held = _Rows(make_row, range(1 if workers else num_envs), self.info)
+        self.parts: list[Entries] = []  # of all rows, as the processes returned them
+        super().__init__(self.held.rows, num_envs, seed, first_seed, cases, device)
+        env = self.held.rows[0].gate.env
         self.rate = _rate(env)
-        self.space = env.action_space
+        self.space, self.entries = env.action_space, self.held.entries
         check_action_space(name, self.space)
-        first = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
-        self.first_choices = first if first.any() else None  # the lowest numbers, if not 0
-        self.entries = _entries(name, env, self.floats)
-        for row in rows:
-            row.entries = self.entries
-            _check_same_spaces(name, row.number, row.gate.env, env)
+        lowest = torch.as_tensor(lowest_choices(self.space)).reshape(-1)
+        self.first_choices = lowest if lowest.any() else None  # the lowest numbers, if not 0
         self._declare_specs(name, makers, dtype)
 
     def _declare_specs(self, id: str, controllers: Iterable[str], dtype: torch.dtype) -> None:
@@ -198,7 +208,7 @@ class GymnasiumEnv(SeededRows):
         if not self.shown:
             return None
         try:
-            return self.rows[0].gate.render()
+            return self.held.picture() if self.workers is None else self.workers.picture()
         except ForeignError as error:
             self.shown = False
             cause = error if error.__cause__ is None else error.__cause__
@@ -207,9 +217,42 @@ class GymnasiumEnv(SeededRows):
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close all envs."""
-        for row in self.rows:
-            row.gate.close()
+        self.held.close()
+        if self.workers is not None:
+            self.workers.close()
         super().close(raise_if_closed=raise_if_closed)
+
+    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
+        """Begin episodes, see `SeededRows`; the rows are made before the first one."""
+        if not self.parts:
+            self._place_rows()
+        if self.workers is None:
+            self.held.begin_rows(seeds, actions)
+            self.parts = [self.held.entries_of_rows()]
+        else:
+            self.parts = self.workers.begin(seeds, actions)
+
+    def step_rows(self, actions: Any) -> None:
+        """Take a step in all rows, see `SeededRows`."""
+        if self.workers is None:
+            self.held.step_rows(actions)
+            self.parts = [self.held.entries_of_rows()]
+        else:
+            self.parts = self.workers.step(actions)
+
+    def _place_rows(self) -> None:
+        """Decide in which processes the rows are, and make them there."""
+        count = self.batch_size[0]
+        if count == len(self.held.rows):
+            return
+        like = self.held.rows[0]
+        make = partial(_Rows, self.make_row, info=self.info, like=like.gate.env)
+        seconds = partial(timed, make, self.space.sample)
+        number = choose(self.asked, count, seconds, like.name, self.kind)
+        if number:
+            self.workers = Workers(make, count, number, like.name)
+        else:
+            self.held.extend(self.make_row, count)
 
     def encode(self, observation: Any, *, first: bool) -> TensorDict:
         """Return the entries of an env of one row for an observation that comes from elsewhere.
@@ -222,6 +265,7 @@ class GymnasiumEnv(SeededRows):
         """
         (row,) = self.rows
         row.observe(observation, first=first)
+        self.parts = [self.held.entries_of_rows()]
         return self._output(stepped=not first)
 
     def decode(self, actions: torch.Tensor) -> Any:
@@ -244,27 +288,109 @@ class GymnasiumEnv(SeededRows):
         return numbered.astype(self.space.dtype) if has_whole_numbers(self.space) else numbered
 
     def _output(self, *, stepped: bool) -> TensorDict:
-        rows = self.rows
-        terminated = np.array([[row.terminated] for row in rows], dtype=bool)
-        truncated = np.array([[row.truncated] for row in rows], dtype=bool)
-        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
-        data = TensorDict({}, self.batch_size)
-        for name, end in ends.items():
-            data[name] = torch.from_numpy(end)
-        if stepped:
-            data["reward"] = self._numbers([row.reward for row in rows])
-        for index, entry in enumerate(self.entries):
-            data[entry.key] = torch.from_numpy(np.stack([row.values[index] for row in rows]))
-        for name in self.info:
-            data["info", name] = self._numbers([row.number_of(name) for row in rows])
-        for name in rows[0].controllers:
-            advice = torch.from_numpy(np.array([row.advice[name] for row in rows]))
-            spec = self.observation_spec["controller", name]
-            data["controller", name] = advice.to(spec.dtype).reshape(spec.shape)
+        tensors: dict[Any, torch.Tensor] = {}
+        for key in self.parts[0]:
+            if key == "reward" and not stepped:
+                continue
+            parts = [part[key] for part in self.parts]
+            value = torch.from_numpy(np.concatenate(parts) if len(parts) > 1 else parts[0])
+            if key[0] == "controller":
+                spec = self.observation_spec[key]
+                value = value.to(spec.dtype).reshape(spec.shape)
+            tensors[key] = value
+        data = TensorDict(tensors, self.batch_size)
         return data if self.device is None or self.device.type == "cpu" else data.to(self.device)
 
-    def _numbers(self, values: list[Any]) -> torch.Tensor:
-        return torch.from_numpy(np.array(values, dtype=self.floats).reshape(-1, 1))
+
+class _Rows:
+    """Rows that are stepped one after the other in one process; see `coil_rl.envs.workers.Shard`.
+
+    Args:
+        make_row: makes a row by its number.
+        numbers: of the rows.
+        info: names of numbers in Gymnasium's info.
+        like: an env whose spaces those of all rows must be; by default that of the first row.
+    """
+
+    def __init__(
+        self,
+        make_row: Callable[[int], "_Row"],
+        numbers: range,
+        info: Sequence[str],
+        like: Env | None = None,
+    ) -> None:
+        self.info = tuple(info)
+        self.rows = [make_row(numbers[0])]
+        first = self.rows[0]
+        self.like = first.gate.env if like is None else like
+        self.entries = _entries(first.name, self.like, first.dtype)
+        self._fit(first)
+        self.extend(make_row, len(numbers), numbers[0])
+
+    def extend(self, make_row: Callable[[int], "_Row"], count: int, start: int = 0) -> None:
+        """Make further rows.
+
+        Args:
+            make_row: makes a row by its number.
+            count: of all rows.
+            start: number of the first row.
+        """
+        for number in range(start + len(self.rows), start + count):
+            row = make_row(number)
+            self._fit(row)
+            self.rows.append(row)
+
+    def _fit(self, row: "_Row") -> None:
+        row.entries = self.entries
+        if row.gate.env is not self.like:
+            _check_same_spaces(row.name, row.number, row.gate.env, self.like)
+
+    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
+        """Begin episodes, and take some actions in each."""
+        for row, seed in seeds.items():
+            self.rows[row].begin(seed)
+            for action in actions.get(row, ()):
+                self.rows[row].step(action)
+
+    def step_rows(self, actions: Any) -> None:
+        """Take a step in all rows."""
+        for row, action in zip(self.rows, actions, strict=True):
+            row.step(action)
+
+    def entries_of_rows(self) -> Entries:
+        """Return the entries of all rows, [rows, ...], and their rewards."""
+        rows, count = self.rows, len(self.rows)
+        ends = np.empty((2, count, 1), dtype=bool)
+        rewards = np.empty((count, 1), dtype=rows[0].dtype)
+        observed = [np.empty((count, *entry.given), entry.dtype) for entry in self.entries]
+        for number, row in enumerate(rows):
+            ends[0, number], ends[1, number] = row.terminated, row.truncated
+            rewards[number] = row.reward
+            for array, value in zip(observed, row.values, strict=True):
+                array[number] = value
+        found: Entries = {
+            "terminated": ends[0],
+            "truncated": ends[1],
+            "done": ends[0] | ends[1],
+            "reward": rewards,
+        }
+        for entry, array in zip(self.entries, observed, strict=True):
+            found[entry.key if len(entry.key) > 1 else entry.key[0]] = array
+        for name in self.info:
+            numbers = np.array([row.number_of(name) for row in rows], dtype=rows[0].dtype)
+            found["info", name] = numbers.reshape(-1, 1)
+        for name in rows[0].controllers:
+            found["controller", name] = np.array([row.advice[name] for row in rows])
+        return found
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Return a picture of the first row."""
+        return self.rows[0].gate.render()
+
+    def close(self) -> None:
+        """Close all envs."""
+        for row in self.rows:
+            row.gate.close()
 
 
 class _Row:
@@ -397,6 +523,15 @@ class _Row:
                     f"controller {name} gave {shown(advice)}, not an action of {space}"
                 )
         return np.array(array)
+
+
+def _check_workers(workers: int | str) -> None:
+    """Raise a `ValueError` for what is no number of processes."""
+    whole = isinstance(workers, int) and not isinstance(workers, bool)
+    if workers != AUTO and not (whole and 0 <= int(workers) <= MOST_WORKERS):
+        raise ValueError(
+            f"workers={workers} must be auto or a whole number from 0 to {MOST_WORKERS}"
+        )
 
 
 # The envs of all rows of this process, to find one that two rows would share.

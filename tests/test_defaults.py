@@ -21,7 +21,8 @@ VARIATIONS = {
     "env/gym.yaml": [
         "env.options",
         "env.controllers",
-    ],  # None in the constructor: no options, no controllers
+        "env.workers",
+    ],  # None in the constructor: no options, no controllers; from Python processes are asked for
     "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["car_length"],
     "disturb/late.yaml": ["min_lag", "max_lag", "in_keys", "memory_key"],

@@ -20,7 +20,15 @@ from coil_rl.measures import REDUCTIONS
 
 LARGEST = 2**63 - 1
 # Keys in which two runs with the same numbers may differ.
-IGNORED_KEYS = ("run_dir", "logger", "existing", "defaults", "trust", "proxy.folder")
+IGNORED_KEYS = (
+    "run_dir",
+    "logger",
+    "existing",
+    "defaults",
+    "trust",
+    "proxy.folder",
+    "env.workers",
+)
 
 
 def one_of(*choices: str) -> GetPydanticSchema:
@@ -280,6 +288,8 @@ def fingerprint(config: DictConfig) -> str:
         value = config[key]
         if OmegaConf.is_config(value):
             value = OmegaConf.to_container(value, resolve=True)
+        if key == "env" and isinstance(value, dict):
+            value.pop("workers", None)  # the numbers are the same with any number of processes
         identity[key] = value
     return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:10]
 

@@ -1,0 +1,223 @@
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from worlds import drive, reloaded, same
+
+from coil_rl import GymnasiumEnv
+from coil_rl.envs.gate import ForeignError
+from coil_rl.envs.workers import choose
+
+
+class Plant(gymnasium.Env):
+    """A drifting number; it may fail, die or be slow at a step."""
+
+    def __init__(self, fails=None, dies=None, most=9.0, ends=9, seconds=0.0, fails_to_begin=False):
+        if fails_to_begin:
+            raise RuntimeError("no licence")
+        self.fails, self.dies, self.most, self.ends = fails, dies, most, ends
+        self.seconds = seconds
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float64)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (3,), np.float64)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time, self.state = 0, self.np_random.normal(size=3)
+        return self.state, {"time": 0}
+
+    def step(self, action):
+        self.time += 1
+        time.sleep(self.seconds)
+        if self.time == self.fails:
+            raise RuntimeError("a valve is stuck")
+        if action.sum() > self.most:
+            raise RuntimeError("a fuse has blown")
+        if self.time == self.dies:
+            os.kill(os.getpid(), signal.SIGKILL)
+        self.state = self.state + 0.1 * self.np_random.normal(size=3) + action.sum()
+        return (
+            self.state,
+            float(self.state.sum()),
+            self.time == self.ends,
+            False,
+            {"time": self.time},
+        )
+
+
+class Integrator:
+    """A controller with a memory."""
+
+    def __init__(self, env):
+        self.total = np.zeros(2)
+
+    def reset(self):
+        self.total = np.zeros(2)
+
+    def act(self, observation):
+        self.total = self.total - 0.1 * observation[:2]
+        return np.clip(self.total, -1, 1)
+
+
+def plants(workers, rows=5, **options):
+    return GymnasiumEnv(
+        Plant,
+        rows,
+        options=options,
+        controllers={"integrator": Integrator},
+        info=["time"],
+        seed=3,
+        workers=workers,
+    )
+
+
+@pytest.mark.parametrize("workers", [2, 3, 100, "auto"])
+def test_digits_do_not_depend_on_the_number_of_processes(workers) -> None:
+    alone, _ = drive(plants(0), 25)
+    spread, _ = drive(plants(workers), 25)
+    assert same(alone, spread)
+
+
+@pytest.mark.parametrize(("before", "after"), [(2, 0), (0, 3), (2, 2)])
+def test_running_episodes_go_on_with_another_number_of_processes(before, after) -> None:
+    env = plants(before)
+    _, carrier = drive(env, 13)
+    other = plants(after)
+    other.load_state_dict(reloaded(env.state_dict()))
+    assert other.continues
+    expected, _ = drive(env, 20, carrier, seed=1)
+    found, _ = drive(other, 20, carrier, seed=1)
+    assert same(expected, found)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"fails": 4}, r"the env Plant \(row 0, seed \d+, step 4\): step raised .*a valve is"),
+        ({"dies": 4}, "held the rows 0 to 1 of the env Plant ended by signal 9"),
+    ],
+)
+def test_fault_in_a_process_is_one_sentence_with_its_rows(options, message) -> None:
+    with pytest.raises(ForeignError, match=message):
+        drive(plants(2, **options), 6)
+
+
+def test_fault_of_a_late_row_names_that_row() -> None:
+    env = plants(2, most=1.5)
+    carrier = env.reset()
+    carrier["action"] = torch.zeros(5, 2, dtype=env.action_spec.dtype)
+    carrier["action"][3] = 1.0
+    with pytest.raises(ForeignError, match=r"row 3, .*: a fuse has blown"):
+        env.step(carrier)
+
+
+def test_env_that_cannot_be_made_is_refused_at_once() -> None:
+    with pytest.raises(ValueError, match=r"the env Plant cannot be made: .*no licence"):
+        plants(2, fails_to_begin=True)
+
+
+@pytest.mark.parametrize("workers", [-1, 1.5, "many", True, 10_000])
+def test_number_of_processes_is_checked(workers) -> None:
+    with pytest.raises(ValueError, match=f"workers={workers} must be auto or a whole number"):
+        plants(workers)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "count"), [(1e-6, 0), (1e-3, min(2, len(os.sched_getaffinity(0)))), (None, 0)]
+)
+def test_long_steps_are_spread_over_the_cores(seconds, count) -> None:
+    found = choose("auto", 2, lambda: seconds and 2 * seconds, "Plant", kind=str(seconds))
+    assert found == (count if count > 1 else 0)
+
+
+def test_an_env_is_timed_once_in_a_program() -> None:
+    times = iter([1e-6])
+    for rows in (2, 4):
+        assert choose("auto", rows, lambda: next(times), "Plant", kind="once") == 0
+
+
+def test_a_slow_plant_is_spread_by_itself() -> None:
+    env = plants("auto", seconds=0.004)
+    env.reset()
+    assert (env.workers is None) == (len(os.sched_getaffinity(0)) < 2)
+
+
+def test_warnings_of_a_process_reach_the_program() -> None:
+    env = plants(2, rows=2, ends=None)
+    with pytest.warns(UserWarning, match="an episode did not end within 1,000"):
+        drive(env, 1_000)
+
+
+def test_processes_end_with_the_env() -> None:
+    env = plants(2)
+    env.reset()
+    processes = env.workers.processes
+    env.close()
+    assert not any(process.is_alive() for process in processes)
+
+
+PROGRAM = """
+import sys, time
+sys.path.insert(0, {tests!r})
+from test_workers import plants
+env = plants(2)
+env.reset()
+print(*[process.pid for process in env.workers.processes], flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("kind", ["SIGKILL", "SIGTERM", "SIGINT"])
+def test_no_process_outlives_the_program(kind) -> None:
+    program = PROGRAM.format(tests=os.path.dirname(__file__))
+    paths = os.pathsep.join(path for path in sys.path if path)
+    child = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": paths},
+    )
+    pids = [int(pid) for pid in child.stdout.readline().split()]
+    assert len(pids) == 2
+    child.send_signal(getattr(signal, kind))
+    child.wait()
+    deadline = time.monotonic() + 10
+    while any(map(_runs, pids)) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(map(_runs, pids))
+
+
+def _runs(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_rows_of_one_process_have_the_spaces_of_all() -> None:
+    made = iter(range(100))
+
+    def uneven():
+        env = Plant()
+        if next(made) == 1:
+            env.observation_space = spaces.Box(-1, 1, (3,))
+        return env
+
+    with pytest.raises(ValueError, match="all envs of a run need the same spaces"):
+        GymnasiumEnv(uneven, 4, workers=2).reset()
+
+
+def test_env_with_processes_gives_the_same_pictures() -> None:
+    pictures = []
+    for workers in (0, 2):
+        env = GymnasiumEnv("CartPole-v1", 2, workers=workers, render=True, seed=1)
+        drive(env, 3)
+        pictures.append(env.render())
+    assert np.array_equal(*pictures)
