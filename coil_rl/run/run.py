@@ -28,6 +28,7 @@ from coil_rl.run.cases import TrainingCases
 from coil_rl.run.controller import Controller
 from coil_rl.run.curve import EvaluationCurve, Watch, measures
 from coil_rl.run.delivery import Delivery, guide_of, handed_over
+from coil_rl.run.evaluation import EvaluationResult
 from coil_rl.run.experiment import PUT_BACK, Experiment, watched_keys
 from coil_rl.run.fallback import Fallback, make_fallback
 from coil_rl.run.folder import (
@@ -40,7 +41,8 @@ from coil_rl.run.folder import (
     weights_file,
     write_config,
 )
-from coil_rl.run.judge import Trial, guide_titles, judge, report_outcome
+from coil_rl.run.guide_episodes import driven_once
+from coil_rl.run.judge import Evaluation, Trial, guide_titles, judge, report_outcome
 from coil_rl.run.next_step import next_step
 from coil_rl.run.parts import TESTS, TRAIN, EnvMaker
 from coil_rl.run.rollout import Rollout
@@ -487,11 +489,20 @@ class Run:
         return policy
 
     def _trial_with_reason(self) -> Trial:
-        """Return the trial with a note on which policy was handed over, and why."""
+        """Return the trial with a note on which policy was handed over, and why.
+
+        Its guides drive once.
+        """
+        trial = replace(self.trial, guide_results=self._guide_results)
         reason = handed_over(self.folder) if self.chosen == "best" else None
         if reason is None:
-            return self.trial
-        return replace(self.trial, notes=[*self.trial.notes, reason])
+            return trial
+        return replace(trial, notes=[*trial.notes, reason])
+
+    def _guide_results(self, evaluation: Evaluation) -> Mapping[str, EvaluationResult]:
+        """Return the episodes of the guides alone, which a resumed run does not drive again."""
+        drive = partial(self.trial.guide_results, evaluation)
+        return driven_once(self.folder, self.settings, evaluation, drive)
 
     def in_env(
         self, env: EnvBase, which: str = HANDED_OVER
