@@ -70,7 +70,6 @@ def keep_written(
     overrides = [*task, *hydra]
     loader: Any = GlobalHydra.instance().config_loader()
     _, files = loader._parse_overrides_and_create_caching_repo(config_name, overrides)
-    defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
     for text in task:
         group, value = key_of(text), text.partition("=")[2]
         if group not in SEVERAL and value.startswith("[") and files.group_exists(group):
@@ -78,6 +77,9 @@ def keep_written(
                 f"{text} chooses several files of a group that takes one; for a run with each "
                 f"write -m {group}={value.strip('[]')}"
             )
+    if all(source.full_path().startswith(SHIPPED) for source in files.get_sources()):
+        return  # to look for files of users takes as long as to compose all of them
+    defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
     # A choice of a file, such as method=coil, gives no value.
     typed = [key for key in map(key_of, task) if not files.group_exists(key.replace(".", "/"))]
     last: dict[str, Written] = {}
