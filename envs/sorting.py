@@ -46,27 +46,30 @@ def smallest(values: Tensor, masked: Tensor, k: int) -> Tensor:
     ):
         first = keys.topk(k, 0, largest=False).values
     else:
-        first = _bitonic_sort(keys, rows_padded, k)
+        first = _bitonic_sort(keys, k)
     return first.bitwise_and_(constant(rows_padded - 1, rows))
 
 
-def _bitonic_sort(keys: Tensor, rows_padded: int, k: int) -> Tensor:
+def _bitonic_sort(keys: Tensor, k: int) -> Tensor:
     """Return the first k rows of keys [N, *batch], sorted by Batcher's bitonic network.
 
-    The network has a power of two of rows, `rows_padded`. A pair of sorted runs is merged by
-    comparing the first run with the reversed second one, which separates the smaller from the
-    larger half, and by splitting each half in the same way down to single rows. Rows beyond k are
-    dropped.
+    A pair of sorted runs is merged by comparing the first run with the reversed second one, which
+    separates the smaller from the larger half, and by splitting each half in the same way down to
+    single rows. Runs grow to the power of two that holds k rows; from then on rows beyond it are
+    dropped, and the last run of an odd number waits for the next round.
     """
-    batch = keys.shape[1:]
-    if rows_padded > len(keys):
+    batch, longest = keys.shape[1:], 1 << (k - 1).bit_length()
+    padding = -len(keys) % longest
+    if padding:
         largest = torch.iinfo(keys.dtype).max
-        keys = torch.cat([keys, keys.new_full((rows_padded - len(keys), *batch), largest)])
-    keys = keys.view(rows_padded, -1)
+        keys = torch.cat([keys, keys.new_full((padding, *batch), largest)])
+    keys = keys.view(len(keys), -1)
     run = 1
     while run < len(keys):
+        half, waiting = run // 2, None
+        if len(keys) // run % 2:
+            keys, waiting = keys[:-run], keys[-run:]
         first, second = keys.view(-1, 2, run, keys.shape[1]).unbind(1)
-        half = run // 2
         if run < k:
             keys = _compare(first, second.flip(1))
             run *= 2
@@ -75,6 +78,8 @@ def _bitonic_sort(keys: Tensor, rows_padded: int, k: int) -> Tensor:
         while half:
             keys = _compare(*keys.view(-1, 2, half, keys.shape[1]).unbind(1))
             half //= 2
+        if waiting is not None:
+            keys = torch.cat([keys, waiting])
     return keys[:k].view(k, *batch)
 
 
