@@ -14,6 +14,8 @@ from pathlib import Path
 import torch
 from hydra import compose, initialize_config_module
 from omegaconf import DictConfig
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torch.profiler import profile
 from torchrl.envs import EnvBase, TransformedEnv
 
@@ -99,6 +101,29 @@ def measure_driving(args: Namespace) -> list[Row]:
                 "rounds": rates,
             }
         )
+    return rows
+
+
+def measure_guide(args: Namespace, states: int = 8) -> list[Row]:
+    """Return the CPU time of the guide alone in states of its drive, for each size of a batch."""
+    rows = []
+    for cars, _ in args.batches:
+        driving = Driving(driving_env(args, cars, guide=True), follow=True)
+        (guide,) = build_guides(train_config(args, "coil")).values()
+        seen = []
+        for _ in range(states):
+            for _ in range(4):
+                driving()
+            seen.append(driving.state.select(*guide.in_keys, strict=False))
+
+        def advise(guide: TensorDictModuleBase = guide, seen: list[TensorDictBase] = seen) -> int:
+            with torch.no_grad():
+                for state in seen:
+                    guide(state.copy())
+            return len(seen) * seen[0].numel()
+
+        rates = measure(args, {"guide": advise}, time.process_time)
+        rows.append({"cars": cars, "us a frame": 1e6 / medians(rates)["guide"], "rounds": rates})
     return rows
 
 
