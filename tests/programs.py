@@ -8,6 +8,9 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import patch
+
+from hydra._internal.hydra import Hydra
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,6 +35,7 @@ TINY_SWEEP = [
     "env.laps=1",
     "env.time_limit=1",
     "env.rate=12",
+    "evaluation.curve.env.time_limit=1",
     "evaluation.repeats=1",
     "logger=none",
     "budget.num_envs=4",
@@ -73,12 +77,24 @@ def program(name, *arguments, cwd, code=0):
     return done
 
 
+def mode_is_known(name, arguments):
+    """Let Hydra not compose the whole configuration once more to find the mode, if it is known.
+
+    A file of an experiment, of other folders or of another package may set it.
+    """
+    settles = ("experiment", "hydra.mode", "hydra.searchpath", "--config", "-cd", "-cn", "-cp")
+    if name == "reproduce" or any(word in each for each in arguments for word in settles):
+        return contextlib.nullcontext()
+    return patch.object(Hydra, "get_mode", lambda self, config_name, overrides: None)
+
+
 def called(name, *arguments, cwd=".", code=0):
     """Run a program in this process; `code=None` accepts any exit code."""
     out, error, ended, given = io.StringIO(), io.StringIO(), 0, sys.argv
     sys.argv = [name, *arguments]
     try:
         with (
+            mode_is_known(name, arguments),
             contextlib.chdir(cwd),
             contextlib.redirect_stderr(error),
             contextlib.redirect_stdout(out),

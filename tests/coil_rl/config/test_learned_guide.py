@@ -19,6 +19,7 @@ TINY = [
     "track.test.count=1",
     "env.laps=1",
     "env.time_limit=1",
+    "evaluation.curve.env.time_limit=1",
     "evaluation.repeats=1",
     "evaluation.gif=false",
     "logger=none",

@@ -34,7 +34,8 @@ TINY = shlex.split(
     "evaluation.repeats=1 logger=none checkpoint_every=1 "
     "budget.frames=256 budget.num_envs=4 budget.steps=16"
 )
-OWN = {env: ["env.laps=1", "env.time_limit=1"] for env in TRACKED}
+SHORT = shlex.split("env.laps=1 env.time_limit=1 evaluation.curve.env.time_limit=1")
+OWN = dict.fromkeys(TRACKED, SHORT)
 OWN |= {env: [*overrides, *SMALL_CASES] for env, overrides in OTHERS.items()}
 PPO = ["learner.epochs=2", "learner.minibatches=2"]
 REPLAY = shlex.split(

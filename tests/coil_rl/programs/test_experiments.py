@@ -12,6 +12,7 @@ from coil_rl.programs.train import train
 
 CONF = Path(__file__).parents[3] / "conf"
 EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
+OF_TRACKS = ("track", "env.", "evaluation.curve.env.")  # words of worlds with tracks
 NEEDS_RUNS = ["driving_tasks"]
 
 
@@ -32,7 +33,7 @@ def first(experiment, run_dir):
     ]
     tiny = TINY_SWEEP
     if experiment == "promise":  # of no world with tracks
-        tiny = [word for word in TINY_SWEEP if not word.startswith(("track", "env."))]
+        tiny = [word for word in TINY_SWEEP if not word.startswith(OF_TRACKS)]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose("train", [f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}"])
 
