@@ -11,10 +11,10 @@ README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"^```(\w*)\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
 CONTROLLER, PROGRAM = (block for language, block in BLOCKS if language == "python")
 COMMANDS = [
-    shlex.split(line.removeprefix("PYTHONPATH=. "))
-    for language, block in BLOCKS
+    shlex.split(line)
+    for _, block in BLOCKS
     for line in block.splitlines()
-    if not language and "coil-" in line and "pip" not in line
+    if line.startswith("coil-")
 ]
 TOY = {
     "coil-train": ["budget.frames=2048", "evaluation.cases=2", "evaluation.curve.num_envs=2"],
