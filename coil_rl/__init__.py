@@ -105,6 +105,7 @@ _NAMES = {
     "coil_rl.run.parts": "EnvMaker",
     "coil_rl.run.run": "Budget Run",
     "coil_rl.config.trust": "trust_packages",
+    "coil_rl.worth.comparison": "compare",
     "coil_rl.transforms": "DiscreteActions GuideActions JumpStart MixedAction NormalisedAction "
     "ResidualAction RewardCoupling set_progress",
 }

@@ -9,6 +9,7 @@ import textwrap
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 from tqdm import tqdm
@@ -53,9 +54,22 @@ class SafeStream:
         return getattr(self.stream, name)
 
 
+_quiet: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Show neither progress bars nor what is said in the block; warnings and errors stay."""
+    before = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(before)
+
+
 def progress(**options: Any) -> "tqdm[Any]":
     """Return a progress bar on standard error; `options` are those of tqdm."""
-    return tqdm(file=SafeStream(sys.stderr), **options)
+    return tqdm(file=SafeStream(sys.stderr), disable=_quiet.get(), **options)
 
 
 def say(text: str, *, error: bool = False) -> None:
@@ -65,6 +79,8 @@ def say(text: str, *, error: bool = False) -> None:
         text: the text.
         error: whether to print on standard error.
     """
+    if _quiet.get():
+        return
     stream = SafeStream(sys.stderr if error else sys.stdout)
     stream.write(f"{text}\n")
     stream.flush()

@@ -1,0 +1,170 @@
+"""What acts without learning, in the cases of the table: measured once, and kept in a file."""
+
+import copy
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf, open_dict
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from coil_rl.config.build import assemble, build_evaluation, env_maker
+from coil_rl.config.nodes import build_all
+from coil_rl.config.saved import read_config
+from coil_rl.report import write_csv
+from coil_rl.run import checkpoint
+from coil_rl.run.curve import POLICIES
+from coil_rl.run.evaluation import EvaluationResult
+from coil_rl.run.parts import TEST, EnvMaker, transformed
+from coil_rl.run.run import put_weights
+from coil_rl.transforms.action_space import ActionSpace
+from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
+
+FILE = "baselines.csv"
+NOTHING_ELSE = "baseline"  # column with the name
+REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
+LATE = {
+    "observation_delay": {"_target_": "coil_rl.transforms.ObservationDelay"},
+    "action_delay": {"_target_": "coil_rl.transforms.ActionDelay"},
+}
+LAG = {"min_lag": 1, "max_lag": 1}  # steps
+
+
+class Acting(TensorDictModuleBase):
+    """Policy without an observation: neutral or random actions, in the unit of the env.
+
+    Args:
+        env: the env.
+        vectors: returns the action vectors of all rows.
+    """
+
+    def __init__(self, env: EnvBase, vectors: Callable[[ActionSpace, torch.Size], Tensor]) -> None:
+        self.in_keys: list[NestedKey] = []
+        self.out_keys: list[NestedKey] = [env.action_key]
+        super().__init__()
+        self.space = ActionSpace(env.full_action_spec[env.action_key], env.batch_dims)
+        self.vectors = vectors
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action."""
+        vectors = self.vectors(self.space, tensordict.batch_size)
+        return tensordict.set(self.out_keys[0], self.space.actions(vectors))
+
+    @staticmethod
+    def env(make_env: EnvMaker, rows: int) -> EnvBase:
+        """Return an env in the cases of the table, without a method."""
+        return transformed(make_env.bare(rows, TEST, None), make_env.disturb(TEST), "disturb")
+
+    @classmethod
+    def random(cls, make_env: EnvMaker, rows: int, seed: int = 0) -> "Acting":
+        """Return a policy with random actions, uniform in those of the env."""
+        return cls(cls.env(make_env, rows), partial(_random, torch.Generator().manual_seed(seed)))
+
+    @classmethod
+    def zero(cls, make_env: EnvMaker, rows: int) -> "Acting":
+        """Return a policy with the neutral action."""
+        return cls(cls.env(make_env, rows), _neutral)
+
+
+def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
+    draws = torch.rand((*batch, *space.agents, space.size), generator=generator)
+    return space.random(draws.to(space.dtype))
+
+
+def _neutral(space: ActionSpace, batch: torch.Size) -> Tensor:
+    neutral = space.neutral()
+    return neutral.expand(*batch, *neutral.shape)
+
+
+def measure_baselines(config: DictConfig, folder: Path) -> None:
+    """Let guide, opposite, zero and random act in the cases of the table, unless that is done.
+
+    Args:
+        config: of a training with a guide.
+        folder: of the comparison, for the file.
+    """
+    if (folder / FILE).exists():
+        return
+    evaluation, make_env = build_evaluation(config), env_maker(config)
+    cases = len(evaluation.cases)
+    opposite = EnvMaker(
+        make_env.bare,
+        disturb=make_env.disturb,
+        guides=make_env.guides,
+        degrade=lambda: [*make_env.degrade(), *build_all({"opposite": REVERSED}, "degrade")],
+    )
+    rows: list[dict[str, Any]] = []
+    for name, (env, policy) in {
+        GUIDE: make_env.guided(cases, TEST),
+        OPPOSITE: opposite.guided(cases, TEST),
+    }.items():
+        rows += _rows(name, evaluation.run(env, policy))
+    for name, acting in {
+        ZERO: Acting.zero(make_env, cases),
+        RANDOM: Acting.random(make_env, cases, config.seed),
+    }.items():
+        rows += _rows(name, evaluation.run(Acting.env(make_env, cases), acting))
+    write_csv(rows, folder / FILE)
+
+
+def measure_network(folder: Path, run: Path) -> None:
+    """Let the first network of a run act in the cases of the table, unless that is done.
+
+    Args:
+        folder: of the comparison, for the file.
+        run: folder of a finished run that kept its policies.
+    """
+    file = folder / "first_network.csv"
+    first = min((run / POLICIES).glob("*.pt"), default=None)
+    if file.exists() or first is None:
+        return
+    opened = assemble(read_config(run, "run"), run)
+    env = opened.make_env(len(opened.trial.evaluation.cases), TEST)
+    policy = opened.make_learner(env).policy  # type: ignore[misc]
+    put_weights(policy, checkpoint.load(first), first)
+    write_csv(_rows(NETWORK, opened.trial.evaluation.run(env, policy)), file)
+
+
+def measure_delayed(name: str, run: Path | None, config: DictConfig) -> pd.DataFrame:
+    """Return the episodes of a policy with a step of delay on observation and action.
+
+    Args:
+        name: of the policy.
+        run: folder of its run; None for a guide or its opposite.
+        config: of a training with a guide, for these.
+    """
+    late = copy.deepcopy(config) if run is None else read_config(run, "run")
+    nodes = {key: node | LAG for key, node in LATE.items()}
+    with open_dict(late):
+        late.disturb = OmegaConf.merge(late.disturb, nodes)
+        if name == OPPOSITE:
+            late.degrade = OmegaConf.merge(late.degrade, {"opposite": REVERSED})
+    evaluation = build_evaluation(late)
+    cases = len(evaluation.cases)
+    if run is None:
+        env, policy = env_maker(late).guided(cases, TEST)
+    else:
+        opened = assemble(late, run)
+        env = opened.make_env(cases, TEST)
+        policy = opened.policy(env)
+    return pd.DataFrame(_rows(name, evaluation.run(env, policy)))
+
+
+def read_baselines(folder: Path) -> pd.DataFrame:
+    """Return the rows of all that was measured in the cases of the table.
+
+    Args:
+        folder: of the comparison.
+    """
+    files = [folder / FILE, folder / "first_network.csv"]
+    return pd.concat([pd.read_csv(file) for file in files if file.exists()], ignore_index=True)
+
+
+def _rows(name: str, result: EvaluationResult) -> list[dict[str, Any]]:
+    return [{NOTHING_ELSE: name, **episode} for episode in result.episodes]

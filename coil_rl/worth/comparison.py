@@ -1,0 +1,385 @@
+"""A comparison of a guide with what learns, with it and without it, in a few minutes."""
+
+import json
+import math
+import os
+import time
+import traceback
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from omegaconf import DictConfig
+
+from coil_rl.config.build import env_maker
+from coil_rl.config.check import check_parts
+from coil_rl.config.python import Named, composed, named, prepared
+from coil_rl.config.sentences import is_no_bug, sentence
+from coil_rl.config.trust import trust_own
+from coil_rl.errors import UserError, file_of_a_run
+from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_file, write_text
+from coil_rl.learners.learner import Callback, Learner
+from coil_rl.output import decoration, progress, quietly, say
+from coil_rl.report import write_csv
+from coil_rl.run.folder import is_evaluated, locked
+from coil_rl.run.parts import TEST
+from coil_rl.run.run import Run
+from coil_rl.worth import timing
+from coil_rl.worth.arms import (
+    ANCHORED,
+    ARMS,
+    PPO,
+    RANDOM,
+    TUNE,
+    arms_for,
+    check_words,
+    job_of,
+    short_words,
+)
+from coil_rl.worth.baselines import (
+    measure_baselines,
+    measure_delayed,
+    measure_network,
+    read_baselines,
+)
+from coil_rl.worth.outcome import Outcome, first_of, read_outcome
+from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
+from coil_rl.worth.timing import Plan
+from coil_rl.worth.verdict import NOTHING, Entry, Verdict, verdict
+
+PLAN, TABLE, PAGE, PICTURE = "compare.json", "compare.csv", "compare.md", "compare.png"
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What a comparison found.
+
+    Attributes:
+        folder: with the runs, the table, the page and the picture.
+        verdict: what to use, and why.
+        table: one row for each policy.
+        command: that trains what is recommended to the end; empty for none.
+        page: for people.
+    """
+
+    folder: Path
+    verdict: Verdict
+    table: pd.DataFrame
+    command: str
+    page: str
+
+
+def compare(
+    env: Any,
+    *,
+    guide: Any,
+    tune: Mapping[str, Any] | None = None,
+    minutes: float = 2.0,
+    frames: int | None = None,
+    seed: int = 0,
+    folder: str | Path | None = None,
+    overrides: Sequence[str] = (),
+) -> Worth:
+    """Say whether a guide is worth it, and what to use, after a few minutes.
+
+    Args:
+        env: as for `train`.
+        guide: as for `train`.
+        tune: bounds of numbers of the guide by name, which are tuned too: [low, high] or [low,
+            high, "log"].
+        minutes: that it may take, about; it takes longer where an env or a guide is too slow.
+        frames: of a whole training, of which each job here gets a tenth at most; by default those
+            of the env's file.
+        seed: of the first trainings; the others have the next one.
+        folder: for everything that is written; one that holds this comparison goes on with it. By
+            default a new one in outputs/compare.
+        overrides: further words of the command line, such as "learner.gamma=0.98".
+
+    Raises:
+        UserError: for a mistake in an argument, with one sentence that says what to do.
+
+    Example:
+        >>> import coil_rl
+        >>> found = coil_rl.compare("Pendulum-v1", guide="swing_up")  # doctest: +SKIP
+        >>> print(found.page)  # doctest: +SKIP
+    """
+    place = new_folder() if folder is None else Path(folder).expanduser()
+    given = named(env, guide, str(place))
+    words = [*given.words, *overrides]
+    if frames is not None:
+        words.append(f"budget.frames={frames}")
+    if tune is not None:
+        given.nodes["tune"] = dict(tune)
+    return Comparison(Named(words, given.nodes), place, minutes=minutes, seed=seed).run()
+
+
+def new_folder() -> Path:
+    """Return the folder of a new comparison."""
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S-%f")
+    return Path("outputs", "compare", f"{now}_{os.getpid()}")
+
+
+class Comparison:
+    """A comparison in a folder, new or begun before.
+
+    Args:
+        given: env, guide and everything else that was given.
+        folder: of the comparison; each training has a folder in it.
+        minutes: that it may take, about.
+        seed: of the first trainings.
+
+    Raises:
+        UserError: for a word that a comparison decides itself, and for no time.
+    """
+
+    def __init__(self, given: Named, folder: Path, *, minutes: float = 2.0, seed: int = 0) -> None:
+        check_words(given.words)
+        if not 0 < minutes < math.inf:
+            raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
+        self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
+        self.overhead = 0.0  # s, to prepare a training
+
+    def run(self) -> Worth:
+        """Compare, or go on with it, and return what was found; the page is written and printed.
+
+        Raises:
+            UserError: for a mistake in what was given, for a folder that holds something else, and
+                if another process uses the folder.
+        """
+        start = time.perf_counter()
+        config = self._checked()
+        self.overhead = time.perf_counter() - start
+        with self._new_or_kept(), locked(self.folder):
+            (self.folder / FAILED_JOBS).unlink(missing_ok=True)
+            plan = self._plan(config)
+            short = short_words(self.given.words, config, plan.cases)
+            with quietly():
+                base = self._config(ANCHORED, plan.frames, short)
+                measure_baselines(base, self.folder)
+            failed = self._train(plan, short)
+            return self._judge(plan, base, failed)
+
+    @contextmanager
+    def _new_or_kept(self) -> Iterator[None]:
+        """Remove the folder again if nothing was written into it."""
+        try:
+            yield
+        except BaseException:
+            if not (self.folder / PLAN).exists():
+                (self.folder / ".lock").unlink(missing_ok=True)
+                with suppress(OSError):  # it is not empty
+                    self.folder.rmdir()
+            raise
+
+    @property
+    def tunes(self) -> bool:
+        """Whether numbers of the guide are tuned."""
+        return "tune" in self.given.nodes
+
+    def _checked(self) -> DictConfig:
+        """Return the configuration of plain PPO with its whole budget, after a check of all."""
+        anchored = self._config(ANCHORED)
+        if len(anchored.guide) != 1:
+            found = ", ".join(map(str, anchored.guide)) or "none"
+            raise UserError(
+                f"guide: a comparison is about one guide, but there is {found}; give guide=NAME, "
+                "or guide=controller guide.controller.of=MODULE:NAME"
+            )
+        trust_own(anchored)
+        check_parts(anchored)
+        if self.tunes:
+            check_parts(self._config(TUNE))
+        return self._config(PPO)
+
+    def _config(
+        self, name: str, frames: int | None = None, short: Sequence[str] = ()
+    ) -> DictConfig:
+        """Return the configuration of an arm, by default with the whole budget."""
+        job = job_of(self.given, ARMS[name], self.seed, frames, short)
+        return composed(job, self.folder / name)
+
+    def _plan(self, config: DictConfig) -> Plan:
+        """Return what is going to be done, and say it; a comparison that goes on has its plan."""
+        file = self.folder / PLAN
+        identity = {
+            "words": list(self.given.words),
+            "objects": sorted(self.given.nodes),
+            "tune": self.given.nodes.get("tune"),
+            "minutes": self.minutes,
+            "seed": self.seed,
+        }
+        if file.exists():
+            return self._known_plan(file, json.loads(json.dumps(identity)))
+        if any(self.folder.rglob("config.yaml")):
+            raise UserError(f"{self.folder} holds runs of something else; choose another folder")
+        say("coil-compare: timing the env and the guide", error=True)
+        with quietly():
+            pace = timing.measure(config, self.overhead)
+            env = env_maker(config).bare(1, TEST, None)
+        arms = arms_for(env, pace.step, tunes=self.tunes)
+        plan = timing.plan(config, pace, arms, self.minutes)
+        write_text(file, json.dumps({"identity": identity, "plan": plan.to_dict()}, indent=2))
+        say(f"{pace.sentence}\n{_described(plan, self.minutes)}", error=True)
+        return plan
+
+    def _known_plan(self, file: Path, identity: Mapping[str, Any]) -> Plan:
+        """Return the plan in a file, which must be that of the same comparison."""
+        with file_of_a_run(file, "choose another folder"):
+            saved = json.loads(read_file(file, LARGEST_NUMBERS))
+            for key, value in identity.items():
+                if saved["identity"][key] != value:
+                    raise UserError(
+                        f"{self.folder} holds a comparison with {key}={saved['identity'][key]}, "
+                        f"not {value}; give the same arguments to go on, or choose another folder"
+                    )
+            plan = Plan(**saved["plan"])
+        say(f"{self.folder} goes on. {_described(plan, self.minutes)}", error=True)
+        return plan
+
+    def _train(self, plan: Plan, short: Sequence[str]) -> dict[str, str]:
+        """Do the trainings that are missing; return why each of some failed, by its name."""
+        failed: dict[str, str] = {}
+        jobs = [
+            (ARMS[name], seed)
+            for seed in range(self.seed, self.seed + plan.seeds)
+            for name in plan.arms
+        ]
+        with progress(
+            total=len(jobs) * plan.frames, unit="frame", unit_scale=True, desc="compare"
+        ) as bar:
+            for number, (arm, seed) in enumerate(jobs):
+                name = f"{arm.name}_seed{seed}"
+                bar.set_description(f"{number + 1} of {len(jobs)}, {arm.name} seed {seed}")
+                reason = self._job(name, job_of(self.given, arm, seed, plan.frames, short), bar)
+                if reason is not None:
+                    failed[name] = reason
+                bar.update(max((number + 1) * plan.frames - bar.n, 0))
+        return failed
+
+    def _job(self, name: str, job: Named, bar: Any) -> str | None:
+        """Do one training, unless it is done; return why it failed, or None."""
+        folder = self.folder / name
+        if is_evaluated(folder):
+            return None
+        try:
+            with quietly():
+                run = prepared(job, folder)
+                _show(run, bar)
+                run.train()
+        except Exception as error:
+            reason = sentence(error)
+            if not is_no_bug(error):
+                traceback.print_exception(error)
+                reason = f"{type(error).__name__}: {reason}"
+            say(f"coil-compare: {name} failed: {reason}; the others go on", error=True)
+            with (self.folder / FAILED_JOBS).open("a", encoding="utf-8") as file:
+                file.write(f"job {name}: {reason}\n")
+            return reason
+        return None
+
+    def _judge(self, plan: Plan, base: DictConfig, failed: Mapping[str, str]) -> Worth:
+        """Write and print what was found."""
+        with quietly():
+            outcome = read_outcome(self.folder, plan.arms, failed)
+            plain = first_of(outcome, PPO)
+            if plain is not None:
+                measure_network(self.folder, plain.folder)
+                outcome = read_outcome(self.folder, plan.arms, failed)
+            found = verdict(
+                outcome.entries, [name for name in plan.arms if name not in outcome.runs]
+            )
+            delayed = self._delayed(found, outcome, base)
+        command = command_of(self.given, found)
+        page = page_of(found, outcome, delayed, self._steps(outcome), command)
+        write_csv(outcome.rows, self.folder / TABLE)
+        write_text(self.folder / PAGE, f"{page}\n")
+        with decoration(f"the picture in {self.folder}"):
+            cases = base.evaluation.curve.num_envs
+            if outcome.runs:
+                draw(outcome, guide_lines(outcome), cases, self.folder / PICTURE)
+        say(f"{page}\nSee {self.folder}; coil-report folder={self.folder} has more.")
+        return Worth(self.folder, found, pd.DataFrame(outcome.rows), command, page)
+
+    def _delayed(self, found: Verdict, outcome: Outcome, base: DictConfig) -> str:
+        """Return the sentence about a delay of what came out best; empty where it cannot act."""
+        if found.use == NOTHING:
+            return ""
+        run = first_of(outcome, found.use)
+        with decoration("the delay"):
+            table = measure_delayed(found.use, None if run is None else run.folder, base)
+            entry = outcome.entries[found.use]
+            late = Entry(found.use, table["reward"].to_numpy()[None])
+            write_csv(table.to_dict("records"), self.folder / "delayed.csv")
+            return delayed_sentence(entry, late, outcome.entries[RANDOM])
+        return ""
+
+    def _steps(self, outcome: Outcome) -> int:
+        """Return the env steps that only measured: all episodes of the table."""
+        runs = [run for each in outcome.runs.values() for run in each]
+        tables = [pd.read_csv(run.folder / "episodes.csv") for run in runs]
+        return sum(int(table["steps"].sum()) for table in [*tables, read_baselines(self.folder)])
+
+
+def _described(plan: Plan, minutes: float) -> str:
+    """Return what a comparison is going to do, for people."""
+    more = ""
+    if plan.seconds > 1.3 * 60 * minutes:
+        more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
+    return (
+        f"It runs {plan.jobs} trainings of {plan.frames:,} frames each ({', '.join(plan.arms)}; "
+        f"{plan.seeds} seeds), beside the guide, its opposite, zero, random actions and the first "
+        f"network, and takes about {_duration(plan.seconds)}{more}."
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration in words."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.1f} min"
+
+
+def _show(run: Run, bar: Any) -> None:
+    """Let a run tell a progress bar of its frames."""
+    others = run.callbacks
+
+    def callbacks(learner: Learner) -> list[Callback]:
+        return [*others(learner), Tick(bar, run.budget.frames)]
+
+    run.callbacks = callbacks
+
+
+class Tick:
+    """Tells a progress bar of the frames of a training; a `Callback`.
+
+    Args:
+        bar: of all trainings.
+        frames: of this one.
+    """
+
+    names: Sequence[str] = ()
+
+    def __init__(self, bar: Any, frames: int) -> None:
+        self.bar, self.frames = bar, frames
+        self.done, self.share = 0, 0.0
+
+    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
+        """Return whether an update is over, and note how much of the training that is."""
+        self.share = update / max(updates, 1)
+        return bool(row)
+
+    def after_update(self, update: int) -> dict[str, float]:
+        """Show the new frames.
+
+        Args:
+            update: number of updates so far.
+        """
+        done = int(self.frames * self.share)
+        with decoration("the progress bar"):
+            self.bar.update(done - self.done)
+        self.done = done
+        return {}
