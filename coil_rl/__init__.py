@@ -76,6 +76,7 @@ if TYPE_CHECKING:
     from coil_rl.transforms import ResidualAction as ResidualAction
     from coil_rl.transforms import RewardCoupling as RewardCoupling
     from coil_rl.transforms import set_progress as set_progress
+    from coil_rl.worth.comparison import compare as compare
 
 _NAMES = {
     "coil_rl.envs": "ConeTrackEnv DrivingTasksEnv EnvBatch McapReplayEnv SimulatedRobotEnv Track "

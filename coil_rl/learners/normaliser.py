@@ -5,7 +5,6 @@ state, so whoever loads the policy has them, guides see the observations as they
 evaluation never changes them.
 """
 
-import sys
 import warnings
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -19,6 +18,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.learners.encoders import entry_specs
 from coil_rl.learners.extension import Extension
+from coil_rl.output import say
 from coil_rl.transforms import GuideActions
 
 LIMIT = 10.0  # of a normalised number: an outlier must not become a huge input
@@ -245,9 +245,9 @@ class RawObservations:
 def _say(key: NestedKey, found: Sequence[str]) -> None:
     """Print what the first batch decided about an entry."""
     if found:
-        print(f"normalise: {_name(key)} is normalised: {', '.join(found)}", file=sys.stderr)
+        say(f"normalise: {_name(key)} is normalised: {', '.join(found)}", error=True)
     else:
-        print(f"normalise: {_name(key)} is in scale and stays as it is", file=sys.stderr)
+        say(f"normalise: {_name(key)} is in scale and stays as it is", error=True)
 
 
 def _name(key: NestedKey) -> str:

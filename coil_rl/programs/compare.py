@@ -1,22 +1,4 @@
-"""`coil-compare`: is my guide worth it? What to use, after a few minutes."""
-
-import logging
-import shlex
-import sys
-from collections.abc import Sequence
-from typing import Any
-
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException
-
-from coil_rl.config.sentences import sentence
-from coil_rl.config.trust import trust_packages
-from coil_rl.errors import UserError
-from coil_rl.output import say
-from coil_rl.programs import app, folders
-
-OWN = ("minutes", "folder", "seed", "tune")  # arguments that coil-train does not have
-HELP = """coil-compare: is my guide worth it? Short trainings beside the guide, and what to use.
+"""coil-compare: is my guide worth it? Short trainings beside the guide, and what to use.
 
   coil-compare env=mountain_car                            with the guide of the env's file
   coil-compare env=gym env.id=Pendulum-v1 guide=controller guide.controller.of=my_package:PID
@@ -26,8 +8,30 @@ minutes=2       that it may take, about; it says before how long it takes
 folder=FOLDER   for everything that is written; the same command with it goes on after a stop
 seed=0          of the first trainings; the others have the next one
 tune='{...}'    bounds of numbers of the guide, as of method=tune
-All other arguments are those of coil-train, but for what is compared: method and learner.
-See docs/compare.md."""
+
+All other arguments are those of coil-train, but for what is compared: method and learner. See
+docs/compare.md.
+"""
+
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from coil_rl.config.sentences import sentence
+from coil_rl.config.trust import trust_packages
+from coil_rl.config.written import quoted
+from coil_rl.errors import UserError
+from coil_rl.output import say
+from coil_rl.programs import app, folders
+
+CONFIG_DIR = ("--config-dir", "-cd")  # of Hydra: a folder with YAML files of the user
+OWN = ("minutes", "folder", "seed", "tune")  # arguments that coil-train does not have
 
 
 def compare(arguments: Sequence[str]) -> None:
@@ -65,8 +69,15 @@ def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
     """Return the arguments of this program by name, and the words of `coil-train`."""
     own: dict[str, str] = {}
     words = []
-    for argument in arguments:
+    rest = iter(arguments)
+    for argument in rest:
         key, equals, value = argument.partition("=")
+        if key in CONFIG_DIR:
+            place = Path(value or next(rest, "")).expanduser().absolute()
+            if not place.is_dir():
+                raise UserError(f"{key}: {place} is no folder; give one with YAML files")
+            words.append(f"hydra.searchpath=[{quoted(f'file://{place}')}]")
+            continue
         if key in OWN:
             if not equals or not value:
                 raise UserError(f"{argument}: give {key}=VALUE")
@@ -98,7 +109,7 @@ def main() -> None:
     """Entry point."""
     arguments = sys.argv[1:]
     if any(argument in ("-h", "--help") for argument in arguments):
-        print(HELP)
+        print(__doc__.rstrip())
         return
     with app.program("compare"):
         compare(arguments)

@@ -243,11 +243,8 @@ class Comparison:
     def _train(self, plan: Plan, short: Sequence[str]) -> dict[str, str]:
         """Do the trainings that are missing; return why each of some failed, by its name."""
         failed: dict[str, str] = {}
-        jobs = [
-            (ARMS[name], seed)
-            for seed in range(self.seed, self.seed + plan.seeds)
-            for name in plan.arms
-        ]
+        seeds = range(self.seed, self.seed + plan.seeds)
+        jobs = [(ARMS[name], seed) for seed in seeds for name in plan.arms]
         with progress(
             total=len(jobs) * plan.frames, unit="frame", unit_scale=True, desc="compare"
         ) as bar:

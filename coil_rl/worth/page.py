@@ -1,5 +1,6 @@
 """The page of a comparison: a picture, a table, three sentences, and the command to go on with."""
 
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from itertools import cycle
@@ -103,7 +104,7 @@ def command_of(given: Named, verdict: Verdict) -> str:
         if arm.name == TUNE and tune is not None:
             bounds = ", ".join(f"{name}: {_bounds(each)}" for name, each in tune.items())
             words.append(f"tune={{{bounds}}}")
-        return shlex.join(["coil-train", *words, *arm.words])
+        return shlex.join(["coil-train", *map(_plain, [*words, *arm.words])])
     method = arm.words[0].partition("=")[2]
     others = [word for word in words if not word.startswith(("env=", "env.id=", "guide"))]
     overrides = [*others, *arm.words[1:]]
@@ -113,6 +114,11 @@ def command_of(given: Named, verdict: Verdict) -> str:
     if overrides:
         arguments.append(f"overrides={overrides!r}")
     return f"coil_rl.train(env, guide=guide, {', '.join(arguments)})"
+
+
+def _plain(word: str) -> str:
+    """Return a word without the quotes that its value does not need."""
+    return re.sub(r"^([\w.+@/]+)='([\w.:/-]+)'$", r"\1=\2", word)
 
 
 def _bounds(each: Any) -> str:

@@ -138,9 +138,9 @@ def verdict(entries: Mapping[str, Entry], failed: Sequence[str] = ()) -> Verdict
         use = entries[TUNE]
     if leading is not None and difference(leading, use).above(least):
         use = leading
-    train = use.name if use.learns else (leading.name if leading is not None else "")
-    if use.name == TUNE:
-        train = TUNE
+    train = "" if leading is None else leading.name
+    if use.learns or use.name == TUNE:
+        train = use.name
     sentences = (
         _what(use, guide, score, wrong),
         _gained(use, entries),
@@ -206,11 +206,8 @@ def _gained(use: Entry, entries: Mapping[str, Entry]) -> str:
 
 def _undecided(use: Entry, candidates: Sequence[Entry], least: float, failed: Sequence[str]) -> str:
     """Return the sentence that says what is undecided."""
-    close = [
-        each.name
-        for each in candidates
-        if each is not use and not difference(use, each).above(least)
-    ]
+    others = [each for each in candidates if each is not use]
+    close = [each.name for each in others if not difference(use, each).above(least)]
     rising = [each.name for each in candidates if each.rising]
     parts = []
     if close:

@@ -172,7 +172,12 @@ def test_dictionary_and_a_reversed_guide(tmp_path):
         guide=Away,
         minutes=0.01,
         folder=tmp_path / "it",
-        overrides=[*SMALL, "observes=[place,goal]", "guide.controller.in_keys=[place,goal]"],
+        overrides=[
+            *SMALL[:2],
+            "evaluation.cases=10",
+            "observes=[place,goal]",
+            "guide.controller.in_keys=[place,goal]",
+        ],
     )
     assert found.verdict.wrong_way_round
     assert "wrong way round" in found.page
@@ -213,6 +218,7 @@ def test_failed_training_is_one_failed_training(tmp_path):
         (["env=pendulum", "method=ppo"], "method=ppo cannot be given to coil-compare"),
         (["env=pendulum", "learner=sac"], "learner=sac cannot be given to coil-compare"),
         (["env=pendulum", "-m"], "-m is no argument of coil-compare"),
+        (["env=pendulum", "--config-dir", "nowhere"], "nowhere is no folder"),
         (["env=pendulum", "minutes=soon"], "minutes=soon must be a number"),
         (["env=pendulum", "minutes=0"], "minutes=0 must be above 0"),
         (["env=pendulum", "minutes"], "minutes: give minutes=VALUE"),
