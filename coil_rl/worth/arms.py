@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torchrl.envs import EnvBase
 
 from coil_rl.config.python import Named
@@ -14,6 +14,8 @@ GUIDE, OPPOSITE, ZERO, RANDOM, NETWORK = "guide", "opposite", "zero", "random", 
 PPO, ANCHORED, RESIDUAL, SAC, TUNE = "ppo", "coil_anchored", "residual", "sac", "tune"
 SLOW_STEP = 1e-3  # s of an env step, from which SAC, which needs fewer steps, is tried too
 SHARE = 0.1  # of the budget, for each job
+POINTS = 4  # kept policies of a training, besides the first one
+MOST_CURVE_CASES = 8
 # What a comparison decides itself, and the reason.
 OWN = {
     "method": "it compares methods",
@@ -28,12 +30,11 @@ OWN = {
 }
 # Values that make the evaluation of a job short, unless the words give them.
 SHORT = {
-    "evaluation.curve.points": "6",
+    "evaluation.curve.points": str(POINTS),
     "evaluation.repeats": "1",
     "evaluation.gif": "false",
     "logger": "none",
 }
-MOST_CURVE_CASES = 8
 
 
 @dataclass(frozen=True)
@@ -97,13 +98,24 @@ def short_words(words: Sequence[str], config: DictConfig, cases: int | None) -> 
     """
     given = {key_of(word) for word in words}
     short = dict(SHORT)
-    if OmegaConf.select(config, "evaluation.curve.count_key") == "cases":
-        short["evaluation.curve.num_envs"] = str(
-            min(MOST_CURVE_CASES, config.evaluation.curve.num_envs)
-        )
+    short["evaluation.curve.num_envs"] = str(curve_cases(config, cases))
     if cases is not None:
         short["evaluation.cases"] = str(cases)
     return [f"{key}={value}" for key, value in short.items() if key not in given]
+
+
+def curve_cases(config: DictConfig, cases: int | None) -> int:
+    """Return the number of cases of the learning curves.
+
+    Args:
+        config: of a training.
+        cases: of the table; None for those of the env's file.
+    """
+    curve = config.evaluation.curve
+    if curve.count_key != "cases":  # they are places on tracks
+        return int(curve.num_envs)
+    most = MOST_CURVE_CASES if cases is None else min(MOST_CURVE_CASES, cases)
+    return min(most, int(curve.num_envs))
 
 
 def job_of(given: Named, arm: Arm, seed: int, frames: int | None, short: Sequence[str]) -> Named:

@@ -27,7 +27,7 @@ from coil_rl.transforms.action_space import ActionSpace
 from coil_rl.worth.arms import GUIDE, NETWORK, OPPOSITE, RANDOM, ZERO
 
 FILE = "baselines.csv"
-NOTHING_ELSE = "baseline"  # column with the name
+NAME = "baseline"  # column with the name
 REVERSED = {"_target_": "coil_rl.transforms.ScaledAdvice", "gain": -1.0}
 LATE = {
     "observation_delay": {"_target_": "coil_rl.transforms.ObservationDelay"},
@@ -56,20 +56,34 @@ class Acting(TensorDictModuleBase):
         vectors = self.vectors(self.space, tensordict.batch_size)
         return tensordict.set(self.out_keys[0], self.space.actions(vectors))
 
-    @staticmethod
-    def env(make_env: EnvMaker, rows: int) -> EnvBase:
-        """Return an env in the cases of the table, without a method."""
-        return transformed(make_env.bare(rows, TEST, None), make_env.disturb(TEST), "disturb")
+    @classmethod
+    def random(cls, env: EnvBase, seed: int = 0) -> "Acting":
+        """Return a policy with random actions, uniform in those of the env.
+
+        Args:
+            env: the env.
+            seed: of the draws.
+        """
+        return cls(env, partial(_random, torch.Generator().manual_seed(seed)))
 
     @classmethod
-    def random(cls, make_env: EnvMaker, rows: int, seed: int = 0) -> "Acting":
-        """Return a policy with random actions, uniform in those of the env."""
-        return cls(cls.env(make_env, rows), partial(_random, torch.Generator().manual_seed(seed)))
+    def zero(cls, env: EnvBase) -> "Acting":
+        """Return a policy with the neutral action.
 
-    @classmethod
-    def zero(cls, make_env: EnvMaker, rows: int) -> "Acting":
-        """Return a policy with the neutral action."""
-        return cls(cls.env(make_env, rows), _neutral)
+        Args:
+            env: the env.
+        """
+        return cls(env, _neutral)
+
+
+def plain_env(make_env: EnvMaker, rows: int) -> EnvBase:
+    """Return an env in the cases of the table, without a method.
+
+    Args:
+        make_env: makes the env.
+        rows: number of rows.
+    """
+    return transformed(make_env.bare(rows, TEST, None), make_env.disturb(TEST), "disturb")
 
 
 def _random(generator: torch.Generator, space: ActionSpace, batch: torch.Size) -> Tensor:
@@ -105,11 +119,10 @@ def measure_baselines(config: DictConfig, folder: Path) -> None:
         OPPOSITE: opposite.guided(cases, TEST),
     }.items():
         rows += _rows(name, evaluation.run(env, policy))
-    for name, acting in {
-        ZERO: Acting.zero(make_env, cases),
-        RANDOM: Acting.random(make_env, cases, config.seed),
-    }.items():
-        rows += _rows(name, evaluation.run(Acting.env(make_env, cases), acting))
+    env = plain_env(make_env, cases)
+    rows += _rows(ZERO, evaluation.run(env, Acting.zero(env)))
+    env = plain_env(make_env, cases)
+    rows += _rows(RANDOM, evaluation.run(env, Acting.random(env, config.seed)))
     write_csv(rows, folder / FILE)
 
 
@@ -167,4 +180,4 @@ def read_baselines(folder: Path) -> pd.DataFrame:
 
 
 def _rows(name: str, result: EvaluationResult) -> list[dict[str, Any]]:
-    return [{NOTHING_ELSE: name, **episode} for episode in result.episodes]
+    return [{NAME: name, **episode} for episode in result.episodes]

@@ -4,7 +4,6 @@ import json
 import math
 import os
 import time
-import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -17,17 +16,14 @@ from omegaconf import DictConfig
 
 from coil_rl.config.build import env_maker
 from coil_rl.config.check import check_parts
-from coil_rl.config.python import Named, composed, named, prepared
-from coil_rl.config.sentences import is_no_bug, sentence
+from coil_rl.config.python import Named, composed, named
 from coil_rl.config.trust import trust_own
 from coil_rl.errors import UserError, file_of_a_run
 from coil_rl.files import FAILED_JOBS, LARGEST_NUMBERS, read_file, write_text
-from coil_rl.learners.learner import Callback, Learner
-from coil_rl.output import decoration, progress, quietly, say
+from coil_rl.output import decoration, quietly, say
 from coil_rl.report import write_csv
-from coil_rl.run.folder import is_evaluated, locked
+from coil_rl.run.folder import locked
 from coil_rl.run.parts import TEST
-from coil_rl.run.run import Run
 from coil_rl.worth import timing
 from coil_rl.worth.arms import (
     ANCHORED,
@@ -46,6 +42,7 @@ from coil_rl.worth.baselines import (
     measure_network,
     read_baselines,
 )
+from coil_rl.worth.jobs import job_name, run_jobs
 from coil_rl.worth.outcome import Outcome, first_of, read_outcome
 from coil_rl.worth.page import command_of, delayed_sentence, draw, guide_lines, page_of
 from coil_rl.worth.timing import Plan
@@ -160,7 +157,7 @@ class Comparison:
             with quietly():
                 base = self._config(ANCHORED, plan.frames, short)
                 measure_baselines(base, self.folder)
-            failed = self._train(plan, short)
+            failed = run_jobs(self._jobs(plan, short), self.folder, plan.frames)
             return self._judge(plan, base, failed)
 
     @contextmanager
@@ -223,7 +220,7 @@ class Comparison:
         arms = arms_for(env, pace.step, tunes=self.tunes)
         plan = timing.plan(config, pace, arms, self.minutes)
         write_text(file, json.dumps({"identity": identity, "plan": plan.to_dict()}, indent=2))
-        say(f"{pace.sentence}\n{_described(plan, self.minutes)}", error=True)
+        say(f"{pace.sentence}\n{plan.described(self.minutes)}", error=True)
         return plan
 
     def _known_plan(self, file: Path, identity: Mapping[str, Any]) -> Plan:
@@ -237,46 +234,17 @@ class Comparison:
                         f"not {value}; give the same arguments to go on, or choose another folder"
                     )
             plan = Plan(**saved["plan"])
-        say(f"{self.folder} goes on. {_described(plan, self.minutes)}", error=True)
+        say(f"{self.folder} goes on. {plan.described(self.minutes)}", error=True)
         return plan
 
-    def _train(self, plan: Plan, short: Sequence[str]) -> dict[str, str]:
-        """Do the trainings that are missing; return why each of some failed, by its name."""
-        failed: dict[str, str] = {}
-        seeds = range(self.seed, self.seed + plan.seeds)
-        jobs = [(ARMS[name], seed) for seed in seeds for name in plan.arms]
-        with progress(
-            total=len(jobs) * plan.frames, unit="frame", unit_scale=True, desc="compare"
-        ) as bar:
-            for number, (arm, seed) in enumerate(jobs):
-                name = f"{arm.name}_seed{seed}"
-                bar.set_description(f"{number + 1} of {len(jobs)}, {arm.name} seed {seed}")
-                reason = self._job(name, job_of(self.given, arm, seed, plan.frames, short), bar)
-                if reason is not None:
-                    failed[name] = reason
-                bar.update(max((number + 1) * plan.frames - bar.n, 0))
-        return failed
-
-    def _job(self, name: str, job: Named, bar: Any) -> str | None:
-        """Do one training, unless it is done; return why it failed, or None."""
-        folder = self.folder / name
-        if is_evaluated(folder):
-            return None
-        try:
-            with quietly():
-                run = prepared(job, folder)
-                _show(run, bar)
-                run.train()
-        except Exception as error:
-            reason = sentence(error)
-            if not is_no_bug(error):
-                traceback.print_exception(error)
-                reason = f"{type(error).__name__}: {reason}"
-            say(f"coil-compare: {name} failed: {reason}; the others go on", error=True)
-            with (self.folder / FAILED_JOBS).open("a", encoding="utf-8") as file:
-                file.write(f"job {name}: {reason}\n")
-            return reason
-        return None
+    def _jobs(self, plan: Plan, short: Sequence[str]) -> dict[str, Named]:
+        """Return what each training consists of, by its name; each seed of all arms in turn."""
+        jobs = {}
+        for seed in range(self.seed, self.seed + plan.seeds):
+            for name in plan.arms:
+                job = job_of(self.given, ARMS[name], seed, plan.frames, short)
+                jobs[job_name(name, seed)] = job
+        return jobs
 
     def _judge(self, plan: Plan, base: DictConfig, failed: Mapping[str, str]) -> Worth:
         """Write and print what was found."""
@@ -319,64 +287,3 @@ class Comparison:
         runs = [run for each in outcome.runs.values() for run in each]
         tables = [pd.read_csv(run.folder / "episodes.csv") for run in runs]
         return sum(int(table["steps"].sum()) for table in [*tables, read_baselines(self.folder)])
-
-
-def _described(plan: Plan, minutes: float) -> str:
-    """Return what a comparison is going to do, for people."""
-    more = ""
-    if plan.seconds > 1.3 * 60 * minutes:
-        more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
-    return (
-        f"It runs {plan.jobs} trainings of {plan.frames:,} frames each ({', '.join(plan.arms)}; "
-        f"{plan.seeds} seeds), beside the guide, its opposite, zero, random actions and the first "
-        f"network, and takes about {_duration(plan.seconds)}{more}."
-    )
-
-
-def _duration(seconds: float) -> str:
-    """Return a duration in words."""
-    if seconds < 90:
-        return f"{max(seconds, 1):.0f} s"
-    return f"{seconds / 60:.1f} min"
-
-
-def _show(run: Run, bar: Any) -> None:
-    """Let a run tell a progress bar of its frames."""
-    others = run.callbacks
-
-    def callbacks(learner: Learner) -> list[Callback]:
-        return [*others(learner), Tick(bar, run.budget.frames)]
-
-    run.callbacks = callbacks
-
-
-class Tick:
-    """Tells a progress bar of the frames of a training; a `Callback`.
-
-    Args:
-        bar: of all trainings.
-        frames: of this one.
-    """
-
-    names: Sequence[str] = ()
-
-    def __init__(self, bar: Any, frames: int) -> None:
-        self.bar, self.frames = bar, frames
-        self.done, self.share = 0, 0.0
-
-    def due(self, update: int, updates: int, row: Mapping[str, float]) -> bool:
-        """Return whether an update is over, and note how much of the training that is."""
-        self.share = update / max(updates, 1)
-        return bool(row)
-
-    def after_update(self, update: int) -> dict[str, float]:
-        """Show the new frames.
-
-        Args:
-            update: number of updates so far.
-        """
-        done = int(self.frames * self.share)
-        with decoration("the progress bar"):
-            self.bar.update(done - self.done)
-        self.done = done
-        return {}

@@ -13,7 +13,7 @@ from coil_rl.report.curves import points
 from coil_rl.report.runs import RETURN, Run, read_runs
 from coil_rl.run.next_step import still_rising
 from coil_rl.worth.arms import GUIDE, OPPOSITE, TUNE
-from coil_rl.worth.baselines import NOTHING_ELSE, read_baselines
+from coil_rl.worth.baselines import NAME, read_baselines
 from coil_rl.worth.verdict import Entry
 
 
@@ -43,7 +43,7 @@ def read_outcome(folder: Path, arms: Sequence[str], failed: Mapping[str, str]) -
     entries: dict[str, Entry] = {}
     rows: list[dict[str, Any]] = []
     baselines = read_baselines(folder)
-    for name, table in baselines.groupby(NOTHING_ELSE, sort=False):
+    for name, table in baselines.groupby(NAME, sort=False):
         entries[str(name)] = Entry(str(name), table["reward"].to_numpy()[None])
         asked = int(table["steps"].sum()) if name in (GUIDE, OPPOSITE) else 0
         rows.append(_row(entries[str(name)], [table], calls=asked))

@@ -15,13 +15,13 @@ from coil_rl.config.build import build_learner, env_maker
 from coil_rl.run.evaluation import episodes
 from coil_rl.run.parts import TEST, EnvMaker
 from coil_rl.run.rollout import Rollout
-from coil_rl.worth.arms import SHARE, TUNE, Arm
-from coil_rl.worth.baselines import Acting
+from coil_rl.worth.arms import POINTS, SHARE, TUNE, Arm, curve_cases
+from coil_rl.worth.baselines import Acting, plain_env
 
 EPISODES = 2  # whose length is measured
 LONGEST = 1000  # steps of these
 ROWS, STEPS = 16, 32  # of the env in which a step is timed: many rows share what a step costs
-LEAST_BATCHES = 8  # of a training: with fewer there is nothing to compare
+LEAST_BATCHES = 4  # of a training: with fewer there is nothing to compare
 LEAST_CASES = 5
 MEASURING = 0.4  # share of the time that the evaluations may take
 SEEDS = 2
@@ -78,9 +78,32 @@ class Plan:
         """Number of trainings."""
         return len(self.arms) * self.seeds
 
+    def described(self, minutes: float) -> str:
+        """Return what is going to be done, for people.
+
+        Args:
+            minutes: that it may take.
+        """
+        more = ""
+        if self.seconds > 1.3 * 60 * minutes:
+            more = f" (minutes={minutes:g} is not enough: each training needs a few batches)"
+        return (
+            f"It runs {self.jobs} trainings of {self.frames:,} frames each "
+            f"({', '.join(self.arms)}; {self.seeds} seeds), beside the guide, its opposite, zero, "
+            "random actions and the first network, and takes about "
+            f"{_duration(self.seconds)}{more}."
+        )
+
     def to_dict(self) -> dict[str, Any]:
         """Return it as plain values."""
         return asdict(self)
+
+
+def _duration(seconds: float) -> str:
+    """Return a duration in words."""
+    if seconds < 90:
+        return f"{max(seconds, 1):.0f} s"
+    return f"{seconds / 60:.1f} min"
 
 
 def measure(config: DictConfig, overhead: float) -> Pace:
@@ -94,10 +117,11 @@ def measure(config: DictConfig, overhead: float) -> Pace:
     with torch.random.fork_rng():
         env, follow = make_env.guided(EPISODES, TEST)
         length = _length(env, follow)
-        random = Acting.random(make_env, EPISODES)
-        length = max(length, _length(Acting.env(make_env, EPISODES), random))
+        env = plain_env(make_env, EPISODES)
+        length = max(length, _length(env, Acting.random(env)))
         guided = _step(*make_env.guided(ROWS, TEST))
-        plain = _step(Acting.env(make_env, ROWS), Acting.random(make_env, ROWS))
+        env = plain_env(make_env, ROWS)
+        plain = _step(env, Acting.random(env))
         learning = _batch(config, make_env)
     guide = max(guided - plain, 0.0)
     return Pace(plain, guide, max(learning, plain), length, overhead)
@@ -171,7 +195,7 @@ def _cases(config: DictConfig, pace: Pace, arms: Sequence[Arm], minutes: float) 
 
 def _measuring(config: DictConfig, pace: Pace, arms: Sequence[Arm], cases: int) -> float:
     """Return the seconds that all evaluations take."""
-    curve = 7 * min(config.evaluation.curve.num_envs, 8)  # kept policies, in the cases of the curve
+    curve = (POINTS + 1) * curve_cases(config, cases)
     baselines = cases * pace.length * (5 * pace.step + 3 * pace.guide)
     jobs = 0.0
     for arm in arms:

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from coil_rl.output import SafeStream, decoration, progress, say
+from coil_rl.output import SafeStream, decoration, progress, quietly, say
 from coil_rl.run.metrics import Metrics
 
 
@@ -77,3 +77,14 @@ def test_logger_that_fails_is_left_out(tmp_path):
     metrics.flush()
     assert logger.calls == 1
     assert len((tmp_path / "metrics.csv").read_text().splitlines()) == 3
+
+
+def test_nothing_is_shown_quietly(capsys):
+    with quietly():
+        say("a text")
+        say("an error", error=True)
+        with progress(total=1) as bar:
+            bar.update()
+    assert capsys.readouterr() == ("", "")
+    say("a text")
+    assert capsys.readouterr().out == "a text\n"

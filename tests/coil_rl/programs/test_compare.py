@@ -13,7 +13,7 @@ from programs import called
 
 import coil_rl
 from coil_rl.report.runs import read_runs
-from coil_rl.worth.comparison import Comparison
+from coil_rl.worth import jobs
 
 pytest.importorskip("gymnasium.envs.classic_control")
 SMALL = ["env.max_steps=20", "budget={frames: 2000, num_envs: 2, steps: 16, minibatches: 2}"]
@@ -41,14 +41,14 @@ def test_table_has_everything_that_acts(compared):
     assert [name for name in rows if name != "sac"] == [*without, *learned]
     assert all(rows[name]["seeds"] == "2" for name in learned)
     assert all(float(rows[name]["frames"]) == 0 for name in without)
-    assert [float(rows[name]["frames"]) for name in ("ppo", "residual")] == [256, 256]
+    assert [float(rows[name]["frames"]) for name in ("ppo", "residual")] == [128, 128]
     assert float(rows["ppo"]["calls"]) == 0 < float(rows["residual"]["calls"])
     assert float(rows["guide"]["worst"]) <= float(rows["guide"]["return"])
 
 
 def test_it_says_before_what_it_runs_and_how_to_go_on(compared):
     folder, done = compared
-    assert "trainings of 256 frames each" in done.stderr
+    assert "trainings of 128 frames each" in done.stderr
     assert "go on with: coil-compare env=pendulum" in done.stderr
     assert "minutes=0.01 is not enough" in done.stderr
     assert f"folder={folder}" in done.stderr
@@ -95,16 +95,16 @@ def test_other_arguments_in_the_same_folder_are_refused(compared):
 
 def test_comparison_that_was_stopped_ends_with_the_same_table(compared, tmp_path, monkeypatch):
     folder, _ = compared
-    job = Comparison._job
+    job = jobs._run_job
     done = []
 
-    def stopped(self, name, *others):
+    def stopped(*given):
         if len(done) == 3:
             raise KeyboardInterrupt
-        done.append(name)
-        return job(self, name, *others)
+        done.append(given)
+        return job(*given)
 
-    monkeypatch.setattr(Comparison, "_job", stopped)
+    monkeypatch.setattr(jobs, "_run_job", stopped)
     words = [*PENDULUM, "tune={gain: [0.1, 10, log]}", f"folder={tmp_path / 'it'}"]
     assert "continue with: coil-compare" in called("compare", *words, code=130).stderr
     monkeypatch.undo()
