@@ -98,7 +98,8 @@ class GymnasiumEnv(SeededRows):
         fresh: whether every episode has a new env, for those whose reset leaves something of the
             past. BipedalWalker is one: without `fresh`, its episodes depend on the seed and, a
             little, on those before.
-        render: whether `render` gives pictures.
+        render: whether `render` gives pictures, of the rows that begin with the first of `cases`
+            different episodes.
         workers: number of processes over which the rows are spread, 0 for none besides this one;
             "auto" for as many as there are cores if a timed step is long enough. The digits are
             the same.
@@ -147,14 +148,14 @@ class GymnasiumEnv(SeededRows):
             settings["max_episode_steps"] = max_steps
         maker = _maker(id)
         make = partial(_make, maker, wrappers, settings)
-        first = make
+        drawn, every = make, cases or num_envs
         self.shown = render and "rgb_array" in _metadata(make(), "render_modes", ())
         if self.shown:
-            first = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
+            drawn = partial(_make, maker, wrappers, settings | {"render_mode": "rgb_array"})
         name, self.floats = _name(maker), torch.empty(0, dtype=dtype).numpy().dtype
 
         def make_row(number: int) -> _Row:
-            return _Row(make if number else first, makers, fresh, name, number, self.floats)
+            return _Row(make if number % every else drawn, makers, fresh, name, number, self.floats)
 
         self.make_row, self.asked = make_row, workers
         self.kind = f"{settings} {wrappers} {makers}"
@@ -203,12 +204,16 @@ class GymnasiumEnv(SeededRows):
         """Return the spec of a batch from that of one row."""
         return spec.to(self.device).expand(*self.batch_size, *spec.shape)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a picture of row 0, [height, width, 3]; None if there are none."""
+    def render(self, row: int = 0) -> NDArray[np.uint8] | None:
+        """Return a picture, [height, width, 3]; None if there are none.
+
+        Args:
+            row: one that begins with the first of the different episodes.
+        """
         if not self.shown:
             return None
         try:
-            return self.held.picture() if self.workers is None else self.workers.picture()
+            return self.held.picture(row) if self.workers is None else self.workers.picture(row)
         except ForeignError as error:
             self.shown = False
             cause = error if error.__cause__ is None else error.__cause__
@@ -383,9 +388,9 @@ class _Rows:
             found["controller", name] = np.array([row.advice[name] for row in rows])
         return found
 
-    def picture(self) -> NDArray[np.uint8]:
-        """Return a picture of the first row."""
-        return self.rows[0].gate.render()
+    def picture(self, row: int) -> NDArray[np.uint8]:
+        """Return a picture of a row."""
+        return self.rows[row].gate.render()
 
     def close(self) -> None:
         """Close all envs."""

@@ -57,8 +57,8 @@ class Shard(Protocol):
     def entries_of_rows(self) -> Entries:
         """Return the entries of all rows, [rows, ...]."""
 
-    def picture(self) -> NDArray[Any] | None:
-        """Return a picture of the first row."""
+    def picture(self, row: int) -> NDArray[Any]:
+        """Return a picture of a row."""
 
     def close(self) -> None:
         """Close all rows."""
@@ -146,10 +146,12 @@ class Workers:
             self._send(pipe, ("step", actions[own.start : own.stop]))
         return self._gather()
 
-    def picture(self) -> NDArray[Any] | None:
-        """Return a picture of row 0."""
-        self._send(self.pipes[0], ("picture",))
-        return self._answer(0)
+    def picture(self, row: int) -> NDArray[Any]:
+        """Return a picture of a row."""
+        number = next(number for number, own in enumerate(self.ranges) if row in own)
+        self._send(self.pipes[number], ("picture", row - self.ranges[number].start))
+        picture: NDArray[Any] = self._value(self._reply(number))
+        return picture
 
     def close(self) -> None:
         """End all processes."""
@@ -163,9 +165,6 @@ class Workers:
         """Return the answers of all processes; those after a fault are read too."""
         replies = [self._reply(number) for number in range(len(self.pipes))]
         return [self._value(reply) for reply in replies]
-
-    def _answer(self, number: int) -> Any:
-        return self._value(self._reply(number))
 
     def _reply(self, number: int) -> _Reply:
         try:
@@ -307,7 +306,7 @@ def _serve(pipe: Connection, make: Callable[[range], Shard], own: range) -> None
 
 def _done(shard: Shard, name: str, arguments: Sequence[Any]) -> Any:
     if name == "picture":
-        return shard.picture()
+        return shard.picture(*arguments)
     if name == "begin":
         shard.begin_rows(*arguments)
     else:

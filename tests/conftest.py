@@ -38,10 +38,21 @@ yaml.load = parse_each_text_once(yaml.load)
 
 
 # The files that take longest, one process each: begun last, one would keep the other waiting.
-LONGEST = (
-    "test_odd_inputs test_pins test_envs test_mistakes test_stopping test_gradient test_methods "
-    "test_experiment test_your_env test_compiled test_packaging test_replay test_promise"
-).split()
+LONGEST = [
+    "test_odd_inputs",
+    "test_pins",
+    "test_envs",
+    "test_mistakes",
+    "test_stopping",
+    "test_gradient",
+    "test_methods",
+    "test_experiment",
+    "test_your_env",
+    "test_compiled",
+    "test_packaging",
+    "test_replay",
+    "test_promise",
+]
 
 
 def pytest_collection_modifyitems(items):

@@ -81,7 +81,7 @@ def installed(wheel: Path) -> Path:
 
 def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
     patterns = {
-        "coil_rl": ["*.py", "*.json", "py.typed"],
+        "coil_rl": ["*.py", "*.html", "*.json", "py.typed"],
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}

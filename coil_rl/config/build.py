@@ -1,6 +1,6 @@
 """From a configuration to a run: its envs, guides, learner, evaluation and budget."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -199,18 +199,32 @@ def advises_only(config: DictConfig) -> bool:
     return added == {GuideActions} and not config.degrade and not config.action
 
 
-def guide_results(config: DictConfig, evaluation: Evaluation) -> Mapping[str, EvaluationResult]:
-    """Evaluate each guide of a configuration alone; the runs of a sweep share the results."""
+def guide_results(
+    config: DictConfig, evaluation: Evaluation, pictures: Sequence[Picture] = ()
+) -> Mapping[str, EvaluationResult]:
+    """Evaluate each guide of a configuration alone.
+
+    The runs of a sweep share the results, unless there are `pictures` that watch the guides.
+    """
     nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
     nodes["disturb"] = disturbances(config, TEST)
     if not nodes["guide"]:
         return {}
     node = env_node(config, config.evaluation.env)
-    return dict(_guide_results(OmegaConf.to_yaml({"env": node, **nodes}), evaluation))
+    text = OmegaConf.to_yaml({"env": node, **nodes})
+    if pictures:
+        return _new_guide_results(text, evaluation, pictures)
+    return dict(_guide_results(text, evaluation))
 
 
 @lru_cache(maxsize=64)
 def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationResult]:
+    return _new_guide_results(nodes, evaluation, [])
+
+
+def _new_guide_results(
+    nodes: str, evaluation: Evaluation, pictures: Sequence[Picture]
+) -> dict[str, EvaluationResult]:
     config: Any = OmegaConf.create(nodes)
 
     def bare(rows: int | None, cases: str, count: int | None) -> EnvBase:
@@ -221,7 +235,7 @@ def _guide_results(nodes: str, evaluation: Evaluation) -> dict[str, EvaluationRe
         disturb=lambda cases: build_all(config.disturb, "disturb"),
         degrade=partial(build_all, config.degrade, "degrade"),
     )
-    return evaluate_guides(make_env, evaluation, build_guides(config))
+    return evaluate_guides(make_env, evaluation, build_guides(config), pictures=pictures)
 
 
 def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:

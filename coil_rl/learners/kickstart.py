@@ -30,7 +30,8 @@ class ActionValues(Protocol):
 class KickstartLoss(Extension):
     """A further loss of a policy: its distance from the action g of a guide.
 
-    The metric is `loss_guide`. An unknown kind, or a scale that is not positive, is a `ValueError`.
+    The metrics are `loss_guide` and its coefficient, `guide_weight`. An unknown kind, or a scale
+    that is not positive, is a `ValueError`.
 
     Args:
         coefficient: weight of the loss, a number or a schedule.
@@ -73,6 +74,10 @@ class KickstartLoss(Extension):
     def weights(self, weights: dict[str, float], progress: float) -> dict[str, float]:
         """Return the weights of all losses, with the coefficient as that of this one."""
         return weights | {self.LOSS: self.coefficient_at(progress)}
+
+    def finish(self, batch: TensorDictBase, progress: float) -> dict[str, float]:
+        """Return the coefficient, as `guide_weight`."""
+        return {"guide_weight": self.coefficient_at(progress)}
 
     def __call__(
         self, policy: ProbabilisticTensorDictSequential, minibatch: TensorDictBase

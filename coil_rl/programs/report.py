@@ -15,7 +15,7 @@ from coil_rl.programs import app
 
 if TYPE_CHECKING:
     from coil_rl.report.comparison import Comparison
-    from coil_rl.report.runs import Run
+    from coil_rl.report.html import Section
 
 ACTIONS = {
     "deterministic": ("deterministic",),
@@ -23,18 +23,20 @@ ACTIONS = {
     "both": ("deterministic", "sampled"),
 }
 DEFAULT_AGAINST = "ppo"
-MAX_CURVES = 8  # in one plot
 
 
 def report(config: DictConfig) -> None:
     """Compare the finished runs, and print the page.
 
-    The page, all numbers and the figures are written to the first folder.
+    The page, as Markdown and as HTML with the figures, all numbers and the figures are written to
+    the first folder.
     """
     from coil_rl.files import write_text
     from coil_rl.report import page, write_csv
     from coil_rl.report.comparison import compare
     from coil_rl.report.configurations import distinguish
+    from coil_rl.report.figures import draw_report
+    from coil_rl.report.html import Section, html_page
     from coil_rl.report.runs import failed_jobs, read_runs
 
     folders = _folders(config)
@@ -50,26 +52,35 @@ def report(config: DictConfig) -> None:
     compared = {actions: compare(finished, actions) for actions in ACTIONS[config.actions]}
     against = _against(config.against, compared)
     tables = {kind: compared[kind].table(against) for kind in compared}
-    parts = []
-    for kind, comparison in compared.items():
-        heading = f"{kind.capitalize()} actions"
-        parts.append(page.section(heading, comparison, tables[kind], against))
-    parts += [*page.training(finished), *page.guide_training(finished)]
-    normalised = any(comparison.normalised for comparison in compared.values())
-    parts.append(page.notes(against, normalised, "sampled" in compared))
-    parts += page.handed_over(finished)
-    parts += differences
-    parts.append(page.progress(len(finished), len(runs), failed_jobs(folders)))
-    text = "\n\n".join(parts)
+    sections = [
+        Section(f"{kind.capitalize()} actions", page.section(compared[kind], rows, against))
+        for kind, rows in tables.items()
+    ]
+    notes = [
+        page.notes(against, compared),
+        *page.handed_over(finished),
+        *differences,
+        page.progress(len(finished), len(runs), failed_jobs(folders)),
+    ]
+    training = [*page.training(finished), *page.guide_training(finished)]
+    sections.append(Section("", [*training, *notes]))
+    text = "\n\n".join(map(_markdown, sections))
 
     folder = folders[0]
     write_text(folder / "report.md", text)
     write_csv(_rows(tables), folder / "report.csv")
     cases = {kind: comparison.case_table() for kind, comparison in compared.items()}
     write_csv(_rows(cases), folder / "report_cases.csv")
-    _draw_scores(compared, normalised, folder / "report.png")
-    _draw_curves(finished, next(iter(compared.values())), folder / "report_curves.png")
+    figures = draw_report(finished, compared, folder)
+    html = html_page(f"Report of {folder.resolve().name}", sections, figures)
+    write_text(folder / "report.html", html)
     print(f"{text}\nreport: see {folder}")
+
+
+def _markdown(section: Section) -> str:
+    """Return a section as Markdown."""
+    heading = [f"## {section.heading}"] if section.heading else []
+    return "\n\n".join([*heading, *map(str, section.blocks)])
 
 
 def _rows(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, Any]]:
@@ -78,47 +89,6 @@ def _rows(tables: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[dict[str, A
     for actions, table in tables.items():
         rows += [{"actions": actions, **row} for row in table]
     return rows
-
-
-def _draw_scores(compared: Mapping[str, Comparison], normalised: bool, path: Path) -> None:
-    """Draw the scores of the agents, or of the guides if there is no agent."""
-    from coil_rl.report import draw_intervals, driver_intervals
-
-    panels = {}
-    for kind, comparison in compared.items():
-        panels[f"{kind} actions"] = driver_intervals(comparison.agents or comparison.guides)
-    measure = "reward / guide's (mean)" if normalised else "reward (mean)"
-    draw_intervals(panels, path, measure=measure)
-
-
-def _draw_curves(runs: Sequence[Run], comparison: Comparison, path: Path) -> None:
-    """Draw the learning curves in the order of the table, if anything was trained."""
-    from coil_rl.report import draw_curve_grid, draw_learning_curves
-
-    curves: dict[str, list[Any]] = {}
-    guides: dict[str, float] = {}
-    for label in dict.fromkeys(group.name for group in comparison.agents):
-        trained = [run for run in runs if run.label == label and run.curve]
-        returns = [max(run.guide_returns.values()) for run in trained if run.guide_returns]
-        if trained:
-            curves[label] = [run.curve for run in trained]
-        if returns:
-            guides[label] = sum(returns) / len(returns)
-    several_guides = len({round(value, 3) for value in guides.values()}) > 1
-    if several_guides or len(curves) > MAX_CURVES:
-        draw_curve_grid(curves, path, guides=guides)
-    elif curves:
-        guide = {"guide": next(iter(guides.values()))} if guides else {}
-        sizes = {_cases_of_curve(run) for run in runs if run.curve}
-        cases = sizes.pop() if len(sizes) == 1 else None
-        draw_learning_curves(curves, path, guides=guide, cases=cases)
-
-
-def _cases_of_curve(run: Run) -> int | None:
-    """Return the number of cases of the curve of a run; None if its configuration has none."""
-    curve = (run.settings.get("evaluation") or {}).get("curve") or {}
-    count = curve.get("num_envs")
-    return count if isinstance(count, int) else None
 
 
 def _against(given: str | None, compared: Mapping[str, Comparison]) -> str | None:

@@ -13,6 +13,7 @@ from coil_rl.report.curves import frames_until as frames_until
 from coil_rl.report.curves import learning as learning
 from coil_rl.report.curves import mean_curve as mean_curve
 from coil_rl.report.curves import points as points
+from coil_rl.report.film import Film as Film
 from coil_rl.report.intervals import Interval as Interval
 from coil_rl.report.intervals import draw_intervals as draw_intervals
 from coil_rl.report.intervals import driver_intervals as driver_intervals
@@ -20,7 +21,6 @@ from coil_rl.report.lines import draw_listening_map as draw_listening_map
 from coil_rl.report.page import cases_table as cases_table
 from coil_rl.report.page import with_cells as with_cells
 from coil_rl.report.pictures import DrivenLines as DrivenLines
-from coil_rl.report.pictures import Film as Film
 from coil_rl.report.pictures import Returns as Returns
 from coil_rl.report.runs import GUIDE as GUIDE
 from coil_rl.report.runs import RETURN as RETURN

@@ -5,7 +5,7 @@ For a run of Dynamic COIL they are drawn with the phases of the training.
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import cycle
 from typing import Any
 
@@ -25,13 +25,15 @@ Rows = Sequence[Mapping[str, object]]
 RETURNS = "return in evaluation"
 GRID_COLUMNS = 3
 GRID_ROW_HEIGHT = 1.55  # inches
+FEW_SEEDS = 5  # up to here each seed is a line: the interval of a few hides what they did
 AGENT = "#1a1a1a"  # the agent in `draw_phases`
 
 
 def draw_learning_curves(
     runs: Mapping[str, Sequence[Rows]],
-    path: str | os.PathLike[str],
+    path: style.Target,
     *,
+    strokes: Mapping[str, style.Stroke] | None = None,
     guides: Mapping[str, float] | None = None,
     title: str | None = None,
     cases: int | None = None,
@@ -39,33 +41,34 @@ def draw_learning_curves(
     """Draw the return of the kept policies against frames, one curve per label.
 
     Several runs of one label are drawn as their mean, over the frames that all of them reached,
-    with the 95 % t interval of that mean as a band.
+    with each of them as a thin line, or with the 95 % t interval of the mean as a band if there are
+    more than `FEW_SEEDS`.
 
     Args:
         runs: by label, one run per seed, at least one run in all. A run is a sequence of rows with
             "frames" (env frames so far) and "evaluation/return", which may be missing, None or NaN.
-        path: output file.
+        path: output file, or a buffer for an SVG.
+        strokes: by label; by default those of `style.strong_strokes`.
         guides: mean return of each guide by name, drawn as a dashed line.
         title: above the plot.
         cases: number of cases that each return is the mean of; None if it is not known.
     """
     returns = RETURNS if cases is None else f"{RETURNS}, mean of {cases} cases"
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    strokes = style.strong_strokes(runs)
+    strokes = strokes or style.strong_strokes(runs)
     handles: list[Artist] = []
-    for label, stroke in strokes.items():
-        line = {"color": stroke.colour, "ls": stroke.linestyle}
-        handles.append(Line2D([], [], lw=2, label=_with_count(label, runs[label]), **line))
-    if any(len(seeds) > 1 for seeds in runs.values()):
-        handles.append(Patch(color=style.QUIET, alpha=0.3, lw=0, label="95 % interval of the mean"))
+    for label, seeds in runs.items():
+        line = {"color": strokes[label].colour, "ls": strokes[label].linestyle}
+        handles.append(Line2D([], [], lw=2, label=_with_count(label, seeds), **line))
+    handles += _spread_handles(runs.values(), style.QUIET)
     with style.picture(path, title, handles, 4.2) as figure:
         axes = figure.add_subplot(xlabel="frames", ylabel=returns)
         axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         style.lighten(axes)
-        for label, stroke in strokes.items():
-            frames, mean, low, high = curves[label]
-            axes.plot(frames, mean, color=stroke.colour, ls=stroke.linestyle, lw=1.6)
-            axes.fill_between(frames, low, high, color=stroke.colour, alpha=0.16, lw=0)
+        for label, (frames, mean, *_) in curves.items():
+            colour, linestyle = strokes[label]
+            axes.plot(frames, mean, color=colour, ls=linestyle, lw=1.8)
+            _draw_spread(axes, runs[label], curves[label], colour)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
         # Their names are beside the plot, where no curve is.
@@ -82,6 +85,40 @@ def draw_learning_curves(
             )
 
 
+def _is_few(seeds: Sequence[Rows]) -> bool:
+    """Return whether the seeds of a label are drawn as lines."""
+    return 1 < len(seeds) <= FEW_SEEDS
+
+
+def _spread_handles(runs: Iterable[Sequence[Rows]], colour: str) -> list[Artist]:
+    """Return the handles of what `_draw_spread` draws."""
+    runs, handles = list(runs), list[Artist]()
+    if any(_is_few(seeds) for seeds in runs):
+        handles.append(Line2D([], [], color=colour, lw=0.8, alpha=0.6, label="one seed"))
+    if any(len(seeds) > FEW_SEEDS for seeds in runs):
+        handles.append(Patch(color=colour, alpha=0.3, lw=0, label="95 % interval of the mean"))
+    return handles
+
+
+def _draw_spread(
+    axes: Axes, seeds: Sequence[Rows], curve: tuple[Array, Array, Array, Array], colour: str
+) -> None:
+    """Draw what the seeds of a label differ by: few as thin lines, more as a band.
+
+    Args:
+        axes: of the curves.
+        seeds: the runs of the label.
+        curve: their `mean_curve`.
+        colour: of the label.
+    """
+    if _is_few(seeds):
+        for run in seeds:
+            axes.plot(*points(run, RETURN).T, color=colour, lw=0.8, alpha=0.6, zorder=1.8)
+        return
+    frames, _, low, high = curve
+    axes.fill_between(frames, low, high, color=colour, alpha=0.2, lw=0)
+
+
 def _with_count(label: str, runs: Sequence[Rows]) -> str:
     """Return a label with the number of its runs if there are several."""
     return f"{label} ({len(runs)} runs)" if len(runs) > 1 else label
@@ -89,34 +126,37 @@ def _with_count(label: str, runs: Sequence[Rows]) -> str:
 
 def draw_curve_grid(
     runs: Mapping[str, Sequence[Rows]],
-    path: str | os.PathLike[str],
+    path: style.Target,
     *,
+    strokes: Mapping[str, style.Stroke] | None = None,
     guides: Mapping[str, float] | None = None,
 ) -> None:
     """Draw one small learning curve per label, with the other labels faint behind it.
 
     Args:
         runs: by label, at least one, the runs as in `draw_learning_curves`.
-        path: output file.
+        path: output file, or a buffer for an SVG.
+        strokes: by label; by default those of `style.strong_strokes`.
         guides: mean return of the guide of each label, drawn as a dashed line.
     """
     curves = {label: mean_curve(seeds, RETURN) for label, seeds in runs.items()}
-    columns, colour = min(GRID_COLUMNS, len(runs)), style.AGENTS[0]
+    columns, strokes = min(GRID_COLUMNS, len(runs)), strokes or style.strong_strokes(runs)
     rows = -(-len(runs) // columns)
     guide_line: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.0}
-    handles: list[Artist] = [Line2D([], [], color=colour, lw=1.5, label="mean of the runs")]
-    handles.append(Patch(color=colour, alpha=0.25, lw=0, label="95 % interval of the mean"))
+    handles: list[Artist] = [Line2D([], [], color=style.INK, lw=1.5, label="mean of the runs")]
+    handles += _spread_handles(runs.values(), style.INK)
     handles.append(Line2D([], [], color=style.KERB, lw=0.6, label="the others"))
     if guides:
         handles.append(Line2D([], [], label="its guide", **guide_line))
     height = 0.35 + GRID_ROW_HEIGHT * rows
     with style.picture(path, None, handles, height, add_header=True, h_pad=0.08) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat
-        for axes, (label, (frames, mean, low, high)) in zip(grid, curves.items(), strict=False):
+        for axes, (label, curve) in zip(grid, curves.items(), strict=False):
+            colour = strokes[label].colour
             for other_frames, other_mean, *_ in curves.values():  # its own is drawn over
                 axes.plot(other_frames, other_mean, color=style.KERB, lw=0.6, alpha=0.7)
-            axes.fill_between(frames, low, high, color=colour, alpha=0.25, lw=0, zorder=2.1)
-            axes.plot(frames, mean, color=colour, lw=1.5, zorder=2.2)
+            _draw_spread(axes, runs[label], curve, colour)
+            axes.plot(*curve[:2], color=colour, lw=1.5, zorder=2.2)
             if guides and label in guides:
                 axes.axhline(guides[label], **guide_line)
             axes.set_title(_with_count(label, runs[label]), size=9, loc="left")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from coil_rl.report.comparison import Group
 
 COLOUR = style.AGENTS[0]
-BAR: dict[str, Any] = {"color": COLOUR, "alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
+BAR: dict[str, Any] = {"alpha": 0.38, "lw": 8, "solid_capstyle": "butt"}
 SEED: dict[str, Any] = {
     "ls": "",
     "marker": "o",
@@ -31,7 +30,6 @@ DOT: dict[str, Any] = {
     "ls": "",
     "marker": "o",
     "ms": 5.5,
-    "mfc": COLOUR,
     "mec": style.BACKGROUND,
     "mew": 0.6,
 }
@@ -40,7 +38,6 @@ HOLLOW: dict[str, Any] = {
     "marker": "o",
     "ms": 5.0,
     "mfc": style.BACKGROUND,
-    "mec": COLOUR,
     "mew": 1.1,
 }
 GUIDE: dict[str, Any] = {"color": style.GUIDES[0], "ls": style.DASHED, "lw": 1.3, "zorder": 1.5}
@@ -58,6 +55,7 @@ class Interval:
         points: small dots, the values of single seeds.
         guide: value of the policy's guide, a dashed line; None for none.
         hollow: whether the dot is hollow, as for a variant of the policy above.
+        colour: of dot and bar.
     """
 
     label: str
@@ -67,15 +65,21 @@ class Interval:
     points: Sequence[float] = ()
     guide: float | None = None
     hollow: bool = False
+    colour: str = COLOUR
 
 
-def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
+def driver_intervals(
+    groups: Iterable[Group], strokes: Mapping[str, style.Stroke] | None = None
+) -> list[Interval]:
     """Return a row for the score of each policy, with its single seeds and its guide.
 
     Args:
         groups: the policies, in the order of the rows.
+        strokes: those of the policies by name, for their colours; by default those of
+            `style.strong_strokes`.
     """
-    rows = []
+    groups, rows = list(groups), []
+    strokes = strokes or style.strong_strokes(dict.fromkeys(group.name for group in groups))
     for group in groups:
         row = Interval(
             group.title,
@@ -85,6 +89,7 @@ def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
             points=group.scores.mean(axis=1).tolist() if len(group.scores) > 1 else [],
             guide=group.guide.score.mean if group.guide else None,
             hollow=bool(group.advice),
+            colour=strokes[group.name].colour,
         )
         rows.append(row)
     return rows
@@ -92,7 +97,7 @@ def driver_intervals(groups: Iterable[Group]) -> list[Interval]:
 
 def draw_intervals(
     panels: Mapping[str, Sequence[Interval]],
-    path: str | os.PathLike[str],
+    path: style.Target,
     *,
     measure: str,
     title: str | None = None,
@@ -101,16 +106,18 @@ def draw_intervals(
 
     Args:
         panels: by heading, the rows of each panel; at least one row in all.
-        path: output file.
+        path: output file, or a buffer for an SVG.
         measure: label of the axis.
         title: above the plot.
     """
     rows = list(itertools.chain.from_iterable(panels.values()))
     labels = list(dict.fromkeys(row.label for row in rows))
+    colours = {row.colour for row in rows}
+    dot, hollow, bar = _marks(colours.pop() if len(colours) == 1 else style.INK)
     legend = {
-        "all seeds": (DOT, True),
-        "all seeds, advice altered": (HOLLOW, any(row.hollow for row in rows)),
-        "95 % interval": (BAR, any(math.isfinite(row.low) for row in rows)),
+        "all seeds": (dot, True),
+        "all seeds, advice altered": (hollow, any(row.hollow for row in rows)),
+        "95 % interval": (bar, any(math.isfinite(row.low) for row in rows)),
         "one seed": (SEED, any(row.points for row in rows)),
         "its guide": (GUIDE, any(row.guide is not None for row in rows)),
     }
@@ -130,6 +137,11 @@ def draw_intervals(
         )
 
 
+def _marks(colour: str) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Return the dot, the hollow dot and the bar in a colour."""
+    return DOT | {"mfc": colour}, HOLLOW | {"mec": colour}, BAR | {"color": colour}
+
+
 def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:
     """Draw rows at their y positions.
 
@@ -142,9 +154,10 @@ def draw_panel(axes: Axes, rows: Mapping[int, Interval]) -> None:
     axes.tick_params(axis="y", length=0)
     axes.margins(x=0.06)
     for y, row in rows.items():
-        axes.plot([row.low, row.high], [y, y], **BAR)
+        dot, hollow, bar = _marks(row.colour)
+        axes.plot([row.low, row.high], [y, y], **bar)
         axes.plot(row.points, [y] * len(row.points), **SEED)
-        axes.plot(row.value, y, **(HOLLOW if row.hollow else DOT))
+        axes.plot(row.value, y, **(hollow if row.hollow else dot))
     # Adjacent rows with the same guide share a line: separate dashes would not join.
     for value, adjacent in itertools.groupby(sorted(rows), key=lambda y: rows[y].guide):
         ys = list(adjacent)

@@ -1,4 +1,4 @@
-"""Markdown page of `coil-report`.
+"""Page of `coil-report`: tables and sentences, which become Markdown and HTML.
 
 It has tables of the policies, of the cases, of the parts of the reward and of the training, and
 says how to read them.
@@ -15,19 +15,21 @@ from coil_rl.report.comparison import Comparison, Group
 from coil_rl.report.curves import learning
 from coil_rl.report.runs import GUIDE, PER_STEP, TERM, Run
 from coil_rl.report.statistics import SIGN_FLIP_SEEDS, Estimate
-from coil_rl.report.table import TABLES, markdown_table
+from coil_rl.report.table import TABLES, Table
+
+Block = Table | str  # a table or a paragraph
 
 MAX_CASES = 8  # in a table
 GUIDE_RETURN = "guide/"  # prefix of columns of metrics.csv
+GUIDE_CALLS = "guide/calls"  # is no return
 
 
 def section(
-    heading: str, comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
-) -> str:
+    comparison: Comparison, rows: Sequence[Mapping[str, Any]], against: str | None
+) -> list[Block]:
     """Return the section for one kind of actions.
 
     Args:
-        heading: of the section.
         comparison: of the policies.
         rows: `comparison.table(against)`.
         against: what the policies are compared with, see `Comparison.table`.
@@ -36,11 +38,10 @@ def section(
     shown = with_cells(rows, comparison.score[1])
     for row, group in zip(shown, comparison.groups, strict=True):
         row |= _shares(row, group, columns)
-    table = markdown_table(shown, columns)
     parts = _parts(comparison, TERM, "term of the reward", ".1f")
     parts += _parts(comparison, PER_STEP, "reward of a step", ".3f")
     cases = cases_table(comparison.groups, "report_cases.csv")
-    return "\n\n".join([f"## {heading}", table, *parts, cases])
+    return [Table(shown, columns), *parts, cases]
 
 
 def _shares(
@@ -116,7 +117,7 @@ def with_cells(rows: Sequence[Mapping[str, Any]], spec: str) -> list[dict[str, A
     return shown
 
 
-def guide_training(runs: Sequence[Run]) -> list[str]:
+def guide_training(runs: Sequence[Run]) -> list[Table]:
     """Return the table of guides' own returns before and after training.
 
     The list is empty if no guide was trained.
@@ -130,12 +131,12 @@ def guide_training(runs: Sequence[Run]) -> list[str]:
         curves = [run.curve for run in of_label]
         row: dict[str, Any] = {"label": label, "seeds": len(curves)}
         for key in chain.from_iterable(curve[0] for curve in curves):
-            if key.startswith(GUIDE_RETURN) and key not in row:
+            if key.startswith(GUIDE_RETURN) and key != GUIDE_CALLS and key not in row:
                 row[key] = _before_to_after(curves, key)
                 columns[key] = (key.removeprefix(GUIDE_RETURN), "")
         if len(row) > 2:
             rows.append(row)
-    return [markdown_table(rows, columns)] if rows else []
+    return [Table(rows, columns)] if rows else []
 
 
 def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) -> str:
@@ -145,7 +146,7 @@ def _before_to_after(curves: Sequence[Sequence[Mapping[str, float]]], key: str) 
     return f"{before:.1f} to {after:.1f}"
 
 
-def training(runs: Sequence[Run]) -> list[str]:
+def training(runs: Sequence[Run]) -> list[Table]:
     """Return the table of evaluation curves, means over seeds.
 
     The list is empty if nothing was trained.
@@ -165,7 +166,7 @@ def training(runs: Sequence[Run]) -> list[str]:
         if not math.isnan(row["area"]):
             rows.append(row)
     rows.sort(key=lambda row: -float(row["area"]))
-    return [markdown_table(rows, TABLES["learning"]["columns"])] if rows else []
+    return [Table(rows, TABLES["learning"]["columns"])] if rows else []
 
 
 def _reached(frames: Sequence[float]) -> str | None:
@@ -177,19 +178,18 @@ def _reached(frames: Sequence[float]) -> str | None:
     return f"{mean(reached):,.0f}{some}"
 
 
-def notes(against: str | None, normalised: bool, sampled: bool) -> str:
+def notes(against: str | None, compared: Mapping[str, Comparison]) -> str:
     """Return an explanation of the tables.
 
     Args:
         against: what the policies are compared with, see `Comparison.table`.
-        normalised: whether scores are fractions of a guide's reward.
-        sampled: whether there is a section for sampled actions.
+        compared: the policies, by kind of actions, such as "sampled".
     """
     used = {
         "order": True,
-        "normalised": normalised,
+        "normalised": any(comparison.normalised for comparison in compared.values()),
         "against": against is not None,
-        "sampled": sampled,
+        "sampled": "sampled" in compared,
     }
     text = " ".join(TABLES["drivers"]["notes"][key] for key in used if used[key])
     return text.format(other=_other(against), seeds=SIGN_FLIP_SEEDS)
@@ -241,7 +241,7 @@ def _other(against: str | None) -> str:
     return "its guide" if against == GUIDE else str(against)
 
 
-def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[str]:
+def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list[Table]:
     """Return the table of the parts of the reward; no table without such columns.
 
     Args:
@@ -258,10 +258,10 @@ def _parts(comparison: Comparison, prefix: str, heading: str, spec: str) -> list
             columns[name] = (name.removeprefix(prefix), spec)
         if parts:
             rows.append({"driver": group.title, **parts})
-    return [markdown_table(rows, columns)] if rows else []
+    return [Table(rows, columns)] if rows else []
 
 
-def cases_table(groups: Sequence[Group], file: str) -> str:
+def cases_table(groups: Sequence[Group], file: str) -> Block:
     """Return the table of the mean reward by policy and case, with the completed share below 1.
 
     Args:
@@ -282,4 +282,4 @@ def cases_table(groups: Sequence[Group], file: str) -> str:
     columns = {"driver": ("mean reward", "")}
     for name in names:
         columns[name] = (name, ".1f")
-    return markdown_table(rows, columns)
+    return Table(rows, columns)

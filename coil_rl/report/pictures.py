@@ -12,10 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
-from coil_rl.files import whole_file
 from coil_rl.report import style
 from coil_rl.report.lines import animate_lines, draw_lines
 
@@ -36,11 +33,17 @@ class Picture:
 
     record: ClassVar[Mapping[str, NestedKey]] = {}
 
-    def watch(self, env: EnvBase) -> None:
-        """See the env after each step of the agent's first episode; by default do nothing.
+    @property
+    def watches(self) -> bool:
+        """Whether the picture needs to see the env, by `watch`."""
+        return False
+
+    def watch(self, env: EnvBase, rows: Mapping[str, int]) -> None:
+        """See the env after each step; by default do nothing.
 
         Args:
             env: of the evaluation.
+            rows: the row in which each policy drives the first case, of those that still drive.
         """
 
     def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
@@ -108,60 +111,3 @@ class Returns(Picture):
                 axes.plot(rewards, heights, "o", color=colour, ms=4, alpha=0.5, mew=0)
                 axes.plot([rewards.mean()] * 2, [row - 0.3, row + 0.3], color=colour, lw=2)
             axes.set_yticks(range(len(names)), names)
-
-
-@dataclass(eq=False)
-class Film(Picture):
-    """The agent's episode in the first case as an animation, `episode.gif`.
-
-    The env itself draws the frames.
-
-    Args:
-        every: number of steps between two frames.
-        frames: largest number of frames.
-        width: largest width of the animation, pixels.
-        duration: of a frame, ms.
-    """
-
-    every: int = 2
-    frames: int = 300
-    width: int = 320
-    duration: int = 40
-
-    def __post_init__(self) -> None:
-        self.images: list[Image.Image] = []
-        self.steps = 0
-
-    def watch(self, env: EnvBase) -> None:
-        """Take a frame if it is time.
-
-        Args:
-            env: of the evaluation; it can render.
-        """
-        if self.steps % self.every == 0 and len(self.images) < self.frames:
-            pixels: NDArray[np.uint8] | None = env.render()
-            if pixels is not None:
-                image = Image.fromarray(pixels)
-                image.thumbnail((self.width, self.width))
-                self.images.append(image)
-        self.steps += 1
-
-    def draw(self, results: Mapping[str, EvaluationResult], folder: Path) -> None:
-        """Write the animation; nothing without frames.
-
-        Args:
-            results: the episodes of each policy, the agent last.
-            folder: where the animation is written.
-        """
-        steps = list(results.values())[-1].episodes[0]["steps"]
-        images = self.images[: max(1, -(-steps // self.every))]
-        if images:
-            with whole_file(folder / "episode.gif") as unfinished:
-                images[0].save(
-                    unfinished,
-                    "GIF",
-                    save_all=True,
-                    append_images=images[1:],
-                    duration=self.duration,
-                    loop=0,
-                )

@@ -3,9 +3,11 @@
 The colours are safe for colour-blind readers.
 """
 
+import io
 import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import chain, cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,15 +33,27 @@ RIGHT_CONE = "#1f6fd6"
 
 # After Okabe and Ito and after Tol, without the colours of the cones, the strongest first.
 AGENTS = ("#d55e00", "#009e73", "#aa3377", "#56b4e9", "#332288")
+# Of the methods that are compared most often, so that their colour is the same in all pictures.
+OWN = {
+    "coil": AGENTS[0],
+    "coil_anchored": AGENTS[1],
+    "residual": AGENTS[2],
+    "ppo": AGENTS[3],
+    "kickstart": AGENTS[4],
+}
 GUIDES = ("#4d4d4d", "#8a8a8a")
 DASHED = (0.0, (3.2, 1.6))
 SECOND_ROUND = (0.0, (6.0, 1.2))  # of a colour that is used again
+
+Target = str | os.PathLike[str] | io.BytesIO  # a buffer receives an SVG
 
 LETTERS: Any = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
     "text.color": INK,
     "text.parse_math": False,
+    "svg.fonttype": "none",  # text, which can be read, searched and copied
+    "svg.hashsalt": "coil-rl",  # equal pictures are equal files
     "figure.facecolor": BACKGROUND,
     "axes.labelcolor": INK,
     "axes.edgecolor": KERB,
@@ -48,6 +62,9 @@ LETTERS: Any = {
     "ytick.color": KERB,
     "ytick.labelcolor": INK,
 }
+
+
+NO_METADATA: Any = dict.fromkeys(("Creator", "Date", "Format", "Type"))  # of an SVG
 
 
 class Stroke(NamedTuple):
@@ -82,19 +99,25 @@ def strokes(labels: Iterable[str]) -> dict[str, Stroke]:
 def strong_strokes(labels: Iterable[str]) -> dict[str, Stroke]:
     """Return a stroke in a strong colour for each label, dashed once the colours are used again.
 
+    The methods of `OWN` have their own colours; the others take those that are left, in the given
+    order.
+
     Args:
         labels: names of the policies or methods, all different.
     """
-    result = {}
-    for index, label in enumerate(labels):
-        linestyle = SECOND_ROUND if index >= len(AGENTS) else "-"
-        result[label] = Stroke(AGENTS[index % len(AGENTS)], linestyle)
-    return result
+    labels = list(labels)
+    result = {label: Stroke(OWN[label]) for label in labels if label in OWN}
+    taken = {stroke.colour for stroke in result.values()}
+    left = [Stroke(colour) for colour in AGENTS if colour not in taken]
+    again = cycle(Stroke(colour, SECOND_ROUND) for colour in AGENTS)
+    others = (label for label in labels if label not in OWN)
+    result |= dict(zip(others, chain(left, again), strict=False))
+    return {label: result[label] for label in labels}
 
 
 @contextmanager
 def picture(
-    path: str | os.PathLike[str],
+    path: Target,
     title: str | None,
     handles: Sequence[Artist],
     height: float,
@@ -105,7 +128,7 @@ def picture(
     """Yield an empty figure with title and legend, 8 inches wide; write it when the block ends.
 
     Args:
-        path: output file, whose suffix decides the format.
+        path: output file, whose suffix decides the format; or a buffer for an SVG.
         title: above the legend; None for none.
         handles: of the legend.
         height: of the figure, inches.
@@ -126,13 +149,18 @@ def picture(
         save(figure, path)
 
 
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save(figure: Figure, path: Target) -> None:
     """Write a figure; the file appears whole or not at all.
 
     Args:
         figure: the figure.
-        path: output file, whose suffix decides the format, PNG without a suffix.
+        path: output file, whose suffix decides the format, PNG without a suffix; or a buffer for an
+            SVG.
     """
+    if isinstance(path, io.BytesIO):
+        with mpl.rc_context(LETTERS):
+            figure.savefig(path, format="svg", metadata=NO_METADATA)
+        return
     with whole_file(path) as unfinished, mpl.rc_context(LETTERS):
         figure.savefig(unfinished, format=Path(path).suffix[1:] or "png")
 

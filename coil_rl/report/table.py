@@ -3,11 +3,13 @@
 import csv
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from itertools import chain
 from numbers import Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import tabulate
 import yaml
@@ -18,10 +20,67 @@ tabulate.MIN_PADDING = 0  # extra width of headings
 # Columns and notes by table.
 TABLES: Any = yaml.safe_load((resources.files("coil_rl.conf") / "tables.yaml").read_text("utf-8"))
 
+Rows = Sequence[Mapping[str, object]]
+Columns = Mapping[str, Sequence[str]]
 
-def markdown_table(
-    rows: Sequence[Mapping[str, object]], columns: Mapping[str, Sequence[str]]
-) -> str:
+
+class Cell(NamedTuple):
+    """A cell of a table for people.
+
+    Attributes:
+        text: as it is shown.
+        number: by which rows are sorted; None for a text without a number at its start.
+    """
+
+    text: str
+    number: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A table for people, in Markdown or cell by cell.
+
+    Args:
+        rows: as `markdown_table` takes them.
+        columns: as `markdown_table` takes them.
+    """
+
+    rows: Rows
+    columns: Columns
+
+    def __str__(self) -> str:
+        """Return the table in Markdown."""
+        return markdown_table(self.rows, self.columns)
+
+    @property
+    def headings(self) -> list[str]:
+        """Headings of the columns."""
+        return [heading for heading, _ in self.columns.values()]
+
+    @property
+    def numeric(self) -> list[bool]:
+        """Whether each column has only numbers."""
+        return _numeric(_values(self.rows, self.columns))
+
+    @property
+    def cells(self) -> list[list[Cell]]:
+        """The cells of each row."""
+        specs = [spec for _, spec in self.columns.values()]
+        return [
+            [_cell(value, spec) for value, spec in zip(row, specs, strict=True)]
+            for row in _values(self.rows, self.columns)
+        ]
+
+
+def _cell(value: object, spec: str) -> Cell:
+    text = _format(value, spec)
+    if not _is_missing(value) and _is_number(value):
+        return Cell(text, float(value))  # type: ignore[arg-type]
+    number = re.match(r"[-+]?\d[\d,]*(\.\d+)?", text)
+    return Cell(text, float(number[0].replace(",", "")) if number else None)
+
+
+def markdown_table(rows: Rows, columns: Columns) -> str:
     """Return a Markdown table; columns of numbers are right-aligned.
 
     Args:
@@ -44,25 +103,41 @@ def markdown_table(
         | guide  |    31.2 | no    |
         | agent  |       - | yes   |
     """
+    values = _values(rows, columns)
+    specs = [spec for _, spec in columns.values()]
+    return tabulate.tabulate(
+        [
+            [_escaped(_format(value, spec)) for value, spec in zip(row, specs, strict=True)]
+            for row in values
+        ],
+        headers=[_escaped(_format(heading, "")) for heading, _ in columns.values()],
+        tablefmt="pipe",
+        colalign=["right" if right else "left" for right in _numeric(values)] or None,
+        disable_numparse=True,
+    )
+
+
+def _values(rows: Rows, columns: Columns) -> list[list[object]]:
+    """Return the values of each row in the order of the columns."""
     keys = dict.fromkeys(chain.from_iterable(rows))
     for key, (heading, _) in columns.items():
         if rows and key not in keys:
             raise ValueError(
                 f"No row has {key!r} for the column {heading!r}; the rows have: {', '.join(keys)}."
             )
-    values = [[_to_python(row.get(key)) for key in columns] for row in rows]
-    numeric = [
+    return [[_to_python(row.get(key)) for key in columns] for row in rows]
+
+
+def _numeric(values: Sequence[Sequence[object]]) -> list[bool]:
+    """Return whether each column has only numbers, given the values of each row."""
+    return [
         all(_is_missing(value) or _is_number(value) for value in column)
         for column in zip(*values, strict=True)
     ]
-    specs = [spec for _, spec in columns.values()]
-    return tabulate.tabulate(
-        [[_format(value, spec) for value, spec in zip(row, specs, strict=True)] for row in values],
-        headers=[_format(heading, "") for heading, _ in columns.values()],
-        tablefmt="pipe",
-        colalign=["right" if right else "left" for right in numeric] or None,
-        disable_numparse=True,
-    )
+
+
+def _escaped(text: str) -> str:
+    return text.replace("|", "\\|")
 
 
 def write_csv(rows: Sequence[Mapping[str, object]], path: str | os.PathLike[str]) -> None:
@@ -105,4 +180,4 @@ def _format(value: object, spec: str) -> str:
         return "yes" if value else "no"
     if _is_number(value):
         return format(value, spec)
-    return " ".join(str(value).split()).replace("|", "\\|")
+    return " ".join(str(value).split())

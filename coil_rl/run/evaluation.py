@@ -60,7 +60,7 @@ def evaluate_policy(
     record: Mapping[str, NestedKey] | None = None,
     cases: Sequence[str] = (),
     tick: Callable[[], Any] | None = None,
-    watch: Callable[[], Any] | None = None,
+    watch: Callable[[Tensor], Any] | None = None,
 ) -> EvaluationResult:
     """Run one episode on every row of an env, with its transforms in evaluation mode.
 
@@ -74,15 +74,14 @@ def evaluate_policy(
         cases: names of the cases; row i is case i modulo their number. By default rows are
             numbered.
         tick: called after every step.
-        watch: called after every step of the first row's episode, of which the env may show a
-            picture.
+        watch: called after every step with whether each row was in its episode, [rows].
     """
     measures = {"reward": Measure(unravel_key(env.reward_key), "sum"), **(measures or {})}
     totals, recorded = Totals(measures), {name: list[Tensor]() for name in record or {}}
     for after, running in episodes(env, policy, sampled=sampled, tick=tick):
         totals.add(after, running)
-        if watch is not None and running.reshape(-1)[0]:
-            watch()
+        if watch is not None:
+            watch(running.reshape(-1))
         for name, key in (record or {}).items():
             recorded[name].append(after[key])
     steps = totals.steps.tolist()

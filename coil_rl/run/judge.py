@@ -14,6 +14,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs import EnvBase
 
 from coil_rl.compiled import compile_steps
@@ -74,7 +75,7 @@ class Evaluation:
         )
 
 
-GuideResults = Callable[[Evaluation], Mapping[str, EvaluationResult]]
+GuideResults = Callable[[Evaluation, Sequence[Picture]], Mapping[str, EvaluationResult]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +88,8 @@ class Trial:
         make_env: makes the env of the policy in the cases of the test.
         pictures: of the deterministic episodes.
         guides: names of the guides, as in tables.
-        guide_results: evaluates the guides alone, by these names; asked if the guides cannot act in
-            the policy's own env.
+        guide_results: evaluates the guides alone, by these names, in the sight of some pictures;
+            asked if the guides cannot act in the policy's own env.
         together: whether the policy's env is that of its guides: all that its method adds is their
             advice. Then the guides act in rows beside the policy.
         advice: names of further kinds of advice, with each of which the policy is evaluated too.
@@ -105,7 +106,7 @@ class Trial:
     _: KW_ONLY
     pictures: Sequence[Picture] = field(default_factory=lambda: [Returns()])
     guides: Sequence[str] = ()
-    guide_results: GuideResults = lambda evaluation: {}
+    guide_results: GuideResults = lambda evaluation, pictures: {}
     together: bool = False
     advice: Sequence[str] = ()
     repeats: int = 0
@@ -174,7 +175,8 @@ def judge(
     """
     judgement = Judgement(trial.evaluation.measures)
     if policy is None or not trial.together:
-        for name, result in trial.guide_results(trial.evaluation).items():
+        watching = [picture for picture in trial.pictures if picture.watches]
+        for name, result in trial.guide_results(trial.evaluation, watching).items():
             judgement.add(result, name)
     share = None
     torch.manual_seed(seed)
@@ -225,11 +227,12 @@ def _evaluate_with(
     env = trial.env(len(rows), advice)
     if trial.compiled:
         compile_steps(env)
-    watching = [] if advice else list(trial.pictures)
+    watching = [] if advice else [picture for picture in trial.pictures if picture.watches]
+    shown = {trial.label: 0} | {name: own + count * index for index, name in enumerate(beside)}
     if beside:
         policy = PolicyAndGuides(env, policy, own, len(beside))
     sampled = repeats > 0 and (rows >= count) & (rows < own)
-    watch = partial(_watch, env, watching) if watching else None
+    watch = partial(_watch, env, watching, shown) if watching else None
     result = trial.evaluation.run(env, policy, sampled=sampled, tick=bar.update, watch=watch)
     if beside:
         for name, of_guide in zip(beside, result[own:].split(len(beside)), strict=True):
@@ -309,12 +312,20 @@ def not_worse(policy: EvaluationResult, guide: EvaluationResult, name: str) -> s
     )
 
 
-def _watch(env: EnvBase, pictures: list[Picture]) -> None:
-    """Show an env to pictures; one that fails is taken out of the list."""
+def _watch(env: EnvBase, pictures: list[Picture], rows: Mapping[str, int], running: Tensor) -> None:
+    """Show an env to pictures; one that fails is taken out of the list.
+
+    Args:
+        env: of the evaluation.
+        pictures: those that still watch.
+        rows: the row in which each policy drives the first case.
+        running: whether each row was in its episode, [rows].
+    """
+    rows = {name: row for name, row in rows.items() if running[row]}
     for picture in list(pictures):
         pictures.remove(picture)
         with decoration(f"the picture {type(picture).__name__}"):
-            picture.watch(env)
+            picture.watch(env, rows)
             pictures.append(picture)
 
 
@@ -341,6 +352,7 @@ def evaluate_guides(
     evaluation: Evaluation,
     guides: Mapping[str, TensorDictModuleBase],
     count: int | None = None,
+    pictures: Sequence[Picture] = (),
 ) -> dict[str, EvaluationResult]:
     """Evaluate each guide alone, once in each case of the test.
 
@@ -351,12 +363,15 @@ def evaluate_guides(
         evaluation: cases and measures.
         guides: by name.
         count: number of cases, if it is not the env's own.
+        pictures: which watch the guides.
     """
-    cases = len(evaluation.cases)
+    cases, titles = len(evaluation.cases), guide_titles(guides)
+    rows = {title: cases * index for index, title in enumerate(titles)}
     env, policy = make_env.guided(cases, TEST, guides, count=count)
     with progress(unit="step", desc="guides", leave=False, mininterval=0.5) as bar:
-        result = evaluation.run(env, policy, tick=bar.update)
-    return dict(zip(guide_titles(guides), result.split(len(guides)), strict=True))
+        watch = partial(_watch, env, list(pictures), rows) if pictures else None
+        result = evaluation.run(env, policy, tick=bar.update, watch=watch)
+    return dict(zip(titles, result.split(len(guides)), strict=True))
 
 
 def guide_titles(guides: Iterable[str]) -> list[str]:

@@ -22,6 +22,7 @@ from coil_rl.learners.learner import Callback, Learner
 from coil_rl.measures import Measure
 from coil_rl.output import decoration, say
 from coil_rl.report import draw_learning_curves, draw_phases
+from coil_rl.report.pictures import Picture
 from coil_rl.report.runs import DELIVERY, EVALUATION, read_curve
 from coil_rl.run import checkpoint
 from coil_rl.run.cases import TrainingCases
@@ -499,9 +500,16 @@ class Run:
             return trial
         return replace(trial, notes=[*trial.notes, reason])
 
-    def _guide_results(self, evaluation: Evaluation) -> Mapping[str, EvaluationResult]:
-        """Return the episodes of the guides alone, which a resumed run does not drive again."""
-        drive = partial(self.trial.guide_results, evaluation)
+    def _guide_results(
+        self, evaluation: Evaluation, pictures: Sequence[Picture]
+    ) -> Mapping[str, EvaluationResult]:
+        """Return the episodes of the guides alone.
+
+        A resumed run does not drive them again, unless there are pictures that watch them.
+        """
+        drive = partial(self.trial.guide_results, evaluation, pictures)
+        if pictures:
+            return drive()
         return driven_once(self.folder, self.settings, evaluation, drive)
 
     def in_env(

@@ -92,7 +92,7 @@ def drive(
     tracks = test_tracks(trial.pictures, folders[0])[:count]
     record = {"pose": ("info", "pose"), "smoothness": ("info", "smoothness")}
     evaluation = replace(trial.evaluation, cases=[track.name for track in tracks], record=record)
-    drives = dict(trial.guide_results(evaluation))
+    drives = dict(trial.guide_results(evaluation, []))
     for run in runs:
         env = run.make_env(len(tracks), "test")
         name = run.label if run.label not in drives else f"{run.label}, seed {run.seed}"

@@ -63,7 +63,7 @@ class Table5(WorldsResult):
                 table = self._policy_table(rows[actions], compared[actions].score[0])
                 parts += [f"**{actions.capitalize()} actions**", table]
                 if not world:
-                    parts.append(cases_table(compared[actions].groups, f"{stem.name}.csv"))
+                    parts.append(str(cases_table(compared[actions].groups, f"{stem.name}.csv")))
         write_csv(episodes, stem.with_suffix(".csv"))
         notes = PAGES["table_5"]["notes"].format(against=self.against)
         return "\n\n".join([*parts, notes, _claims(worlds)])

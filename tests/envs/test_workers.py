@@ -217,7 +217,9 @@ def test_rows_of_one_process_have_the_spaces_of_all() -> None:
 def test_env_with_processes_gives_the_same_pictures() -> None:
     pictures = []
     for workers in (0, 2):
-        env = GymnasiumEnv("CartPole-v1", 2, workers=workers, render=True, seed=1)
+        env = GymnasiumEnv(
+            "CartPole-v1", 4, workers=workers, render=True, first_seed=1, cases=2, seed=1
+        )
         drive(env, 3)
-        pictures.append(env.render())
+        pictures.append(np.stack([env.render(row) for row in (0, 2)]))
     assert np.array_equal(*pictures)

@@ -5,7 +5,14 @@ import pytest
 from programs import TINY, called, program
 from run_folders import driven, make_run, make_sweep
 
-FILES = {"report.md", "report.csv", "report_cases.csv", "report.png", "report_curves.png"}
+FILES = {
+    "report.md",
+    "report.html",
+    "report.csv",
+    "report_cases.csv",
+    "report.png",
+    "report_curves.png",
+}
 
 
 @pytest.fixture

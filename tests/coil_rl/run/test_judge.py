@@ -114,7 +114,9 @@ class Broken(Picture):
     def __init__(self, place):
         self.place, self.seen = place, 0
 
-    def watch(self, env):
+    watches = True
+
+    def watch(self, env, rows):
         self.seen += 1
         if self.place == "watch":
             raise TypeError("render() returns floats")

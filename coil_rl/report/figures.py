@@ -1,0 +1,127 @@
+"""The figures of `coil-report`: as PNG files, and for its HTML page."""
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from coil_rl.errors import file_of_a_run
+from coil_rl.files import read_file
+from coil_rl.report import style
+from coil_rl.report.comparison import Comparison
+from coil_rl.report.curves import draw_curve_grid, draw_learning_curves
+from coil_rl.report.guide_use import draw_guide_use, guide_use
+from coil_rl.report.html import Figure, svg, webp
+from coil_rl.report.intervals import draw_intervals, driver_intervals
+from coil_rl.report.runs import RESTORE, Run
+
+MAX_CURVES = 8  # in one plot
+FILM = "episode.webp"
+LARGEST_FILM = 1_000_000  # bytes
+MAX_FILMS = 8  # on a page
+
+Draw = Callable[[style.Target], None]
+
+
+def draw_report(
+    runs: Sequence[Run], compared: Mapping[str, Comparison], folder: Path
+) -> list[Figure]:
+    """Draw all figures into a folder, and return them for the HTML page.
+
+    A label has one colour in all of them.
+
+    Args:
+        runs: finished runs.
+        compared: the policies, by kind of actions.
+        folder: where the files are written.
+    """
+    shown = [comparison.agents or comparison.guides for comparison in compared.values()]
+    strokes = style.strong_strokes(
+        dict.fromkeys(group.name for groups in shown for group in groups)
+    )
+    figures = [_draw_scores(compared, strokes, folder / "report.png")]
+    curves = [run for run in runs if run.curve and run.label in strokes]
+    if curves:
+        draw = _learning_curves(curves, strokes)
+        path = folder / "report_curves.png"
+        figures.append(_draw(draw, path, "Training", "Deterministic policies kept on the way."))
+    use = guide_use(curves)
+    if use:
+        path, draw = folder / "report_guides.png", partial(draw_guide_use, use, strokes=strokes)
+        figures.append(_draw(draw, path, "Use of the guide", "A line for each run."))
+    return [*figures, *films(runs)]
+
+
+def _draw(draw: Any, path: Path, title: str, caption: str) -> Figure:
+    """Draw a figure into its file and for the page."""
+    draw(path)
+
+    def into(buffer: io.BytesIO) -> None:
+        draw(buffer)
+
+    return Figure(title, svg(into), caption)
+
+
+def _draw_scores(
+    compared: Mapping[str, Comparison],
+    strokes: Mapping[str, style.Stroke],
+    path: Path,
+) -> Figure:
+    """Draw the scores of the agents, or of the guides if there is no agent."""
+    panels = {}
+    for kind, comparison in compared.items():
+        groups = comparison.agents or comparison.guides
+        panels[f"{kind} actions"] = driver_intervals(groups, strokes)
+    normalised = any(comparison.normalised for comparison in compared.values())
+    measure = "reward / guide's (mean)" if normalised else "reward (mean)"
+    draw = partial(draw_intervals, panels, measure=measure)
+    return _draw(draw, path, "Evaluation", f"{measure}, in the cases of the evaluation.")
+
+
+def _learning_curves(runs: Sequence[Run], strokes: Mapping[str, style.Stroke]) -> Any:
+    """Return the function that draws the learning curves in the order of the table."""
+    curves: dict[str, list[Any]] = {}
+    guides: dict[str, float] = {}
+    for label in strokes:
+        trained = [run for run in runs if run.label == label]
+        returns = [max(run.guide_returns.values()) for run in trained if run.guide_returns]
+        if trained:
+            curves[label] = [run.curve for run in trained]
+        if returns:
+            guides[label] = sum(returns) / len(returns)
+    several_guides = len({round(value, 3) for value in guides.values()}) > 1
+    if several_guides or len(curves) > MAX_CURVES:
+        return partial(draw_curve_grid, curves, strokes=strokes, guides=guides)
+    guide = {"guide": next(iter(guides.values()))} if guides else {}
+    sizes = {_cases_of_curve(run) for run in runs}
+    cases = sizes.pop() if len(sizes) == 1 else None
+    return partial(draw_learning_curves, curves, strokes=strokes, guides=guide, cases=cases)
+
+
+def _cases_of_curve(run: Run) -> int | None:
+    """Return the number of cases of the curve of a run; None if its configuration has none."""
+    curve = (run.settings.get("evaluation") or {}).get("curve") or {}
+    count = curve.get("num_envs")
+    return count if isinstance(count, int) else None
+
+
+def films(runs: Sequence[Run]) -> list[Figure]:
+    """Return the film of the first run of each label that has one, of the first `MAX_FILMS` labels.
+
+    Args:
+        runs: finished runs.
+
+    Raises:
+        UserError: for a file that is no WebP picture, or too large.
+    """
+    found: dict[str, Figure] = {}
+    for run in runs:
+        path = run.folder / FILM
+        if run.label in found or len(found) == MAX_FILMS or not path.exists():
+            continue
+        with file_of_a_run(path, RESTORE):
+            image = webp(read_file(path, LARGEST_FILM))
+        caption = f"The first case of the evaluation, seed {run.seed}."
+        found[run.label] = Figure(f"Film of {run.label}", image, caption)
+    return list(found.values())

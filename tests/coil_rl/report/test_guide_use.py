@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from coil_rl.report import style
+from coil_rl.report.guide_use import draw_guide_use, guide_use
+from coil_rl.report.runs import Run
+
+NAN = float("nan")
+
+
+def run(label, seed=0, **columns):
+    """Return a run of four rows with some columns besides the frames."""
+    rows = [
+        {"frames": 100.0 * number}
+        | {name.replace("__", "/"): values[number] for name, values in columns.items()}
+        for number in range(4)
+    ]
+    return Run(None, label, seed, True, curve=rows)
+
+
+def test_weight_that_was_decided_before_the_training_lasts_for_the_run():
+    use = guide_use([run("coil_anchored", start__weight=[0.5, NAN, NAN, NAN])])
+    (curve,) = use["start/weight"]["coil_anchored"]
+    assert curve.tolist() == [[0, 0.5], [300, 0.5]]
+
+
+def test_what_methods_log_of_their_guide_is_found_by_column_and_label():
+    runs = [
+        run("kickstart", 0, learner__guide_weight=[NAN, 1.0, 0.5, 0.0]),
+        run("kickstart", 1, learner__guide_weight=[NAN, 1.0, 0.5, 0.0]),
+        run("ppo", learner__loss=[NAN, 1.0, 2.0, 3.0]),
+        run("cheq", train__agent_weight=[NAN] * 4),
+        Run(None, "guide", 0, None),
+    ]
+    use = guide_use(runs)
+    assert list(use) == ["learner/guide_weight"]
+    one, other = use["learner/guide_weight"]["kickstart"]
+    assert one.tolist() == other.tolist() == [[100, 1], [200, 0.5], [300, 0]]
+    assert not guide_use(runs[2:])
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_each_column_has_a_panel_of_its_own(number, tmp_path):
+    columns = dict(list({"start/weight": 1, "train/agent_acts": 0}.items())[:number])
+    use = {
+        name: {"coil": [np.array([[0.0, value], [9.0, value]])]} for name, value in columns.items()
+    }
+    draw_guide_use(use, tmp_path / "use.png", style.strong_strokes(["coil"]))
+    with Image.open(tmp_path / "use.png") as image:
+        assert image.height == pytest.approx((0.77 + 1.5 * number) * style.RESOLUTION, rel=0.1)
