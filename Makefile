@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench test-extras kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -50,6 +50,11 @@ test-all: $(INSTALLED) ## run all tests, also the slow ones
 test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that compare with it
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/coil_rl/learners/test_ppo_sb3.py tests/benchmarks/test_beside_sb3.py
+
+# The packages of the loggers are needed for this only; without them these tests are skipped.
+test-extras: $(INSTALLED) ## install Weights & Biases and MLflow and run the tests of the loggers
+	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[wandb,mlflow]'
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m '' tests/coil_rl/config/test_logger.py tests/coil_rl/programs/test_loggers.py
 
 kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
 	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)

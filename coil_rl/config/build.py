@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, Transform
 
 from coil_rl.config.beside import unread_controllers
+from coil_rl.config.logger import make_logger
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
 from coil_rl.config.saved import identity, settings
@@ -68,7 +69,7 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
         watch=OmegaConf.to_container(config.watch),
         failure=measures_of(config.evaluation.measures).get("crashed"),
         noise_correlation=config.training.noise_correlation,
-        logger=partial(build, config.logger, "logger") if config.logger else None,
+        logger=partial(make_logger, config.logger) if config.logger else None,
         callbacks=guide_returns,
         prepare=partial(distil, config, folder) if trains else lambda: 0,
         init=Path(config.init).expanduser() if config.init else None,

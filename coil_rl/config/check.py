@@ -22,6 +22,7 @@ from coil_rl.config.distillation import (
     guides_without_parameters,
     proxy_config,
 )
+from coil_rl.config.logger import check_logger
 from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
@@ -287,7 +288,7 @@ def _check_training(config: DictConfig, make_env: EnvMaker) -> None:
     _check_validation(config, learner)
     _check_curve(config, make_env)
     if config.logger:
-        check_node(config.logger, "logger")
+        check_logger(check_node(config.logger, "logger"))
     _check_watch(config, env)
 
 

@@ -47,7 +47,7 @@ def open_run(
     folder = Path(folder).expanduser()
     if trust:
         trust_packages(trust)
-    config = read_config(folder, "folder", {"device": device})
+    config = read_config(folder, "folder", {"device": device}, goes_on=bool(trust))
     give(config, {"guide": guide, "env": env})
     return assemble(config, folder)
 

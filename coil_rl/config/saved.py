@@ -8,6 +8,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from coil_rl.config.logger import shipped_logger
 from coil_rl.config.measured import complete_measures
 from coil_rl.config.schema import IGNORED_KEYS, TrainConfig
 from coil_rl.config.sentences import sentence
@@ -29,7 +30,13 @@ def settings(config: DictConfig) -> dict[str, Any]:
     return dict(saved)
 
 
-def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None) -> DictConfig:
+def read_config(
+    folder: Path,
+    key: str,
+    changes: Mapping[str, Any] | None = None,
+    *,
+    goes_on: bool = False,
+) -> DictConfig:
     """Return the configuration of the run in a folder.
 
     The folder may come from anybody; `trust_packages` names packages that it may use.
@@ -38,6 +45,9 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
         folder: of the run.
         key: of the calling program that names the folder, for the message.
         changes: new values of top-level keys.
+        goes_on: whether the run may be trained further, so that its logger is needed. A shipped one
+            is taken by its name, see `coil_rl.config.logger`; another one must be trusted as any
+            part, and is left out where the run is only evaluated.
 
     Raises:
         UserError: for a configuration that cannot be read, could run code, or is of a run that was
@@ -57,8 +67,13 @@ def read_config(folder: Path, key: str, changes: Mapping[str, Any] | None = None
                 f"{key}={folder} was made in Python from parts, which no file names; "
                 "make the same coil_rl.Run there, and call its methods"
             )
+        logger = shipped_logger(values.get("logger"))
+        if logger is not None or not goes_on:
+            values["logger"] = None
         saved = OmegaConf.create(_renamed(values))
         check_config(saved, path)
+        if logger is not None:
+            saved["logger"] = logger
         for name, value in (changes or {}).items():
             saved[name] = value
         config: Any = OmegaConf.merge(OmegaConf.structured(TrainConfig), saved)

@@ -8,11 +8,12 @@ each of them must be on a list of full names before anything is imported:
 
 - what the shipped configuration names in the groups of a run, also as an alternative in a comment:
   a part that has its YAML file is on the list;
-- the estimators of scikit-learn and the transforms and loggers of TorchRL in `conf/trusted.yaml`;
+- the estimators of scikit-learn and the transforms of TorchRL in `conf/trusted.yaml`;
 - what the configuration of the command itself names, because the command uses it anyway;
 - anything that is defined in a package that the user trusts.
 
-A constructor on the list may read a file that its arguments name, but must not write one.
+The logger of a run is not among them: `coil_rl.config.logger` takes it by its name. A constructor
+on the list may read a file that its arguments name, but must not write one.
 `docs/trust.md` has the trust model.
 """
 
@@ -50,11 +51,9 @@ NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {
     "torch",
 }
 
-LOGGERS = "torchrl.record.loggers."
 NAMED = ESTIMATORS.union(
     ["coil_rl.config.given.kept"],  # it looks an object up that the user handed over in Python
     (f"torchrl.envs.{name}" for name in TRUSTED["transforms"]),
-    (LOGGERS + name for name in TRUSTED["loggers"]),
 )
 
 _packages: frozenset[str] = frozenset()  # of the option `trust`
@@ -102,7 +101,7 @@ def trust_own(config: DictConfig) -> None:
 def _targets(config: DictConfig) -> frozenset[str]:
     paths = (
         _import_path(name, key, value)
-        for name, _, key, value in _entries(OmegaConf.to_container(config))
+        for name, key, value in _entries(OmegaConf.to_container(config))
     )
     return frozenset(path for path in paths if isinstance(path, str))
 
@@ -114,7 +113,7 @@ def check_config(config: DictConfig, path: Path) -> None:
 
     Nothing is resolved, and nothing is imported but packages that the user trusts.
     """
-    for name, parent, key, value in _entries(OmegaConf.to_container(config)):
+    for name, key, value in _entries(OmegaConf.to_container(config)):
         named = (
             key if not name.startswith("defaults[") else ""
         )  # Hydra's list names groups by paths
@@ -124,14 +123,14 @@ def check_config(config: DictConfig, path: Path) -> None:
             )
         target = _import_path(name, key, value)
         if key == "_target_" or target is not None:
-            _check_target(target, name, parent, path)
+            _check_target(target, name, path)
         elif str(key).startswith("_") and key != "_partial_":
             raise UserError(f"{path}: {name:.100} is not a key of a run's configuration; remove it")
         if (key == "memory" or str(key).endswith("__memory")) and value is not None:
             raise UserError(
                 f"{path}: {name:.100} names a cache, whose files can run code; set it to null"
             )
-        # Only the logger is saved with references, and none to itself, so that they cannot grow.
+        # Only a logger is saved with references, and none to itself, so that they cannot grow.
         known = r"(?!)"
         if name.startswith("logger.") and key != "_target_":
             known = r"\$\{(?!logger\b)\w[\w.]*\}"
@@ -141,8 +140,8 @@ def check_config(config: DictConfig, path: Path) -> None:
             )
 
 
-def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any], Any, Any]]:
-    """Yield full key, parent, key and value of each entry of nested mappings and lists."""
+def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield full key, key and value of each entry of nested mappings and lists."""
     parent: Mapping[Any, Any] = {}
     if isinstance(node, Mapping):
         parent = node
@@ -150,7 +149,7 @@ def _entries(node: Any, name: str = "") -> Iterator[tuple[str, Mapping[Any, Any]
         parent = dict(enumerate(node))
     for key, value in parent.items():
         full = f"{name}[{key}]" if isinstance(node, list) else f"{name}.{key}".lstrip(".")
-        yield full, parent, key, value
+        yield full, key, value
         yield from _entries(value, full)
 
 
@@ -176,13 +175,12 @@ class _Entry(NamedTuple):
         return f"{self.path}: {self.name:.100} names {self.target!r:.100}"
 
 
-def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -> None:
+def _check_target(target: Any, name: str, path: Path) -> None:
     """Raise a `UserError` if an entry names something that a folder may not call.
 
     Args:
         target: what it names.
         name: full key of the entry.
-        node: mapping that holds the entry.
         path: of the configuration, for the message.
     """
     entry = _Entry(path, name, target)
@@ -190,15 +188,13 @@ def _check_target(target: Any, name: str, node: Mapping[Any, Any], path: Path) -
     if not package.isidentifier():
         raise UserError(f"{entry}, which is not the full name of a class; give one")
     allowed = NAMED | _shipped_targets() | _own
-    if target in allowed and not target.startswith(LOGGERS):
+    if target in allowed:
         return
     entry_points = metadata.entry_points(group=ENTRY_POINTS).names
     if package not in NEVER_TRUSTED and package in _packages | entry_points:
         # A Gymnasium env is registered by its module, and has no name of its own there.
         if not name.endswith(".id") or "controllers" in name:
             _check_origin(entry, package)
-    elif target in allowed:
-        _check_logger(entry, node)
     elif package in NEVER_TRUSTED:
         similar = did_you_mean(target, allowed) if package == "coil_rl" else ""
         raise UserError(
@@ -223,25 +219,17 @@ def _check_origin(entry: _Entry, package: str) -> None:
         raise UserError(f"{entry}, which is defined elsewhere; name the package that defines it")
 
 
-def _check_logger(entry: _Entry, node: Mapping[Any, Any]) -> None:
-    """Raise a `UserError` for a logger that could write outside of the folder of its run."""
-    plain = re.fullmatch(r"[\w-]+", str(node.get("exp_name")))
-    if entry.name != "logger._target_" or node.get("log_dir") != "${run_dir}" or not plain:
-        raise UserError(
-            f"{entry}, which may only be the logger, with log_dir: ${{run_dir}} and a plain "
-            "exp_name, because a run writes only into its own folder; trust=[torchrl] on the "
-            "command line allows it"
-        )
-
-
 @cache
 def _shipped_targets() -> frozenset[str]:
-    """Return all targets that the shipped configuration names in the groups of a run."""
+    """Return all targets that the shipped configuration names in the groups of a run.
+
+    Loggers are not among them, because what they write and where is up to their arguments.
+    """
     conf = resources.files("coil_rl.conf")
     found: set[str] = set()
     for name in (*(field.name for field in fields(TrainConfig)), "cases", "network"):
         group = conf / name
-        if not group.is_dir():
+        if name == "logger" or not group.is_dir():
             continue
         for file in group.iterdir():
             if ".yaml" in file.name:

@@ -1,5 +1,6 @@
 """`coil-train`: train a method, evaluate the policy beside its guides and draw the results."""
 
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,15 +52,10 @@ def resume(folder: Path, frames: int | None = None) -> float:
     from coil_rl.config.saved import read_config
     from coil_rl.run.folder import is_evaluated, locked
 
-    config = read_config(folder, "resume")
+    config = read_config(folder, "resume", goes_on=True)
     imported()
     folder = folder.absolute()
-    link = next((path for path in folder.rglob("*") if path.is_symlink()), None)
-    if link is not None:
-        raise UserError(
-            f"{link} is a link, so that the run could write outside of its folder; put the file in "
-            "its place"
-        )
+    _refuse_links(folder)
     config.run_dir = str(folder)
     if config.proxy:
         config.proxy["folder"] = str(folder / "distilled")  # not the folder that the file names
@@ -75,6 +71,22 @@ def resume(folder: Path, frames: int | None = None) -> float:
         except UserError as error:
             raise UserError(f"{folder / 'config.yaml'}: {error}") from error
         return run.finish_begun()
+
+
+def _refuse_links(folder: Path) -> None:
+    """Raise a `UserError` for a link through which a run could write outside of its folder."""
+    inside = os.path.realpath(folder)
+    for path in folder.rglob("*"):
+        if not path.is_symlink() or Path(os.path.realpath(path)).is_relative_to(inside):
+            continue
+        # W&B leaves links to its logs in the folders of its earlier records, which are finished.
+        parts = path.relative_to(folder).parts
+        if parts[0] == "wandb" and len(parts) > 2:
+            continue
+        raise UserError(
+            f"{path} is a link out of the folder of the run, so that it could write there; put the "
+            "file in its place"
+        )
 
 
 def resume_from_command_line(resumed: str, others: Sequence[str]) -> None:

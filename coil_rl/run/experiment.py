@@ -153,6 +153,7 @@ class Experiment:
             UserError: for a NaN from the env, in the losses or in the weights.
         """
         first = {}
+        self.metrics.describe(self.identity)
         if self.updates == 0:
             first = self._measure({})
             self.frames_before = self.before + self.tested

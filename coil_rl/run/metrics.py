@@ -4,7 +4,8 @@ import csv
 import io
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,21 @@ from coil_rl.output import decoration
 from coil_rl.report.runs import RETURN, read_curve, read_table
 
 REMEDY = "put the whole file back, or train again in another folder"  # for a damaged log
+
+
+class NoLogger:
+    """A logger that does nothing."""
+
+    experiment = None
+
+    def log_scalar(self, name: str, value: float, step: int) -> None:
+        """Log nothing."""
+
+    def log_hparams(self, settings: Mapping[str, Any]) -> None:
+        """Log nothing."""
+
+    def close(self) -> None:
+        """Close nothing."""
 
 
 class Metrics:
@@ -36,6 +52,33 @@ class Metrics:
         writer = getattr(logger, "experiment", None)
         self.tensorboard: Any | None = writer if hasattr(writer, "purge_step") else None
 
+    def describe(self, settings: Mapping[str, Any]) -> None:
+        """Log the configuration of the run with the TorchRL logger, if there is one.
+
+        Args:
+            settings: values by full key; numbers, flags and texts stay what they are.
+        """
+        plain = {
+            key: value if isinstance(value, (bool, int, float, str)) else str(value)
+            for key, value in settings.items()
+        }
+        with self._using() as logger:
+            logger.log_hparams(plain)
+
+    def close(self) -> None:
+        """End the record of the TorchRL logger, so that a second run in this process has its own.
+
+        What is logged later is lost.
+        """
+        with self._using() as logger:
+            # Runs of MLflow end only so, and those of others too.
+            end = getattr(logger.experiment, "__exit__", None)
+            if end is None:
+                logger.close()
+            else:
+                end(None, None, None)
+        self.logger = None
+
     def append(self, row: dict[str, float]) -> None:
         """Log a row; `frames` is the step of the logger."""
         self.rows.append(row)
@@ -48,17 +91,24 @@ class Metrics:
         self.log(row, int(row["frames"]))
 
     def log(self, values: Mapping[str, float], frames: int) -> None:
-        """Log values with the TorchRL logger, if there is one; NaN is left out.
-
-        A logger that fails is left out from then on.
-        """
-        if self.logger is None:
-            return
-        logger, self.logger = self.logger, None
-        with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
+        """Log values with the TorchRL logger, if there is one; NaN is left out."""
+        with self._using() as logger:
             for name, value in values.items():
                 if not math.isnan(value):
                     logger.log_scalar(name, value, step=frames)
+
+    @contextmanager
+    def _using(self) -> Iterator[Any]:
+        """Yield the TorchRL logger, or one that does nothing.
+
+        A logger that fails is left out from then on.
+        """
+        logger, self.logger = self.logger, None
+        if logger is None:
+            yield NoLogger()
+            return
+        with decoration(f"the logger {type(logger).__name__} of {self.path.parent}"):
+            yield logger
             self.logger = logger
 
     def fill(self, results: Mapping[int, Mapping[str, float]]) -> None:

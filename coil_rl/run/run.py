@@ -356,6 +356,7 @@ class Run:
         learner = experiment.learner
         with decoration(f"the learning curve in {self.folder}"):
             self._draw(rows, learner, guide_returns)
+        experiment.metrics.close()
         learner.export(self.folder)
         return self._loaded(learner.policy, experiment.rollout.env, self.chosen)
 

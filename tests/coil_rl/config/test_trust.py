@@ -71,7 +71,7 @@ def read(folder, content):
     if not isinstance(content, str):
         content = json.dumps(OmegaConf.to_container(OmegaConf.create(content)))  # JSON is YAML
     (folder / "config.yaml").write_text(content)
-    return read_config(folder, "run")
+    return read_config(folder, "run", goes_on=True)
 
 
 def no_import(name, *_):
@@ -162,7 +162,6 @@ def test_controller_of_a_trusted_package_and_of_the_command_may_be_used(package,
         "track.train",
         "track.test.deep.er",
         "logger",
-        "logger.x",
         "evaluation.advice.x",
         "evaluation.env.tracks",
         "watch.step.x",
@@ -215,15 +214,13 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
         ("env.x", {"_convert_": "none"}, "_convert_ is not a key"),
         ("env.x", "${oc.env:HOME}", "is a reference; put the value in its place"),
         ("env.x", "${label}", "is a reference"),
-        ("logger.exp_name", "${oc.env:HOME}", "is a reference|plain exp_name"),
-        ("logger.x", "${logger.exp_name}", "is a reference"),
-        ("logger.x", "a ${${label}}", "is a reference"),
-        ("logger.log_dir", "/tmp/elsewhere", "may only be the logger, with log_dir"),
-        ("logger.exp_name", "../elsewhere", "a plain exp_name"),
+        ("logger", {"x": "${oc.env:HOME}"}, "is a reference"),
+        ("logger", {"x": "${logger.exp_name}"}, "is a reference"),
+        ("logger", {"x": "a ${${label}}"}, "is a reference"),
         (
             "env.x",
             {"_target_": "torchrl.record.loggers.CSVLogger", "exp_name": "a"},
-            "may only be the logger",
+            "could run code",
         ),
         ("learner.memory", "cache", "learner.memory names a cache, whose files can run code"),
         ("learner.grid", {"steps__memory": ["cache"]}, "steps__memory names a cache"),
@@ -234,6 +231,27 @@ def test_target_is_refused_wherever_it_is(key, saved, tmp_path):
 def test_trick_is_refused(key, value, message, saved, tmp_path):
     with pytest.raises(UserError, match=message):
         read(tmp_path, changed(saved, key, value))
+
+
+def test_run_with_a_logger_of_its_own_is_evaluated_without_it(saved, tmp_path):
+    theirs = changed(saved, "logger", {"_target_": "os.system", "command": "ls"})
+    with pytest.raises(UserError, match="could run code"):
+        read(tmp_path, theirs)
+    assert read_config(tmp_path, "run").logger is None
+
+
+def test_shipped_logger_writes_only_where_it_is_shipped_to_write(saved, tmp_path):
+    for key, value in (
+        ("log_dir", "/tmp/elsewhere"),
+        ("exp_name", "../x"),
+        ("x", {"_target_": "os.system"}),
+    ):
+        config = read(tmp_path, changed(saved, f"logger.{key}", value))
+        assert OmegaConf.to_container(config.logger) == {
+            "_target_": "torchrl.record.loggers.TensorboardLogger",
+            "exp_name": "tensorboard",
+            "log_dir": "${run_dir}",
+        }
 
 
 @pytest.mark.parametrize(
@@ -416,6 +434,8 @@ def test_resumed_run_writes_only_into_its_own_folder(saved, tmp_path, monkeypatc
     (config,) = resumed
     assert config.run_dir == config.logger.log_dir == str(folder)
     assert config.proxy.folder == str(folder / "distilled")
+    (folder / "latest.log").symlink_to("config.yaml")
+    train.resume(folder)
     (folder / "metrics.csv").symlink_to(tmp_path / "outside.csv")
-    with pytest.raises(UserError, match=r"metrics\.csv is a link"):
+    with pytest.raises(UserError, match=r"metrics\.csv is a link out of the folder"):
         train.resume(folder)
