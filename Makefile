@@ -49,7 +49,7 @@ test-all: $(INSTALLED) ## run all tests, also the slow ones
 # Stable-Baselines3 is needed for this comparison only; without it these tests are skipped.
 test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that compare with it
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[bench]'
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/coil_rl/learners/test_ppo_sb3.py tests/benchmarks/test_beside_sb3.py
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q tests/coil_rl/learners/test_ppo_sb3.py tests/benchmarks/test_beside_sb3.py tests/benchmarks/test_advice_for_sb3.py
 
 # The packages of the loggers are needed for this only; without them these tests are skipped.
 test-extras: $(INSTALLED) ## install Weights & Biases and MLflow and run the tests of the loggers

@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from coil_rl.guides import RecordedGuide as RecordedGuide
     from coil_rl.guides import SplineGuide as SplineGuide
     from coil_rl.guides import ZeroGuide as ZeroGuide
+    from coil_rl.guides.advice_observation import AdviceObservation as AdviceObservation
     from coil_rl.imitation import Imitation as Imitation
     from coil_rl.learners import A2C as A2C
     from coil_rl.learners import DQN as DQN
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from coil_rl.learners import TRPO as TRPO
     from coil_rl.learners import DynamicCoil as DynamicCoil
     from coil_rl.learners import Reinforce as Reinforce
+    from coil_rl.learners.stepper import LearnerStepper as LearnerStepper
     from coil_rl.measures import Measure as Measure
     from coil_rl.programs.app import NoSweepError as NoSweepError
     from coil_rl.programs.app import run_program as run_program
@@ -88,8 +90,10 @@ _NAMES = {
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
     "SplineGuide ZeroGuide",
     "coil_rl.config.learned_guide": "LearnedGuide",
+    "coil_rl.guides.advice_observation": "AdviceObservation",
     "coil_rl.imitation": "Imitation",
     "coil_rl.learners": "A2C DQN PPO SAC TRPO DynamicCoil Reinforce",
+    "coil_rl.learners.stepper": "LearnerStepper",
     "coil_rl.testing": "check_env check_guide check_transform",
     "coil_rl.run.evaluation": "EvaluationResult evaluate_policy",
     "coil_rl.run.judge": "Evaluation Trial guide_titles",

@@ -142,7 +142,9 @@ class GymnasiumEnv(SeededRows):
     ) -> None:
         check_range(1, num_envs=num_envs, max_steps=1 if max_steps is None else max_steps)
         _check_workers(workers)
-        makers = {name: _resolve(name, thing) for name, thing in (controllers or {}).items()}
+        makers = {
+            name: resolved_controller(name, thing) for name, thing in (controllers or {}).items()
+        }
         settings = dict(options or {})
         if max_steps is not None:
             settings["max_episode_steps"] = max_steps
@@ -444,7 +446,7 @@ class _Row:
         limit = None if _has_limit(env) else LIMIT
         self.gate = EnvGate(env, self.name, self.number, self.dtype, limit)
         self.controllers = {
-            name: _controller(name, maker, env) for name, maker in self.makers.items()
+            name: controller_of(name, maker, env) for name, maker in self.makers.items()
         }
 
     def begin(self, seed: int) -> None:
@@ -510,24 +512,35 @@ class _Row:
 
     def _fitted(self, name: str, advice: Any) -> NDArray[Any]:
         """Return the action of a controller as an array, in the env's own numbering."""
-        space = self.gate.env.action_space
         with self.gate.placed():
-            try:
-                array = plain_array(advice, "it")
-                if has_whole_numbers(space):
-                    whole = array.astype(space.dtype)
-                    fits = bool((whole == array).all()) and space.contains(whole)
-                elif isinstance(space, spaces.Box):
-                    fits = array.shape == space.shape and bool(np.isfinite(array).all())
-                else:
-                    fits = bool(space.contains(array))
-            except ForeignError:
-                fits = False
-            if not fits:
-                raise ForeignError(
-                    f"controller {name} gave {shown(advice)}, not an action of {space}"
-                )
-        return np.array(array)
+            return fitted_action(name, advice, self.gate.env.action_space)
+
+
+def fitted_action(name: str, advice: Any, space: spaces.Space[Any]) -> NDArray[Any]:
+    """Return the action of a controller as an array, in the env's own numbering.
+
+    Args:
+        name: of the controller, for the message.
+        advice: what the controller gave.
+        space: of the env's actions; the bounds of real numbers are not checked.
+
+    Raises:
+        ForeignError: for what is no action of the env.
+    """
+    try:
+        array = plain_array(advice, "it")
+        if has_whole_numbers(space):
+            whole = array.astype(space.dtype)
+            fits = bool((whole == array).all()) and space.contains(whole)
+        elif isinstance(space, spaces.Box):
+            fits = array.shape == space.shape and bool(np.isfinite(array).all())
+        else:
+            fits = bool(space.contains(array))
+    except ForeignError:
+        fits = False
+    if not fits:
+        raise ForeignError(f"controller {name} gave {shown(advice)}, not an action of {space}")
+    return np.array(array)
 
 
 def _check_workers(workers: int | str) -> None:
@@ -689,7 +702,7 @@ def _reason(id: str, error: BaseException) -> str:
     return f"{first_line}; if a package registers it, write PACKAGE:{id}"
 
 
-def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
+def resolved_controller(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
     """Return a controller by its import path PACKAGE.MODULE:THING."""
     if not isinstance(thing, str):
         return thing
@@ -701,7 +714,7 @@ def _resolve(name: str, thing: str | Callable[..., Any]) -> Callable[..., Any]:
         ) from error
 
 
-def _controller(
+def controller_of(
     name: str, maker: Callable[..., Any], env: Env
 ) -> tuple[Callable[[Any], Any], Callable[[], Any]]:
     """Make a controller for an env.

@@ -114,8 +114,13 @@ def test_sdist_contains_everything_that_its_tests_need(tree: Path) -> None:
     [sdist] = tree.parent.glob("*.tar.gz")
     with tarfile.open(sdist) as file:
         names = {name.partition("/")[2] for name in file.getnames()}
-    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "paper", "tests", "transforms"]
-    paths = [path for folder in folders for path in (tree / folder).rglob("*") if path.is_file()]
+    folders = ["benchmarks", "coil_rl", "conf", "docs", "envs", "examples", "paper", "tests"]
+    paths = [
+        path
+        for folder in [*folders, "transforms"]
+        for path in (tree / folder).rglob("*")
+        if path.is_file()
+    ]
     needed = {path.relative_to(tree).as_posix() for path in paths} - {*LINKS}
     files = {
         "CONTRIBUTING.md",

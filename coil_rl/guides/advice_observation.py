@@ -1,0 +1,143 @@
+"""The advice of a controller in the observation of any Gymnasium env, for other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, SupportsFloat, TypeGuard
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from coil_rl.envs.gate import foreign
+from coil_rl.envs.gymnasium_env import controller_of, fitted_action, resolved_controller
+from coil_rl.envs.gymnasium_spaces import action_spec, check_action_space, lowest_choices
+from coil_rl.transforms.action_space import ActionSpace
+
+ADVICE = "guide_action"  # key of the advice in an observation of several entries
+
+
+class AdviceObservation(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Any Gymnasium env whose observation has the advice of a controller in it: COIL elsewhere.
+
+    The advice is what the networks of this package read: real numbers from -1 to 1 between the
+    bounds of the action (without a bound in the unit of the env), choices as one-hot vectors side
+    by side. It is appended to an observation that is a vector of real numbers. A Dict observation
+    gets the entry `guide_action`; any other one becomes a Dict of `observation` and `guide_action`.
+    After a termination the advice is the last one.
+
+    Args:
+        env: the env. Its actions are a Box, Discrete, MultiDiscrete or MultiBinary.
+        controller: whose action is the advice, as in `GymnasiumEnv`: a class, made as
+            `THING(env)`, with `act(observation)` and, if it wants, `reset()`, called at the start
+            of an episode; a function, called as `THING(env, observation)`; an object with `act`,
+            or a trained model with `predict`; or the import path of one.
+
+    Attributes:
+        advice: the present one, [A], as observed; None before the first reset.
+
+    Raises:
+        ValueError: for an action space that is not supported, a controller that cannot be made, or
+            a Dict observation with an entry `guide_action`.
+        ForeignError: at a reset or a step, for what the controller raises, or gives that is no
+            action of the env.
+
+    Example:
+        >>> env = AdviceObservation(
+        ...     gymnasium.make("CartPole-v1"), lambda env, seen: int(seen[2] > 0)
+        ... )
+        >>> observation, _ = env.reset(seed=0)
+        >>> observation.shape, observation[4:].tolist()
+        ((6,), [1.0, 0.0])
+    """
+
+    def __init__(
+        self, env: gymnasium.Env[Any, Any], controller: str | Callable[..., Any] | Any
+    ) -> None:
+        super().__init__(env)
+        name = type(env.unwrapped).__name__
+        check_action_space(name, env.action_space)
+        spec = action_spec(name, env.action_space, torch.float32)
+        first = torch.as_tensor(lowest_choices(env.action_space)).reshape(-1)
+        self.space = ActionSpace(spec, 0, first if first.any() else None)
+        thing = resolved_controller("advice", controller)
+        self.act, self.begin = controller_of("advice", thing, env)
+        self.advice: NDArray[np.float32] | None = None
+        self.observation_space = self._with(env.observation_space, self._advice_space())
+
+    def _advice_space(self) -> spaces.Box:
+        """Return the space of the advice."""
+        units, size = self.space.units, int(self.space.agents.numel()) * self.space.size
+        if units is None:
+            return spaces.Box(0.0, 1.0, (size,), np.float32)
+        low, high = units.low.flatten().numpy(), units.high.flatten().numpy()
+        return spaces.Box(low, high, (size,), np.float32)
+
+    def _with(self, space: spaces.Space[Any], advice: spaces.Box) -> spaces.Space[Any]:
+        """Return the space of observations with advice."""
+        if isinstance(space, spaces.Dict):
+            if ADVICE in space.spaces:
+                raise ValueError(
+                    f"the observation has an entry {ADVICE!r} already: rename it with a wrapper"
+                )
+            return spaces.Dict({**space.spaces, ADVICE: advice})
+        if not _is_vector(space):
+            return spaces.Dict({"observation": space, ADVICE: advice})
+        low, high = (
+            np.concatenate([own.astype(np.float32), more])
+            for own, more in ((space.low, advice.low), (space.high, advice.high))
+        )
+        return spaces.Box(low, high, dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode of env and controller.
+
+        Args:
+            seed: of the env.
+            options: of the env.
+        """
+        observation, info = self.env.reset(seed=seed, options=options)
+        with foreign("the controller", "reset"):
+            self.begin()
+        self._advise(observation)
+        return self._observed(observation), info
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Do a step, and ask the controller for its next action.
+
+        Args:
+            action: of the env; the advice is not obeyed.
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if not terminated:
+            self._advise(observation)
+        return self._observed(observation), reward, terminated, truncated, info
+
+    def _advise(self, observation: Any) -> None:
+        with foreign("the controller", "it"):
+            given = self.act(observation)
+        action = torch.as_tensor(fitted_action("advice", given, self.env.action_space))
+        shape = self.space.event or action.shape
+        vectors = self.space.advice(action.reshape(shape), torch.Size())
+        self.advice = self.space.normalise(vectors).flatten().numpy().astype(np.float32)
+
+    def _observed(self, observation: Any) -> Any:
+        """Return an observation with the present advice."""
+        space = self.env.observation_space
+        advice = np.copy(self.advice)  # type: ignore[arg-type]
+        if isinstance(space, spaces.Dict):
+            return {**observation, ADVICE: advice}
+        if not _is_vector(space):
+            return {"observation": observation, ADVICE: advice}
+        return np.concatenate([np.asarray(observation, np.float32), advice])
+
+
+def _is_vector(space: spaces.Space[Any]) -> TypeGuard[spaces.Box]:
+    """Return whether observations are vectors of real numbers."""
+    if not isinstance(space, spaces.Box) or len(space.shape) != 1:
+        return False
+    return bool(np.issubdtype(space.dtype, np.floating))

@@ -1,0 +1,37 @@
+"""docs/torchrl_users.md: its Python blocks run, and COIL in TorchRL's PPOTrainer learns."""
+
+import re
+
+import pytest
+import torch
+from programs import ROOT
+
+PAGE = (ROOT / "docs" / "torchrl_users.md").read_text()
+BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, flags=re.DOTALL | re.MULTILINE)
+
+
+def run(block):
+    torch.manual_seed(0)
+    names = {}
+    exec(compile(block, "torchrl_users.md", "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+def test_coil_runs_in_their_ppo_trainer():
+    before = BLOCKS[0].replace("trainer.train()", "")
+    fresh, trained = run(before), run(BLOCKS[0])
+    assert trained["trainer"].collected_frames == 1024
+    weights = [names["network"].module.layers[0].weight for names in (fresh, trained)]
+    changed = (weights[0] - weights[1]).abs()
+    assert changed[:, :3].max() > 1e-4
+    assert changed[:, 3].max() > 1e-4, "the weights of the advice learn, too"
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_other_blocks_run(number):
+    assert run(BLOCKS[number])["env"] is not None
+
+
+def test_no_block_is_left_out():
+    assert len(BLOCKS) == 3
