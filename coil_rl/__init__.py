@@ -12,7 +12,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from coil_rl.config.learned_guide import LearnedGuide as LearnedGuide
     from coil_rl.config.load import open_run as open_run
+    from coil_rl.config.load import pretrained as pretrained
     from coil_rl.config.nodes import build as build
+    from coil_rl.config.pretrained import pretrained_card as pretrained_card
+    from coil_rl.config.pretrained import pretrained_names as pretrained_names
     from coil_rl.config.python import compose_train as compose_train
     from coil_rl.config.python import prepare as prepare
     from coil_rl.config.python import train as train
@@ -34,6 +37,9 @@ if TYPE_CHECKING:
     from coil_rl.envs.limits import check_range as check_range
     from coil_rl.errors import UserError as UserError
     from coil_rl.errors import did_you_mean as did_you_mean
+    from coil_rl.export import ExportedGuide as ExportedGuide
+    from coil_rl.export import ExportedPolicy as ExportedPolicy
+    from coil_rl.export import export_policy as export_policy
     from coil_rl.files import write_text as write_text
     from coil_rl.guides import ConstantGuide as ConstantGuide
     from coil_rl.guides import ControllerGuide as ControllerGuide
@@ -86,6 +92,7 @@ _NAMES = {
     "coil_rl.envs.gymnasium_env": "GymnasiumEnv",
     "coil_rl.envs.limits": "check_range",
     "coil_rl.errors": "UserError did_you_mean",
+    "coil_rl.export": "ExportedGuide ExportedPolicy export_policy",
     "coil_rl.files": "write_text",
     "coil_rl.guides": "ConstantGuide ControllerGuide EntryGuide PerRow RandomGuide RecordedGuide "
     "SplineGuide ZeroGuide",
@@ -97,8 +104,9 @@ _NAMES = {
     "coil_rl.testing": "check_env check_guide check_transform",
     "coil_rl.run.evaluation": "EvaluationResult evaluate_policy",
     "coil_rl.run.judge": "Evaluation Trial guide_titles",
-    "coil_rl.config.load": "open_run",
+    "coil_rl.config.load": "open_run pretrained",
     "coil_rl.config.nodes": "build",
+    "coil_rl.config.pretrained": "pretrained_card pretrained_names",
     "coil_rl.config.python": "compose_train prepare train",
     "coil_rl.config.schema": "NodeConfig ProgramConfig",
     "coil_rl.config.values": "check_values",

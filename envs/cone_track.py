@@ -22,6 +22,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.constants import constant
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
+from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import (
     HISTORY,
     TERMS,
@@ -215,6 +216,11 @@ class ConeTrackEnv(SeededEnv):
         self.staggered = starts is not None
         self._register_starts(starts)
         self.set_seed(seed)
+
+    @property
+    def meanings(self) -> dict[str, dict[str, str]]:
+        """What the entries mean, see `coil_rl.envs.meanings`."""
+        return of_cones(self.sight, math.degrees(self.max_steering))
 
     def _declare_specs(self) -> None:
         real = partial(Unbounded, dtype=self.dtype_, device=self.device)

@@ -41,10 +41,12 @@ def flat_index(rows: Tensor) -> Tensor:
     """
     rows = rows.view(len(rows), -1)
     columns = rows.shape[1]
-    make = _new if torch.compiler.is_compiling() else _cached
-    return torch.add(
-        make(range(columns), 0, rows.dtype, rows.device), rows, alpha=columns
-    ).flatten()
+    if torch.compiler.is_exporting():  # for any number of columns
+        numbers = torch.arange(columns, dtype=rows.dtype, device=rows.device)
+    else:
+        make = _new if torch.compiler.is_compiling() else _cached
+        numbers = make(range(columns), 0, rows.dtype, rows.device)
+    return torch.add(numbers, rows, alpha=columns).flatten()
 
 
 def _new(

@@ -206,6 +206,11 @@ class GymnasiumEnv(SeededRows):
         """Return the spec of a batch from that of one row."""
         return spec.to(self.device).expand(*self.batch_size, *spec.shape)
 
+    @property
+    def meanings(self) -> Any:
+        """What the env says about its entries, see `coil_rl.envs.meanings`."""
+        return getattr(self.rows[0].gate.env.unwrapped, "meanings", None)
+
     def render(self, row: int = 0) -> NDArray[np.uint8] | None:
         """Return a picture, [height, width, 3]; None if there are none.
 

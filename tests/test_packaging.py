@@ -21,6 +21,8 @@ LINKS = {
     "coil_paper": "paper",
 }
 
+SHIPPED = (".md", ".csv", ".pt", ".yaml")  # files of the shipped policies
+
 
 def run(*command: str | Path, cwd: Path, pythonpath: Path | None = None) -> str:
     env = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
@@ -82,7 +84,13 @@ def installed(wheel: Path) -> Path:
 
 def test_wheel_contains_exactly_the_sources_and_their_data(tree: Path, wheel: Path) -> None:
     patterns = {
-        "coil_rl": ["*.py", "*.html", "*.json", "py.typed"],
+        "coil_rl": [
+            "*.py",
+            "*.html",
+            "*.json",
+            "py.typed",
+            *(f"policies/**/*{end}" for end in SHIPPED),
+        ],
         "envs": ["*.py", "*.json", "tracks/**/*.csv"],
     }
     patterns |= {"transforms": ["*.py"], "conf": ["*.py", "*.yaml"], "paper": ["*.py", "*.yaml"]}

@@ -213,13 +213,21 @@ class AdaptiveMixedAction(CombinedAction):
         weight = expand_as_right(weight, advice)
         return self.action_space.clamp(weight * tensordict[self.action_key] + (1 - weight) * advice)
 
+    def weight_after(self, weight: Tensor, uncertainty: Tensor | None) -> Tensor:
+        """Return the weight of the agent in the next step, [*batch, 1], as in evaluation.
+
+        Args:
+            weight: in this step, [*batch, 1].
+            uncertainty: of the critics about this step, [*batch, 1]; None: not known.
+        """
+        if uncertainty is None:
+            return torch.full_like(weight, self.low)
+        share = (uncertainty - self.certain) / (self.uncertain - self.certain)
+        return self.high - (self.high - self.low) * share.clamp(0, 1).to(weight.dtype)
+
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         doubt = next_tensordict.pop("uncertainty", None)
-        weight = torch.full_like(tensordict["agent_weight"], self.low)
-        if doubt is not None:
-            share = (doubt - self.certain) / (self.uncertain - self.certain)
-            share = share.clamp(0, 1).to(weight.dtype)
-            weight = self.high - (self.high - self.low) * share
+        weight = self.weight_after(tensordict["agent_weight"], doubt)
         if self.learns:
             draw = torch.rand(weight.shape, generator=self.rng.generator).to(weight)
             drawn = self.low + (self.warm_up_high - self.low) * draw

@@ -1,6 +1,5 @@
 """The policy of a finished run as a guide."""
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -21,6 +20,7 @@ from torchrl.envs import (
 )
 
 from coil_rl.config.build import assemble
+from coil_rl.config.pretrained import run_folder
 from coil_rl.config.saved import read_config
 from coil_rl.errors import UserError
 from coil_rl.guides import PerRow
@@ -41,7 +41,7 @@ class LearnedGuide(TensorDictModuleBase):
     they act one after the other, each with a `Controller` of its own.
 
     Args:
-        run: folder of a run of `coil-train`.
+        run: folder of a run of `coil-train`, or `pretrained:NAME`.
         which: the policy that the run hands over, the last, or the best one.
         device: of the networks.
 
@@ -57,7 +57,7 @@ class LearnedGuide(TensorDictModuleBase):
         device: str = "cpu",
     ) -> None:
         super().__init__()
-        folder = Path(os.path.expanduser(run))
+        folder = run_folder(run)
         config = read_config(folder, "run", {"device": device})
         if config.method.observes is None:
             raise ValueError(

@@ -9,6 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from coil_rl.config.build import assemble, build_guides, trains_guides
 from coil_rl.config.given import give
+from coil_rl.config.pretrained import PREFIX, run_folder
 from coil_rl.config.saved import read_config
 from coil_rl.config.trust import trust_packages
 from coil_rl.errors import UserError
@@ -29,7 +30,8 @@ def open_run(
     """Return the run in a folder, finished or not.
 
     Args:
-        folder: that `coil-train` or `coil_rl.train` has written; it may come from anybody.
+        folder: that `coil-train` or `coil_rl.train` has written; it may come from anybody. Or
+            "pretrained:NAME" for a shipped policy.
         guide: the object that was the guide, for a run that was made in Python with one that no
             import path names.
         env: the same for its env.
@@ -44,12 +46,32 @@ def open_run(
         >>> import coil_rl
         >>> controller = coil_rl.open_run("outputs/tank").controller()  # doctest: +SKIP
     """
-    folder = Path(folder).expanduser()
+    folder = run_folder(folder)
     if trust:
         trust_packages(trust)
     config = read_config(folder, "folder", {"device": device}, goes_on=bool(trust))
     give(config, {"guide": guide, "env": env})
     return assemble(config, folder)
+
+
+def pretrained(name: str, *, device: str = "cpu") -> Run:
+    """Return a shipped policy as the finished run that it is.
+
+    Args:
+        name: such as "cone_track/coil"; `pretrained_names()` has all.
+        device: of everything, "cpu" or "cuda".
+
+    Raises:
+        UserError: for a name that does not exist, and for files that are not those that were
+            shipped.
+
+    Example:
+        >>> import coil_rl
+        >>> run = coil_rl.pretrained("cone_track/coil")
+        >>> run.label, run.seed
+        ('coil', 0)
+    """
+    return open_run(f"{PREFIX}{name}", device=device)
 
 
 def load_guides(folder: Path, config: DictConfig) -> Mapping[str, TensorDictModuleBase]:

@@ -238,6 +238,7 @@ class EvaluateConfig(DrivingConfig):
     """Configuration of `coil-evaluate`."""
 
     run: str | None = None
+    exported: str | None = None
 
 
 @dataclass
@@ -260,6 +261,21 @@ class ReplayConfig(ProgramConfig):
     preset: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = field(default_factory=dict)
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 1
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+@dataclass
+class ExportConfig(ProgramConfig):
+    """Configuration of `coil-export`."""
+
+    run: str = MISSING
+    policy: WhichPolicy = "handed_over"
+    observations: Annotated[int, Field(ge=1, le=1_000_000)] = 1_000
+    meanings: dict[str, Any] = field(default_factory=dict)
     seed: Seed = 0
     device: str = "cpu"
     threads: Threads = 1
@@ -333,3 +349,4 @@ _store(name="evaluate_schema", node=_open_to_measures(EvaluateConfig))
 _store(name="report_schema", node=ReportConfig)
 _store(name="listen_schema", node=_open_to_measures(ListenConfig))
 _store(name="replay_schema", node=ReplayConfig)
+_store(name="export_schema", node=ExportConfig)

@@ -1,9 +1,12 @@
 """Critics of actions as one module, for policies and losses that compare values of actions."""
 
+import copy
+from typing import Self
+
 import torch
 from tensordict import NestedKey, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.objectives import REDQLoss, SACLoss
 
 
@@ -26,11 +29,27 @@ class Critics(TensorDictModuleBase):
         self.out_keys: list[NestedKey] = [("next", "uncertainty")]
         super().__init__()
         self.weights = loss.qvalue_network_params if weights is None else weights
+        self.networks: nn.ModuleList | None = None  # written out, one for each critic
+
+    def written_out(self) -> Self:
+        """Return a copy in which each critic is a network of its own, for export."""
+        copied = copy.deepcopy(self)
+        (network,) = self._network
+        copied.networks = nn.ModuleList()
+        for weights in self.weights.data.unbind(0):
+            own = copy.deepcopy(network)
+            weights.to_module(own)
+            copied.networks.append(own)
+        del copied.weights
+        return copied
 
     def values(self, tensordict: TensorDictBase) -> Tensor:
         """Return the values of the action, [critics, *B]."""
         (network,) = self._network
         data = tensordict.select(*network.in_keys)
+        if self.networks is not None:
+            values = [each(data.copy())["state_action_value"] for each in self.networks]
+            return torch.stack(values).squeeze(-1)
 
         def one(weights: TensorDictBase) -> Tensor:
             with weights.to_module(network):

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
+from coil_rl.errors import UserError
 from coil_rl.programs import app
 
 # Keys that have an effect on the evaluation of a run, and on that of guides alone.
-OF_A_RUN = ("run", "track", "disturb", "degrade", "evaluation")
+OF_A_RUN = ("run", "exported", "track", "disturb", "degrade", "evaluation")
 OF_GUIDES = ("preset", "env", "guide", *OF_A_RUN)
 OWN = (
     "repeats",
@@ -30,6 +31,7 @@ def evaluate(config: DictConfig) -> float:
     import torch
 
     from coil_rl.config.build import assemble, env_maker, trial
+    from coil_rl.config.pretrained import run_folder
     from coil_rl.run.judge import judge, report_outcome
 
     torch.set_num_threads(config.threads)
@@ -37,12 +39,40 @@ def evaluate(config: DictConfig) -> float:
     if config.run is None:
         judge(trial(config, env_maker(config)), None, results, config.seed)
         return report_outcome(results)
-    folder = Path(config.run).expanduser()
-    run = assemble(configured(folder, config), folder)
+    folder = run_folder(config.run)
+    of_run = configured(folder, config)
+    if config.exported is not None:
+        exported = with_exported(of_run, config.exported)
+        judge(trial(exported, env_maker(exported)), None, results, config.seed)
+        return report_outcome(results)
+    run = assemble(of_run, folder)
     policy = run.policy()
     fallback = run.make_fallback(policy) if run.fallback else None
     judge(run.trial, policy, results, config.seed, fallback)
     return report_outcome(results)
+
+
+def with_exported(config: DictConfig, file: str) -> DictConfig:
+    """Return the configuration of a run in which an exported policy is a guide that acts alone.
+
+    Args:
+        config: of the run.
+        file: of the exported policy, or its folder.
+
+    Raises:
+        UserError: for a file that cannot be used, or a policy whose guide is outside.
+    """
+    from coil_rl.export import ExportedGuide
+
+    ExportedGuide(file)
+    alone = config.copy()
+    target = {"_target_": "coil_rl.export.ExportedGuide", "file": str(file)}
+    with open_dict(alone):
+        alone.guide["exported"] = target
+        # Degraded advice is not a part of a policy that acts.
+        alone.degrade, alone.action = {}, {}
+        alone.method.name, alone.method.observes, alone.method.transforms = "guide", None, {}
+    return alone
 
 
 def configured(folder: Path, requested: DictConfig) -> DictConfig:
@@ -85,8 +115,6 @@ def _changed(config: DictConfig, resolved: Mapping[str, Any], folder: Path) -> l
 
     The tracks and the disturbances that it gives are set.
     """
-    from coil_rl.errors import UserError
-
     changed = list(OWN)
     for key, text in app.overrides() if HydraConfig.initialized() else ():
         if key == "track":
@@ -108,6 +136,11 @@ def check(config: DictConfig) -> None:
     Otherwise make the folder of the results.
     """
     given = config.run is not None
+    if config.exported is not None and not given:
+        raise UserError(
+            f"exported={config.exported} needs the run whose env it is evaluated in: run=RUN; or "
+            f"name an env and guide=exported guide.exported.file={config.exported}"
+        )
     reason = (
         f"run={config.run} has its own configuration"
         if given

@@ -13,7 +13,16 @@ from hydra.errors import HydraException
 from coil_rl.config.written import quoted
 
 # Keys that hold one folder or file.
-KEYS = ("run", "hydra.run.dir", "run_dir", "init", "guide.learned.run", "proxy.folder")
+KEYS = (
+    "run",
+    "exported",
+    "hydra.run.dir",
+    "run_dir",
+    "init",
+    "guide.learned.run",
+    "guide.exported.file",
+    "proxy.folder",
+)
 
 
 def spelled(argument: str) -> str:

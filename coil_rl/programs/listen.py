@@ -30,6 +30,7 @@ def listen(config: DictConfig) -> None:
 
     from coil_rl.config.build import assemble, build_evaluation
     from coil_rl.config.nodes import build
+    from coil_rl.config.pretrained import run_folder
     from coil_rl.files import write_text
     from coil_rl.listening import WholeEpisode
     from coil_rl.listening.survey import table_by_section
@@ -38,8 +39,9 @@ def listen(config: DictConfig) -> None:
 
     torch.set_num_threads(config.threads)
     folder = Path(config.run_dir)
-    of_run = configured(Path(config.run), config)
-    run = assemble(of_run, Path(config.run))
+    source = run_folder(config.run)
+    of_run = configured(source, config)
+    run = assemble(of_run, source)
     agent = _agent(run)
     node = of_run.evaluation.sections
     sections: WholeEpisode = build(node, "evaluation.sections") if node else WholeEpisode()

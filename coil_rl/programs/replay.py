@@ -77,13 +77,14 @@ def _load_policies(config: DictConfig, env: McapReplayEnv) -> tuple[Runs, Polici
     """Return the runs and all policies by name, guides first."""
     from coil_rl.config.build import assemble, build_guides
     from coil_rl.config.check import check_guide_in_env
+    from coil_rl.config.pretrained import run_folder
     from coil_rl.config.saved import read_config
     from coil_rl.replay.open_loop import RECORDED
 
     guides = build_guides(config) if config.guide else {}
     for name, guide in guides.items():
         check_guide_in_env(guide, env, f"guide.{name}")
-    folders = [Path(run).expanduser() for run in config.runs]
+    folders = [run_folder(run) for run in config.runs]
     _check_unique("runs", folders)
     configs = [read_config(folder, "runs", {"device": config.device}) for folder in folders]
     guide_names = [_topic_name(name) for name in guides]

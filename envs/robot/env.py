@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from coil_rl.envs.cone_track import SeededEnv
 from coil_rl.envs.limits import LARGEST_COUNT, LARGEST_STARTS, check_choice, check_range
+from coil_rl.envs.meanings import of_cones
 from coil_rl.envs.reward import (
     HISTORY,
     TERMS,
@@ -139,6 +140,13 @@ class SimulatedRobotEnv(SeededEnv):
         self._register_state(num_envs)
         declare_specs(self, self._reset())
         self.set_seed(seed)
+
+    @property
+    def meanings(self) -> dict[str, dict[str, str]]:
+        """What the entries mean, see `coil_rl.envs.meanings`."""
+        scale = self.perception.scale
+        sight = self.perception.range_max * scale
+        return of_cones(sight, math.degrees(self.max_steering), scale)
 
     def _register_state(self, num_envs: int) -> None:
         """Register all state that is not in the memory of the boundaries as buffers."""

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from outside_package.install import PROXY, SOURCE
+from learned_runs import ON_POLICY, OPTIONS, STEPS, TINY, learned
+from outside_package.install import SOURCE
 from torchrl.envs import ExplorationType, set_exploration_type
 
 import coil_rl
@@ -14,16 +15,6 @@ from coil_rl.run.parts import TEST
 
 CONF = Path(__file__).parents[3] / "conf"
 METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
-STEPS = 20
-TINY = ["budget.num_envs=2", "budget.steps=16", "evaluation.cases=2", "logger=none"]
-TINY += ["evaluation.curve.num_envs=2", "evaluation.curve.points=1", "evaluation.gif=false"]
-TINY += [f"env.max_steps={STEPS + 4}"]
-REPLAY = ["learner.starts=16", "learner.ratio=1", "learner.batch_size=16"]
-ON_POLICY = ["learner.minibatches=2", "learner.epochs=1", "learner.action_gain=1"]
-FOREST = ["learner.regressor.estimator.n_estimators=3"]
-# What makes a method small, and its policy do something before it has learned anything.
-OPTIONS = dict.fromkeys(("cheq", "ibrl", "policy_decorator", "rlpd", "wsrl", "q_filter"), REPLAY)
-OPTIONS |= {"dagger": FOREST, "oil": FOREST, "guide": [], "coil_anchored": ON_POLICY[:2]}
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
@@ -41,23 +32,6 @@ def cases(methods, slow):
 def package(monkeypatch):
     """Make the user's package importable, as one that is installed."""
     monkeypatch.syspath_prepend(SOURCE)
-
-
-def learned(folder, method, *overrides, guide="thermostat.control:PI", env="thermostat:Room-v0"):
-    """Return the folder of a run that has learned from one batch."""
-    words = [*TINY, *PROXY, *OPTIONS.get(method, ON_POLICY), f"proxy.folder={folder}_proxies"]
-    run = coil_rl.prepare(
-        env,
-        guide=None if method == "ppo" else guide,
-        method=method,
-        frames=32,
-        folder=folder,
-        overrides=[*words, *overrides],
-    )
-    run.begin()
-    if method != "guide":
-        run.learn()
-    return folder
 
 
 def executed(run):

@@ -1,0 +1,154 @@
+"""Make a shipped policy of a finished run: `python -m benchmarks.ship RUN NAME`.
+
+For maintainers. It copies what opening the run needs into `coil_rl/policies/NAME`, without paths of
+this machine, writes the card, and adds the checksums. `python -m benchmarks.ship RUN NAME` replaces
+an older policy of that name.
+"""
+
+import csv
+import hashlib
+import json
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+from coil_rl.files import write_text
+from coil_rl.plain_yaml import read_yaml, yaml_of
+from coil_rl.report.runs import DELIVERY
+from coil_rl.report.table import markdown_table
+from coil_rl.run.delivery import handed_over
+from coil_rl.run.folder import COMMAND, CONFIG
+
+PLACE = Path(__file__).parents[1] / "coil_rl" / "policies"
+EVALUATION = "evaluation.csv"
+COLUMNS = {
+    "driver": ("driver", ""),
+    "actions": ("actions", ""),
+    "reward": ("reward", ".1f"),
+    "completed": ("completed", ".0%"),
+    "lap_time": ("lap time (s)", ".1f"),
+    "smoothness": ("smoothness", ".3f"),
+}
+
+
+def ship(run: Path, name: str) -> Path:
+    """Make a shipped policy, and return its folder.
+
+    Args:
+        run: folder of a finished run.
+        name: of the policy, such as "cone_track/coil".
+
+    Raises:
+        SystemExit: for a file that is too large, and for a path in the configuration.
+    """
+    settings = read_yaml(run / CONFIG)
+    settings["run_dir"], settings["logger"] = "pretrained", None
+    _check_paths(settings, CONFIG)
+    tested = settings["delivery"] == "tested"
+    folder = PLACE / name
+    folder.mkdir(parents=True, exist_ok=True)
+    write_text(folder / CONFIG, yaml_of(settings))
+    files = ["policy_best.pt" if tested else "policy_last.pt", EVALUATION]
+    files += [DELIVERY] if tested else []
+    for file in files:
+        (folder / file).write_bytes((run / file).read_bytes())
+    write_text(folder / CARD, card(run, name, settings))
+    for path in folder.iterdir():
+        if path.stat().st_size > LARGEST:
+            raise SystemExit(f"{path} has more than {LARGEST} bytes")
+    _add_checksums(name, folder)
+    return folder
+
+
+def _check_paths(node: Any, key: str) -> None:
+    """End the program if a configuration names a place on this machine."""
+    if isinstance(node, Mapping):
+        for name, value in node.items():
+            _check_paths(value, f"{key}.{name}")
+    elif isinstance(node, str) and node.startswith(("/", "~")):
+        raise SystemExit(f"{key}={node} is a place on this machine")
+
+
+def _add_checksums(name: str, folder: Path) -> None:
+    path = PLACE / CHECKSUMS
+    known = json.loads(path.read_text()) if path.exists() else {}
+    known[name] = {
+        file.name: hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(folder.iterdir())
+        if file.is_file()
+    }
+    write_text(path, json.dumps(dict(sorted(known.items())), indent=2))
+
+
+def card(run: Path, name: str, settings: Mapping[str, Any]) -> str:
+    """Return the card of a policy.
+
+    Args:
+        run: folder of the run.
+        name: of the policy.
+        settings: configuration of the run.
+    """
+    rows = list(csv.DictReader((run / EVALUATION).read_text().splitlines()))
+    means = [row for row in rows if row["case"] == "mean"]
+    cases = len({row["case"] for row in rows}) - 1
+    columns = {key: column for key, column in COLUMNS.items() if key in means[0]}
+    numbers = [{key: _number(row[key]) for key in columns} for row in means]
+    guides = ", ".join(settings["guide"]) or "none"
+    env = settings["env"]
+    title = env.get("id") or env["_target_"].rpartition(".")[2]
+    versions = json.loads((run / "versions.json").read_text())
+    names = ("python", "torch", "torchrl", "tensordict", "gymnasium")
+    made = ", ".join(f"{each} {versions[each]}" for each in names)
+    seconds = json.loads((run / "training_time.json").read_text())["seconds"]
+    parts = [
+        f"# {name}",
+        f"The policy of one training of `{settings['method']['name']}` in {title}. "
+        f"Guide: {guides}. Its seed is {settings['seed']}, which was chosen before the training: "
+        "it is not the best of several.",
+        f"- {settings['budget']['frames']:,} frames, {seconds:.0f} s on a CPU that others used too",
+        f"- made by `{_command(run)}`",
+        f"- {made}",
+        f"Means of {cases} cases that the training never saw; one episode a case with "
+        f"deterministic actions, sampled ones {settings['evaluation']['repeats']} a case:",
+        markdown_table(numbers, columns),
+    ]
+    sentence = handed_over(run)
+    if sentence:
+        parts.append(sentence)
+    parts.append(
+        f"`coil-evaluate run=pretrained:{name}` repeats the evaluation; in Python "
+        f'`coil_rl.pretrained("{name}").controller()` is the policy with all that belongs to it.'
+    )
+    return "\n\n".join(parts).replace("\n\n- ", "\n- ").replace("several.\n- ", "several.\n\n- ")
+
+
+def _command(run: Path) -> str:
+    """Return the command that made a run, without what says where it was written."""
+    words = shlex.split((run / COMMAND).read_text())
+    kept = [word for word in words if not word.startswith(("hydra.run.dir=", "logger="))]
+    return shlex.join(kept)
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Entry point.
+
+    Args:
+        arguments: the run and the name.
+    """
+    if len(arguments) != 2:
+        raise SystemExit("give the folder of a run and a name: python -m benchmarks.ship RUN NAME")
+    print(ship(Path(arguments[0]), arguments[1]))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

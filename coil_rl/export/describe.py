@@ -1,0 +1,280 @@
+"""What the contract of an exported policy says: gathered from run, env and comparison."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+from typing import Any
+
+import torch
+from gymnasium import spaces
+from torch import Tensor
+from torchrl.data import Bounded
+
+from coil_rl.envs.gymnasium_env import GymnasiumEnv
+from coil_rl.envs.meanings import meaning, meanings_of
+from coil_rl.errors import file_of_a_run
+from coil_rl.export.contract import FORMAT, VERSION, checksum
+from coil_rl.export.files import OPSET
+from coil_rl.export.parity import Parity
+from coil_rl.export.step import ADVICE, Entry, PolicyStep
+from coil_rl.files import LARGEST_TABLE, read_text
+from coil_rl.learners.normaliser import Normaliser
+from coil_rl.run.controller import Controller
+from coil_rl.run.delivery import handed_over
+from coil_rl.run.run import Run
+
+PACKAGES = ("coil-rl", "torch", "onnx", "onnxscript", "onnxruntime")
+AS_GIVEN = "as the env gives it"
+EACH_EPISODE = (
+    "In the first step of each episode every state input is its `first` value; afterwards it is "
+    "what the step before gave as the output beside it."
+)
+
+
+def describe(
+    run: Run,
+    controller: Controller,
+    step: PolicyStep,
+    parity: Parity,
+    contents: Mapping[str, bytes],
+    *,
+    which: str,
+    outside: str | None,
+    meanings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """Return the contract of an exported policy.
+
+    Args:
+        run: of the policy.
+        controller: of the run.
+        step: what was exported.
+        parity: how much the file differs.
+        contents: of the files, by name.
+        which: policy of the run, "handed_over", "last" or "best".
+        outside: why the guides are outside; None if they are not.
+        meanings: of entries, in place of what the env says, see `coil_rl.envs.meanings`.
+    """
+    plant = controller.plant
+    known = meanings_of(plant)
+    for name, value in meanings.items():
+        known[name] = known.get(name, {}) | meaning(name, value)
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "files": {
+            name: {"sha256": checksum(content), "bytes": len(content)}
+            for name, content in contents.items()
+        },
+        "policy": _policy(run, which),
+        "env": {"title": title_of(plant), "control_rate": _rate(plant)},
+        "batch": "any number of rows; the first dimension of every input and output",
+        "inputs": [_input(entry, plant, step, known) for entry in step.inputs],
+        "outputs": [_action(plant, step, known)],
+        "state": [_state(entry) for entry in step.state],
+        "reset": EACH_EPISODE if step.state else "The policy remembers nothing between two steps.",
+        "guide": _guide(step, outside),
+        "inside": _inside(step),
+        "parity": {
+            "observations": parity.observations,
+            "largest_difference": parity.largest,
+            "limit": parity.limit,
+            "observations_beyond_the_limit": parity.beyond,
+            "unit": "normalised actions: 1 is half of the range of a number; another choice is 1",
+            "cpu_milliseconds_per_call": round(parity.milliseconds, 3),
+            "cpu_milliseconds_per_call_of_torch": round(parity.torch_milliseconds, 3),
+        },
+        "results": results_of(run),
+        "made_with": {name: metadata.version(name) for name in PACKAGES} | {"opset": OPSET},
+    }
+
+
+def title_of(plant: Any) -> str:
+    """Return the name of an env, for people.
+
+    Args:
+        plant: without transforms.
+    """
+    if isinstance(plant, GymnasiumEnv):
+        return plant.rows[0].gate.name
+    return type(plant).__name__
+
+
+def _policy(run: Run, which: str) -> dict[str, Any]:
+    sentence = handed_over(run.folder) if run.file_of(which) == "best" else None
+    method = run.settings.get("method") or {}
+    return {
+        "label": run.label,
+        "method": method.get("name", run.label),
+        "seed": run.seed,
+        "frames": run.budget.frames,
+        "which": which,
+        "chosen": sentence or f"the {run.file_of(which)} policy of the training",
+        "actions": "deterministic",
+    }
+
+
+def _rate(plant: Any) -> dict[str, Any] | None:
+    rate = float(getattr(plant, "rate", math.nan))
+    return None if math.isnan(rate) else {"value": rate, "unit": "steps per second"}
+
+
+def _numbers(values: Tensor) -> Any:
+    """Return numbers as nested lists, None for those that are not finite."""
+    if values.ndim:
+        return [_numbers(each) for each in values]
+    number = values.item()
+    return number if math.isfinite(number) else None
+
+
+def _bounds(spec: Any, batch_dims: int) -> dict[str, Any] | None:
+    if not isinstance(spec, Bounded):
+        return None
+    first = (0,) * batch_dims
+    return {"low": _numbers(spec.space.low[first]), "high": _numbers(spec.space.high[first])}
+
+
+def _input(
+    entry: Entry, plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]
+) -> dict[str, Any]:
+    """Return what an input is."""
+    key = [entry.key] if isinstance(entry.key, str) else list(entry.key)
+    about: dict[str, Any] = {"name": entry.name, "key": key, "shape": list(entry.shape)}
+    about["dtype"] = _name(entry)
+    if entry.key == ADVICE:
+        action = known.get("action", {})
+        numbers = _numbering(step) if step.space.choices else {}
+        return about | {
+            "unit": action.get("unit", AS_GIVEN) if step.space.continuous else "number of a choice",
+            "meaning": "the actions of the guides, in the unit and numbering of the env, in this "
+            f"order: {', '.join(step.guides)}",
+            **numbers,
+        }
+    spec = plant.observation_spec[entry.key]
+    meant = {"unit": AS_GIVEN, "meaning": AS_GIVEN} | dict(known.get(entry.name, {}))
+    about |= {"bounds": _bounds(spec, plant.batch_dims)}
+    if isinstance(plant, GymnasiumEnv):
+        about |= _source(plant, key)
+    return about | meant
+
+
+def _source(plant: GymnasiumEnv, key: list[str]) -> dict[str, Any]:
+    """Return where an input is in the observation of a Gymnasium env."""
+    for entry in plant.entries:
+        if list(entry.key) == key:
+            start = torch.as_tensor(entry.start).reshape(-1)
+            start = start.expand(len(entry.choices)) if entry.choices else start[:0]
+            source = {"path": list(entry.path), "choices": entry.choices, "start": start.tolist()}
+            about: dict[str, Any] = {"from": source}
+            if entry.choices:
+                about["encoding"] = "one-hot vectors of the choices side by side"
+            elif isinstance(entry.space, spaces.Box) and entry.space.is_bounded():
+                low, high = (
+                    torch.as_tensor(bound) for bound in (entry.space.low, entry.space.high)
+                )
+                about["bounds"] = {"low": _numbers(low), "high": _numbers(high)}
+            return about
+    return {}
+
+
+def _name(entry: Entry) -> str:
+    return str(entry.dtype).removeprefix("torch.")
+
+
+def _action(plant: Any, step: PolicyStep, known: Mapping[str, Mapping[str, str]]) -> dict[str, Any]:
+    """Return what the output is."""
+    spec = plant.full_action_spec[plant.action_key]
+    shape = list(spec.shape[plant.batch_dims :])
+    dtype = str(spec.dtype).removeprefix("torch.")
+    meant = {"unit": AS_GIVEN, "meaning": "the action that the env executes"}
+    if step.space.choices:
+        meant["unit"] = "number of a choice"
+    space = {"shape": shape, "dtype": dtype}
+    if isinstance(plant, GymnasiumEnv):
+        space = {"shape": list(plant.space.shape or ()), "dtype": str(plant.space.dtype)}
+    numbers = (
+        _numbering(step) if step.space.choices else {"bounds": _bounds(spec, plant.batch_dims)}
+    )
+    meant |= known.get("action", {})
+    return {"name": "action", "shape": shape, "dtype": dtype, **meant, **numbers, "space": space}
+
+
+def _numbering(step: PolicyStep) -> dict[str, Any]:
+    """Return the numbers of choices, and the lowest number of each."""
+    first = step.space.first
+    lowest = [0] * len(step.space.choices) if first is None else first.reshape(-1).tolist()
+    return {"choices": step.space.choices, "lowest": lowest}
+
+
+def _state(entry: Entry) -> dict[str, Any]:
+    """Return what a state input is; a first value that is one number is written as one."""
+    first = torch.zeros(()) if entry.first is None else entry.first
+    one = bool((first == first.reshape(-1)[0]).all())
+    return {
+        "input": f"state.{entry.name}",
+        "output": f"next.{entry.name}",
+        "shape": list(entry.shape),
+        "dtype": _name(entry),
+        "first": first.reshape(-1)[0].item() if one else first.tolist(),
+    }
+
+
+def _guide(step: PolicyStep, outside: str | None) -> dict[str, Any]:
+    if not step.guides:
+        return {"place": "absent"}
+    if outside is None:
+        return {"place": "inside", "names": step.guides}
+    return {"place": "outside", "names": step.guides, "key": ADVICE, "reason": outside}
+
+
+def _inside(step: PolicyStep) -> list[str]:
+    """Return sentences that say what the file does, which nobody must do again."""
+    sentences = []
+    for module in step.modules():
+        if isinstance(module, Normaliser):
+            names = [key if isinstance(key, str) else ".".join(key) for key in module.in_keys]
+            sentences.append(f"the normalisation of {', '.join(names)}: give them as they are")
+    units = step.space.units
+    if units is not None and not units.identity:
+        sentences.append("the scale of the action: the output is in the unit of the env")
+    if step.space.first is not None:
+        sentences.append("the lowest numbers of the choices: the output is what the env takes")
+    if step.guides and ADVICE not in [entry.key for entry in step.inputs]:
+        sentences.append(f"the guides: {', '.join(step.guides)}")
+    if step.state:
+        sentences.append("the memory, which goes in and out as state")
+    return sentences
+
+
+def results_of(run: Run) -> list[dict[str, Any]]:
+    """Return the means of the evaluation of a run, by driver; empty if it was not evaluated.
+
+    Args:
+        run: the run.
+    """
+    path = run.folder / "evaluation.csv"
+    if not path.is_file():
+        return []
+    with file_of_a_run(path, "remove the file, and evaluate again"):
+        text = read_text(path, LARGEST_TABLE)
+        rows = list(csv.DictReader(io.StringIO(text, newline="")))
+        means = [row for row in rows if row["case"] == "mean"]
+        cases = len({row["case"] for row in rows} - {"mean"})
+        return [_result(row, cases) for row in means]
+
+
+def _result(row: Mapping[str, str], cases: int) -> dict[str, Any]:
+    names: Sequence[str] = ("driver", "advice", "actions")
+    result: dict[str, Any] = {name: row[name] for name in names} | {"cases": cases}
+    for name, text in row.items():
+        if name in (*names, "case"):
+            continue
+        try:
+            number = float(text)
+        except ValueError:
+            continue
+        result[name] = number if math.isfinite(number) else None
+    return result

@@ -1,0 +1,154 @@
+"""A function of tensors as files of ONNX and of torch.export, without traces of this machine."""
+
+from __future__ import annotations
+
+import io
+import logging
+import textwrap
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from typing import Any
+
+import torch
+from torch.export import Dim, ExportedProgram
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from coil_rl.export.step import NotExportableError, PolicyStep
+
+OPSET = 20
+ROWS = 3  # of the example with which a step is traced
+TRACES = ("stack_trace", "nn_module_stack", "source_fn_stack", "from_node", "torch_fn", "custom")
+
+
+def names_of(step: PolicyStep) -> tuple[list[str], list[str]]:
+    """Return the names of the inputs and of the outputs of the files.
+
+    Args:
+        step: the function.
+    """
+    inputs = [entry.name for entry in step.inputs]
+    inputs += [f"state.{entry.name}" for entry in step.state]
+    return inputs, ["action", *(f"next.{entry.name}" for entry in step.state)]
+
+
+def traced(step: PolicyStep) -> ExportedProgram:
+    """Return a step as the program of torch.export, for any number of rows.
+
+    Args:
+        step: the function.
+
+    Raises:
+        NotExportableError: for a step that is no function of tensors.
+    """
+    entries = [*step.inputs, *step.state]
+    if not entries:
+        raise NotExportableError("it reads nothing, so there is nothing to export")
+    batch = Dim("batch", min=1)
+    examples = tuple(entry.rows(ROWS) for entry in entries)
+    shapes = {"tensors": tuple({0: batch} for _ in entries)}
+    try:
+        with _quiet(), torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            program = torch.export.export(step, examples, dynamic_shapes=shapes)
+    except NotExportableError:
+        raise
+    except Exception as error:  # whatever the modules raise that see no real numbers
+        raise NotExportableError(_reason(error)) from error
+    for node in program.graph.nodes:
+        for name in TRACES:
+            node.meta.pop(name, None)
+    return program
+
+
+def as_torch(program: ExportedProgram) -> bytes:
+    """Return the content of a file that `torch.export.load` reads.
+
+    Args:
+        program: the function.
+    """
+    file = io.BytesIO()
+    with _quiet():
+        torch.export.save(program, file)
+    return file.getvalue()
+
+
+def as_onnx(program: ExportedProgram, step: PolicyStep) -> bytes:
+    """Return the content of a file of ONNX.
+
+    Args:
+        program: the function.
+        step: the same, for the names.
+
+    Raises:
+        NotExportableError: for an operation that ONNX does not have.
+    """
+    inputs, outputs = names_of(step)
+    try:
+        with _quiet():
+            written = torch.onnx.export(
+                program,
+                (),
+                dynamo=True,
+                opset_version=OPSET,
+                input_names=inputs,
+                output_names=outputs,
+                verbose=False,
+                # Its search for patterns takes a minute for a guide; see `_smaller`.
+                optimize=False,
+            )
+    except Exception as error:  # of many classes, one for each step of the translation
+        raise NotExportableError(_reason(error)) from error
+    if written is None:
+        raise NotExportableError("torch.onnx gave no program")
+    return _smaller(written.model)
+
+
+def _smaller(model: Any) -> bytes:
+    """Return the content of a file: constants folded, unused parts and texts left out.
+
+    Args:
+        model: as `onnx_ir` has it.
+    """
+    import onnx_ir
+    from onnx_ir.passes import common
+    from onnxscript.optimizer import fold_constants_ir
+
+    fold_constants_ir(model)
+    for each in (
+        common.CommonSubexpressionEliminationPass(),
+        common.RemoveUnusedNodesPass(),
+        common.LiftConstantsToInitializersPass(lift_all_constants=True, size_limit=0),
+        common.DeduplicateInitializersPass(),
+        common.RemoveUnusedNodesPass(),
+        common.ClearMetadataAndDocStringPass(),
+    ):
+        each(model)
+    proto = onnx_ir.serde.serialize_model(model)
+    # Stack traces with the paths of this machine are there, too.
+    del proto.metadata_props[:], proto.graph.metadata_props[:], proto.graph.value_info[:]
+    for part in (*proto.graph.node, *proto.graph.input, *proto.graph.output):
+        del part.metadata_props[:]
+    for part in proto.graph.initializer:
+        del part.metadata_props[:]
+    content: bytes = proto.SerializeToString()
+    return content
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence what the libraries say about themselves in the block."""
+    disabled = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            with redirect_stderr(io.StringIO()):
+                yield
+    finally:
+        logging.disable(disabled)
+
+
+def _reason(error: BaseException) -> str:
+    """Return in a few words what a library says about a function that it cannot write."""
+    lines = str(error).strip().splitlines() or [""]
+    return textwrap.shorten(f"{type(error).__name__}: {lines[0]}", 200, placeholder=" ...")

@@ -1,0 +1,136 @@
+"""An exported policy as a guide."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import NestedKey, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from coil_rl.errors import UserError
+from coil_rl.export.policy import ADVICE, ExportedPolicy
+from coil_rl.transforms.action_space import ActionSpace
+
+
+class ExportedGuide(TensorDictModuleBase):
+    """Deterministic action of a policy in a file, for all rows at once.
+
+    What the policy remembers is the memory of the guide, as entries of the data.
+
+    Args:
+        file: `policy.onnx` of `coil-export`, or its folder.
+        threads: of onnxruntime.
+
+    Raises:
+        UserError: for a file that cannot be used, see `ExportedPolicy`, and for one whose own
+            guide is outside; in an env for one of other entries or another action.
+    """
+
+    def __init__(self, file: str | os.PathLike[str], threads: int = 1) -> None:
+        super().__init__()
+        self.exported = ExportedPolicy(os.fspath(file), threads)
+        contract = self.exported.contract
+        names = [entry["name"] for entry in contract["inputs"]]
+        if ADVICE in names:
+            raise UserError(
+                f"{self.exported.file} needs the action of its own guide, which is outside "
+                f"({contract['guide']['reason']}); take the run itself: guide=learned "
+                "guide.learned.run=RUN"
+            )
+        self.read: list[NestedKey] = [_key(entry["key"]) for entry in contract["inputs"]]
+        self.memory = {f"exported_{entry['input']}": entry for entry in contract["state"]}
+        self.in_keys = [*self.read, *self.memory]
+        self.out_keys: list[NestedKey] = ["action", *(("next", name) for name in self.memory)]
+        self.pure = not self.memory
+        self.fits = False
+
+    def in_space(self, space: ActionSpace) -> None:
+        """Check the action of an env.
+
+        Args:
+            space: of the actions of the env.
+
+        Raises:
+            UserError: if the policy acts in another one.
+        """
+        action = self.exported.contract["outputs"][0]
+        choices = action.get("choices")
+        same = choices == space.choices if choices else list(space.event) == action["shape"]
+        if same and not choices and space.bounds is not None:
+            bounds = action["bounds"] or {}
+            same = all(
+                _equal(bounds.get(side), bound)
+                for side, bound in zip(("low", "high"), space.bounds, strict=True)
+            )
+        if not same:
+            raise self._unfit("its action has other numbers or bounds")
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the action, and what is remembered."""
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        inputs = {}
+        for entry, key in zip(self.exported.contract["inputs"], self.read, strict=True):
+            if list(flat[key].shape[1:]) != entry["shape"]:
+                raise self._unfit(f"{entry['name']} has the shape {list(flat[key].shape[1:])}")
+            inputs[entry["name"]] = _array(flat[key], entry["dtype"])
+        for name, entry in self.memory.items():
+            inputs[entry["input"]] = _array(flat[name], entry["dtype"])
+        for key, value in zip(self.out_keys, self.exported.session(inputs), strict=True):
+            written = torch.from_numpy(value).to(flat.device or "cpu")
+            tensordict.set(key, written.reshape(*tensordict.batch_size, *written.shape[1:]))
+        return tensordict
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """Declare what is remembered."""
+        specs, first = {}, {}
+        for name, entry in self.memory.items():
+            value = np.full(entry["shape"], entry["first"], entry["dtype"])
+            specs[name] = Unbounded(entry["shape"], dtype=torch.from_numpy(value).dtype)
+            one = isinstance(entry["first"], (bool, int, float))
+            first[name] = entry["first"] if one else _Constant(torch.from_numpy(value))
+        return TensorDictPrimer(specs, default_value=first, expand_specs=True)
+
+    def _unfit(self, problem: str) -> UserError:
+        title = self.exported.contract["env"]["title"]
+        return UserError(
+            f"{self.exported.file} is a policy for {title}, which this env is not: {problem}; give "
+            "the env that its contract.json names"
+        )
+
+
+class _Constant:
+    """A first value that is not one number.
+
+    Args:
+        value: of a row.
+    """
+
+    def __init__(self, value: Tensor) -> None:
+        self.value = value
+
+    def __call__(self) -> Tensor:
+        return self.value
+
+
+def _key(parts: list[str]) -> NestedKey:
+    return parts[0] if len(parts) == 1 else tuple(parts)
+
+
+def _array(tensor: Tensor, dtype: str) -> NDArray[Any]:
+    return tensor.cpu().numpy().astype(dtype)
+
+
+def _equal(numbers: Any, bound: Tensor) -> bool:
+    """Return whether bounds of a contract are those of a space; None stands for infinite ones."""
+    if numbers is None:
+        return not bool(bound.isfinite().any())
+    given = np.array(numbers, dtype=float)  # None becomes NaN
+    found = torch.where(bound.isfinite(), bound, torch.nan).cpu().double().numpy()
+    return given.shape == found.shape and bool(np.allclose(given, found, equal_nan=True))

@@ -1,0 +1,198 @@
+"""Comparison of an exported policy with the controller, observation by observation.
+
+Differences are in normalised actions, so that 1 is half of the range of a number; another choice
+counts as 1. They may be at most `LIMIT`, with a guide inside `WITH_GUIDE`. A guide may amplify the
+rounding of what it reads: the spline through two midpoints that nearly coincide does so by a
+thousand. There a difference may be larger by what a change of the inputs by `ROUNDING` of their
+value, which no sensor resolves, does to the controller's own action.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torchrl.envs import ExplorationType, set_exploration_type
+
+from coil_rl.export.files import names_of
+from coil_rl.export.recording import Recording
+from coil_rl.export.session import Session
+from coil_rl.export.step import NotExportableError, PolicyStep
+
+LIMIT, WITH_GUIDE = 1e-5, 2e-5
+ROUNDING = 2e-6  # of a number
+CHANGES = 16  # random changes by this much
+
+
+@dataclass(frozen=True)
+class Parity:
+    """How much an exported policy differs from the controller.
+
+    Attributes:
+        observations: number of compared steps.
+        largest: largest difference, in normalised actions.
+        limit: allowed difference.
+        beyond: number of steps beyond the limit, in each of which rounded inputs do as much.
+        milliseconds: CPU time of a call of the file.
+        torch_milliseconds: CPU time of a call of the controller.
+    """
+
+    observations: int
+    largest: float
+    limit: float
+    beyond: int
+    milliseconds: float
+    torch_milliseconds: float
+
+    def __str__(self) -> str:
+        beyond = ""
+        if self.beyond:
+            beyond = (
+                f"; beyond it at {self.beyond}, where a change of the inputs by 2e-6 does as much"
+            )
+        return (
+            f"the file differs from torch by at most {self.largest:.1e} on {self.observations:,} "
+            f"observations (limit {self.limit:.0e}{beyond}); {self.milliseconds:.2f} ms of CPU a "
+            f"call (torch {self.torch_milliseconds:.2f})"
+        )
+
+
+Rows = list[list[Tensor]]  # by step, the inputs and the state
+
+
+@torch.no_grad()
+def expected(step: PolicyStep, recording: Recording, limit: float) -> Rows:
+    """Return the inputs and the state of each recorded step.
+
+    Args:
+        step: the function.
+        recording: of the controller.
+        limit: allowed difference.
+
+    Raises:
+        NotExportableError: if the function is not what the controller does.
+    """
+    rows: Rows = []
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        state: list[Tensor] = []
+        for number in range(len(recording)):
+            if recording.first[number]:
+                state = [entry.rows(1) for entry in step.state]
+            inputs = [recording.value(number, entry.key) for entry in step.inputs]
+            rows.append([*inputs, *state])
+            action, *state = step(*rows[-1])
+            own = step.executed(recording.actions[number])
+            difference = float(_difference(step, action, own))
+            if not difference <= limit:
+                raise NotExportableError(
+                    f"its action depends on more than its inputs and its memory: it differs by "
+                    f"{difference:.1e} at observation {number + 1}"
+                )
+    return rows
+
+
+def compare(
+    step: PolicyStep,
+    content: bytes,
+    recording: Recording,
+    rows: Rows,
+    limit: float,
+    tick: Callable[[], Any] = lambda: None,
+) -> Parity:
+    """Return how much a file differs from the controller.
+
+    Args:
+        step: the function that the file holds.
+        content: of the file.
+        recording: of the controller.
+        rows: of `expected`.
+        limit: allowed difference.
+        tick: called after every step.
+
+    Raises:
+        NotExportableError: if it differs by too much.
+    """
+    session = Session(content, names_of(step)[1])
+    own = step.executed(torch.cat(recording.actions))
+    before = time.process_time()
+    one_by_one = _called(step, session, recording, tick)
+    seconds = time.process_time() - before
+    # All rows at once, as a batch of envs calls it.
+    batch = dict(zip(names_of(step)[0], (each.numpy() for each in _columns(rows)), strict=True))
+    at_once = torch.from_numpy(session(batch)[0])
+    differences = torch.maximum(_difference(step, one_by_one, own), _difference(step, at_once, own))
+    allowed = torch.full_like(differences, limit)
+    beyond = (differences > limit).nonzero().flatten().tolist()
+    if beyond:
+        allowed[beyond] += _rounding(step, [rows[number] for number in beyond])
+    worst = int((differences - allowed).argmax())
+    if not bool((differences <= allowed).all()):
+        raise NotExportableError(
+            f"the file differs from torch by {float(differences[worst]):.1e} at observation "
+            f"{worst + 1}, but must by at most {float(allowed[worst]):.1e}"
+        )
+    return Parity(
+        len(recording),
+        float(differences.max()),
+        limit,
+        len(beyond),
+        1000 * seconds / len(recording),
+        1000 * recording.seconds / len(recording),
+    )
+
+
+def _called(
+    step: PolicyStep, session: Session, recording: Recording, tick: Callable[[], Any]
+) -> Tensor:
+    """Return the actions of a file that is called step by step, [N, *A]."""
+    actions, state = list[Tensor](), dict[str, Any]()
+    for number in range(len(recording)):
+        if recording.first[number]:
+            state = {f"state.{entry.name}": entry.rows(1).numpy() for entry in step.state}
+        inputs = {entry.name: recording.value(number, entry.key).numpy() for entry in step.inputs}
+        action, *after = session(inputs | state)
+        state = dict(zip(state, after, strict=True))
+        actions.append(torch.from_numpy(action))
+        tick()
+    return torch.cat(actions)
+
+
+def _columns(rows: Rows) -> list[Tensor]:
+    """Return the inputs and the state of all steps, [N, ...] each."""
+    return [torch.cat(column) for column in zip(*rows, strict=True)]
+
+
+@torch.no_grad()
+def _rounding(step: PolicyStep, rows: Rows) -> Tensor:
+    """Return how much the action of each row changes with the rounding of the inputs, [N]."""
+    tensors = _columns(rows)
+    generator = torch.Generator().manual_seed(0)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        own = step(*tensors)[0]
+        largest = torch.zeros(len(rows))
+        for _ in range(CHANGES):
+            changed = step(*(_changed(each, generator) for each in tensors))[0]
+            largest = torch.maximum(largest, _difference(step, changed, own))
+    return largest
+
+
+def _changed(numbers: Tensor, generator: torch.Generator) -> Tensor:
+    """Return numbers that are changed by `ROUNDING` up or down."""
+    if not numbers.is_floating_point():
+        return numbers
+    up = torch.rand(numbers.shape, generator=generator) < 0.5
+    return numbers * torch.where(up, 1 + ROUNDING, 1 - ROUNDING).to(numbers.dtype)
+
+
+def _difference(step: PolicyStep, actions: Tensor, others: Tensor) -> Tensor:
+    """Return the largest difference in each row of two batches of actions, [B]."""
+    units = step.space.units
+    if units is None:
+        return (actions != others).reshape(len(actions), -1).any(-1).float()
+    apart = (units.normalise(actions) - units.normalise(others)).abs()
+    return torch.nan_to_num(apart.flatten(1).amax(-1), nan=np.inf).float()

@@ -1,0 +1,195 @@
+"""An exported policy as a controller: onnxruntime and the contract, without PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from coil_rl.export.contract import place_of, read_contract
+from coil_rl.export.session import Session
+
+ADVICE = "guide_action"
+
+
+class ExportedPolicy:
+    """A policy in a file, with the methods of `Controller`.
+
+    Actions are deterministic. Call `reset()` at the start of each episode.
+
+    Args:
+        file: `policy.onnx` of `coil-export`, or its folder.
+        threads: of onnxruntime.
+
+    Attributes:
+        contract: what the numbers mean, see docs/export.md.
+
+    Raises:
+        UserError: without onnxruntime, for a file that is missing or damaged, and for one that is
+            not the one of its contract.
+
+    Example:
+        >>> from coil_rl.export import ExportedPolicy
+        >>> policy = ExportedPolicy("exported")  # doctest: +SKIP
+        >>> policy.reset()  # doctest: +SKIP
+        >>> action = policy.act(observation)  # doctest: +SKIP
+    """
+
+    def __init__(self, file: str | Path, threads: int = 1) -> None:
+        self.file = place_of(file)
+        self.contract, content = read_contract(self.file)
+        names = ["action", *(entry["output"] for entry in self.contract["state"])]
+        self.session = Session(content, names, threads)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode: forget everything."""
+        self.state = self.first_state(1)
+
+    def first_state(self, rows: int) -> dict[str, NDArray[Any]]:
+        """Return what the policy remembers at the start of an episode, by input.
+
+        Args:
+            rows: number of rows, B.
+        """
+        state = {}
+        for entry in self.contract["state"]:
+            shape = (rows, *entry["shape"])
+            state[entry["input"]] = np.full(shape, entry["first"], entry["dtype"])
+        return state
+
+    def act(self, observation: Any, guide_action: Any = None) -> Any:
+        """Return the action for an observation.
+
+        Args:
+            observation: as the env gives it: for a Gymnasium env what its `reset` and `step`
+                return; for a TorchRL env its entries as a mapping, or the value of the only entry.
+            guide_action: what the guides advise in the unit and numbering of the env, where the
+                contract says that they are outside.
+
+        Returns:
+            The action in the unit and numbering of the env: for a Gymnasium env what its `step`
+            takes; for a TorchRL env an array.
+
+        Raises:
+            ValueError: for an observation that does not fit the contract.
+        """
+        inputs = {}
+        for entry in self.contract["inputs"]:
+            if entry["name"] == ADVICE:
+                value = _advice(observation, guide_action)
+            else:
+                value = _found(observation, entry, len(self.contract["inputs"]))
+            inputs[entry["name"]] = _row(value, entry)
+        action = self.act_on(inputs)[0]
+        space = self.contract["outputs"][0]["space"]
+        return action.reshape(space["shape"]).astype(space["dtype"])[()]
+
+    def act_on(self, inputs: Mapping[str, NDArray[Any]]) -> NDArray[Any]:
+        """Return the action for the inputs of the contract.
+
+        Args:
+            inputs: by name, [1, ...] each.
+        """
+        action, *state = self.session({**inputs, **self.state})
+        self.state = dict(zip(self.state, state, strict=True))
+        return action
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return what the next actions of the episode depend on, besides their observations."""
+        return {name: value.tolist() for name, value in self.state.items()}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restore what `state_dict` returned.
+
+        Raises:
+            ValueError: for the state of another policy.
+        """
+        first = self.first_state(1)
+        given = {name: np.shape(value) for name, value in state.items()}
+        if given != {name: value.shape for name, value in first.items()}:
+            names = ", ".join(first) or "nothing"
+            raise ValueError(
+                f"the state has {', '.join(state) or 'nothing'}, but this policy remembers "
+                f"{names}; restore the state of the same policy"
+            )
+        self.state = {name: np.asarray(state[name], first[name].dtype) for name in first}
+
+
+def _advice(observation: Any, guide_action: Any) -> Any:
+    if guide_action is None and isinstance(observation, Mapping):
+        guide_action = observation.get(ADVICE)
+    if guide_action is None:
+        raise ValueError(
+            "the guide of this policy is outside: give its action as guide_action, in the unit and "
+            "numbering of the env"
+        )
+    return guide_action
+
+
+def _found(observation: Any, entry: Mapping[str, Any], inputs: int) -> Any:
+    """Return the part of an observation that an input of the contract stands for.
+
+    Args:
+        observation: of the env.
+        entry: of the contract.
+        inputs: number of inputs.
+    """
+    source, path = entry.get("from"), entry["key"]
+    if source is not None:
+        # The entry itself may be given too, as by a guide of another run.
+        named = isinstance(observation, Mapping) and entry["key"][0] in observation
+        if source["path"] or not named:
+            path = source["path"]
+    elif inputs == 1 and not isinstance(observation, Mapping):
+        path = []
+    for part in path:
+        try:
+            observation = observation[part]
+        except (IndexError, KeyError, TypeError) as error:
+            raise ValueError(
+                f"the observation lacks {entry['name']}; the policy reads it, see its contract.json"
+            ) from error
+    if source is not None and source["choices"]:
+        return _one_hot(observation, entry)
+    return observation
+
+
+def _one_hot(value: Any, entry: Mapping[str, Any]) -> Any:
+    """Return choices as one-hot vectors side by side, unless they are that already."""
+    source = entry["from"]
+    sizes, given = np.array(source["choices"]), np.asarray(value)
+    if given.size == sizes.sum() and given.size != sizes.size:
+        return given
+    chosen = np.ravel(given) - np.array(source["start"])
+    if chosen.shape != sizes.shape or (chosen < 0).any() or (chosen >= sizes).any():
+        raise ValueError(
+            f"{entry['name']} is {np.ravel(given).tolist()}, which are no choices of "
+            f"{sizes.tolist()} from {source['start']} on"
+        )
+    vector = np.zeros(sizes.sum())
+    vector[chosen.astype(np.int64) + np.cumsum([0, *sizes[:-1]])] = 1
+    return vector
+
+
+def _row(value: Any, entry: Mapping[str, Any]) -> NDArray[Any]:
+    """Return the value of an input with the batch dimension, [1, ...]."""
+    shape = tuple(entry["shape"])
+    given = np.asarray(value)
+    if given.size != np.prod(shape, dtype=int) or not _fits(given.shape, shape):
+        raise ValueError(
+            f"{entry['name']} has the shape {list(given.shape)}, but must have {list(shape)}"
+        )
+    if given.dtype.kind not in "fiub":
+        raise ValueError(f"{entry['name']} holds {given.dtype}, but must hold numbers")
+    if not np.isfinite(given).all():
+        raise ValueError(f"{entry['name']} holds a number that is not finite")
+    return given.astype(entry["dtype"]).reshape(1, *shape)
+
+
+def _fits(given: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Return whether two shapes are the same but for dimensions of 1."""
+    return [n for n in given if n != 1] == [n for n in shape if n != 1]

@@ -1,0 +1,163 @@
+"""Observations of an env with the actions of a controller, to compare an exported policy with.
+
+They come from the env itself, driven by the controller, so that they are what a machine will see:
+random numbers would never be two boundaries of a track. In every second episode some actions are
+drawn, so that the observations are not only those of a perfect drive.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDictBase
+from torch import Tensor
+
+from coil_rl.export.step import ADVICE
+from coil_rl.run.controller import Controller
+from coil_rl.run.parts import TRAIN, transformed
+from coil_rl.run.run import Run
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.action_space import ActionSpace, random_action
+
+LONGEST = 250  # steps of an episode
+DRAWN = 0.3  # share of drawn actions in every second episode
+
+
+@dataclass
+class Recording:
+    """Steps of a controller.
+
+    Attributes:
+        entries: of the env, [1] each.
+        first: whether the step begins an episode.
+        actions: of the controller, as entries of the env, [1, *A] each.
+        advice: actions of its guides, [1, n_guides, ...] each, see `PolicyStep`; empty without.
+        seconds: that the controller took.
+    """
+
+    entries: list[TensorDictBase] = field(default_factory=list)
+    first: list[bool] = field(default_factory=list)
+    actions: list[Tensor] = field(default_factory=list)
+    advice: list[Tensor] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def __len__(self) -> int:
+        return len(self.entries)
+
+    def value(self, step: int, key: NestedKey) -> Tensor:
+        """Return what an input is in a step, [1, ...].
+
+        Args:
+            step: number of the step.
+            key: of an entry, or `guide_action`.
+        """
+        value: Tensor = self.advice[step] if key == ADVICE else self.entries[step][key]
+        return value
+
+
+@torch.no_grad()
+def record(
+    run: Run,
+    controller: Controller,
+    count: int,
+    seed: int = 0,
+    tick: Callable[[], Any] = lambda: None,
+) -> Recording:
+    """Drive the env of a run by a controller, and return what was seen and done.
+
+    Args:
+        run: has the env.
+        controller: of the run.
+        count: number of steps.
+        seed: of the env and of the drawn actions.
+        tick: called after every step.
+    """
+    env = transformed(run.make_env.bare(1, TRAIN, None), [], "env").eval()
+    env.set_seed(seed)
+    keys = [*env.base_env.observation_spec.keys()]
+    recording, heard = Recording(), _Heard(controller)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        episode, steps = -1, 0
+        carrier = None
+        while len(recording) < count:
+            if carrier is None:
+                episode, steps, carrier = episode + 1, 0, env.reset()
+                controller.reset()
+            entries = carrier.select(*keys)
+            copied, before = entries.clone(), time.process_time()
+            action = controller.act_on(copied)
+            recording.seconds += time.process_time() - before
+            recording.entries.append(entries)
+            recording.first.append(steps == 0)
+            recording.actions.append(action.clone())
+            if heard.guides is not None:
+                recording.advice.append(heard.advice())
+            executed = carrier.set(env.action_key, action)
+            if episode % 2 and float(torch.rand(())) < DRAWN:
+                executed = random_action(env, carrier)
+            step = env.step(executed)
+            carrier, steps = env.step_mdp(step), steps + 1
+            if steps == LONGEST or bool(step["next", "done"].any()):
+                carrier = None
+            tick()
+    heard.close()
+    return recording
+
+
+class _Heard:
+    """Listens to the guides of a controller.
+
+    Args:
+        controller: the controller.
+    """
+
+    def __init__(self, controller: Controller) -> None:
+        parts = controller.env.transform.modules()
+        self.guides = next((part for part in parts if isinstance(part, GuideActions)), None)
+        self.actions: dict[str, Tensor] = {}
+        self.hooks: list[Any] = []
+        if self.guides is None:
+            return
+        for name, guide in self.guides.guides.guides.items():
+            self.hooks.append(guide.register_forward_hook(self._listener(name)))
+
+    def _listener(self, name: str) -> Callable[..., None]:
+        def listen(module: Any, arguments: Any, written: TensorDictBase) -> None:
+            if self.guides is not None:
+                self.actions[name] = written[self.guides.action_key].clone()
+
+        return listen
+
+    def advice(self) -> Tensor:
+        """Return the last actions of all guides in the unit and numbering of the env."""
+        if self.guides is None:
+            return torch.empty(0)
+        space: ActionSpace = self.guides.guide_space
+        rows = []
+        for name in self.guides.names:
+            action = self.actions[name]
+            rows.append(numbered(space, space.advice(action, action.shape[:1])))
+        return torch.stack(rows, -2)
+
+    def close(self) -> None:
+        """Listen no longer."""
+        for hook in self.hooks:
+            hook.remove()
+
+
+def numbered(space: ActionSpace, vectors: Tensor) -> Tensor:
+    """Return vectors [..., A] in the numbering of the env: of choices [..., n] whole numbers.
+
+    Args:
+        space: of the actions.
+        vectors: as `ActionSpace` has them.
+    """
+    if not space.choices:
+        return vectors
+    chosen = torch.stack([part.argmax(-1) for part in vectors.split(space.choices, -1)], -1)
+    return chosen if space.first is None else chosen + space.first.to(chosen)

@@ -1,0 +1,184 @@
+"""Export of the policy of a run: recorded, traced, written, compared, described."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from coil_rl.envs.limits import check_range
+from coil_rl.errors import UserError
+from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
+from coil_rl.export.describe import describe
+from coil_rl.export.files import as_onnx, as_torch, traced
+from coil_rl.export.parity import LIMIT, WITH_GUIDE, Parity, compare, expected
+from coil_rl.export.policy import ExportedPolicy
+from coil_rl.export.recording import Recording, record
+from coil_rl.export.session import require
+from coil_rl.export.step import NotExportableError, PolicyStep
+from coil_rl.files import temporary
+from coil_rl.guides.controllers import EntryGuide, PerRow
+from coil_rl.guides.functions import FunctionGuide
+from coil_rl.output import progress, say
+from coil_rl.run.controller import Controller
+from coil_rl.run.run import HANDED_OVER, Run
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.guide_transform import SeededGenerator
+
+
+def export_policy(
+    run: Run,
+    folder: str | Path,
+    *,
+    which: str = HANDED_OVER,
+    observations: int = 1_000,
+    seed: int = 0,
+    meanings: Mapping[str, Any] | None = None,
+) -> ExportedPolicy:
+    """Write the policy of a run as files of ONNX and torch.export with a contract, and return it.
+
+    The files are `policy.onnx`, `policy.pt2`, `contract.json`, which says what the numbers mean,
+    and `drive.py`, which drives without this package. Older ones are replaced. Nothing is written
+    unless the file acts as `run.controller()` does.
+
+    Args:
+        run: finished.
+        folder: for the files.
+        which: policy, "handed_over", "last" or "best".
+        observations: number of steps in the env in which both are compared.
+        seed: of these steps.
+        meanings: of entries and of `action`, for the contract: texts, or mappings with some of
+            `unit`, `meaning`, `bounds`, `padding`, `frame`. They go before what the env says.
+
+    Raises:
+        UserError: without the extra `export`, for a policy that cannot be exported, and for one
+            that acts differently.
+    """
+    require("onnx", "onnxscript", "onnxruntime")
+    check_range(1, 1_000_000, observations=observations)
+    controller = run.controller(which)
+    recording = _recorded(run, controller, observations, seed)
+    outside = _cause(controller)
+    step, contents, parity = None, dict[str, bytes](), None
+    if outside is None:
+        try:
+            step, contents, parity = _written(controller, recording, inside=True)
+        except NotExportableError as error:
+            outside = str(error)
+            _check_possible(run, controller, outside)
+    if step is None or parity is None:
+        _check_possible(run, controller, str(outside))
+        say(f"export: the guide stays outside, its action is an input: {outside}")
+        try:
+            step, contents, parity = _written(controller, recording, inside=False)
+        except NotExportableError as error:
+            raise UserError(_impossible(run, str(error))) from error
+    contract = describe(
+        run,
+        controller,
+        step,
+        parity,
+        contents,
+        which=which,
+        outside=outside,
+        meanings=meanings or {},
+    )
+    _save(Path(folder), contents, contract)
+    say(f"export: {parity}")
+    return ExportedPolicy(folder)
+
+
+def _recorded(run: Run, controller: Controller, count: int, seed: int) -> Recording:
+    say(f"export: {count:,} observations of {run.label} in its env ...")
+    with progress(total=count, unit="step", desc="export", leave=False, mininterval=0.5) as bar:
+        return record(run, controller, count, seed, bar.update)
+
+
+def _written(
+    controller: Controller, recording: Recording, *, inside: bool
+) -> tuple[PolicyStep, dict[str, bytes], Parity]:
+    """Return what is exported, the contents of the files, and how much they differ.
+
+    Raises:
+        NotExportableError: if that is not possible, or they differ too much.
+    """
+    step = PolicyStep(controller, inside=inside)
+    limit = WITH_GUIDE if inside and step.guides else LIMIT
+    say("export: writing the function ...")
+    try:
+        rows = expected(step, recording, limit)
+    except (KeyError, RuntimeError, TypeError, ValueError) as error:
+        raise NotExportableError(f"{type(error).__name__}: {error}") from error
+    program = traced(step)
+    contents = {TORCH: as_torch(program), ONNX: as_onnx(program, step)}
+    say("export: comparing it with torch ...")
+    parity = compare(step, contents[ONNX], recording, rows, limit)
+    return step, contents, parity
+
+
+def _cause(controller: Controller) -> str | None:
+    """Return why the guides of a controller can only be outside; None if they may be inside."""
+    guides = _guides(controller)
+    if guides is None:
+        return None
+    for name, guide in guides.guides.guides.items():
+        for part in guide.modules():
+            if isinstance(part, PerRow):
+                return f"guide {name} is a Python object for each row ({part.title})"
+            if isinstance(part, FunctionGuide) and not part.for_batch:
+                return f"guide {name} is a Python function of one observation ({part.title})"
+            if isinstance(part, SeededGenerator):
+                return f"guide {name} draws numbers at random"
+            if isinstance(part, EntryGuide) and part.in_keys[0][0] == "controller":
+                return f"guide {name} is a controller beside its env"
+    return None
+
+
+def _guides(controller: Controller) -> GuideActions | None:
+    for part in controller.env.transform.modules():
+        if isinstance(part, GuideActions):
+            return part
+    return None
+
+
+def _check_possible(run: Run, controller: Controller, reason: str) -> None:
+    """Raise a `UserError` if nothing is left without the guide."""
+    if _guides(controller) is None or run.make_learner is None:
+        raise UserError(_impossible(run, reason))
+
+
+def _impossible(run: Run, reason: str) -> str:
+    return f"run {run.folder}: its policy cannot be exported: {reason}; use run.controller()"
+
+
+def _save(folder: Path, contents: Mapping[str, bytes], contract: Mapping[str, Any]) -> None:
+    """Write all files, the contract as the last one."""
+    driver = (resources.files("coil_rl.export") / DRIVER).read_bytes()
+    text = json.dumps(contract, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    with _whole_folder(folder) as unfinished:
+        for name, content in {**contents, DRIVER: driver, CONTRACT: text.encode()}.items():
+            (unfinished / name).write_bytes(content)
+
+
+@contextmanager
+def _whole_folder(folder: Path) -> Iterator[Path]:
+    """Yield a new folder whose files are moved into `folder` at the end of the block."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UserError(
+            f"{folder} is a file, but a folder is to be made there; remove it"
+        ) from error
+    unfinished = temporary(folder / "export")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    unfinished.mkdir()
+    try:
+        yield unfinished
+        for path in sorted(unfinished.iterdir(), key=lambda path: path.name == CONTRACT):
+            path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)

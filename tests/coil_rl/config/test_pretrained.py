@@ -1,0 +1,89 @@
+"""Shipped policies: small, checked before they are read, and wherever a run is read."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from programs import called
+
+import coil_rl
+from coil_rl.config import pretrained
+from coil_rl.config.pretrained import CARD, CHECKSUMS, LARGEST
+
+PLACE = Path(pretrained.__file__).parents[1] / "policies"
+NAMES = coil_rl.pretrained_names()
+
+
+def test_there_are_three_to_five_small_ones():
+    assert 3 <= len(NAMES) <= 5
+    for name in NAMES:
+        sizes = [path.stat().st_size for path in (PLACE / name).iterdir()]
+        assert sum(sizes) < LARGEST
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shipped_policy_names_no_place_and_has_a_card(name):
+    settings = yaml.safe_load((PLACE / name / "config.yaml").read_text())
+    assert settings["run_dir"] == "pretrained"
+    card = coil_rl.pretrained_card(name)
+    frames, seed = settings["budget"]["frames"], settings["seed"]
+    for text in (f"# {name}", f"{frames:,} frames", f"Its seed is {seed}", "torch ", "sampled"):
+        assert text in card
+    assert "/tmp" not in card
+
+
+def test_controller_of_a_shipped_policy_acts():
+    controller = coil_rl.pretrained("pendulum/coil").controller()
+    action = controller.act(np.array([1.0, 0.0, 0.5], np.float32))
+    assert action.shape == (1,)
+    assert -2 <= action[0] <= 2
+
+
+def test_unknown_name_lists_the_known_ones():
+    message = (
+        "pretrained:cone_track/coin does not exist; there are .*; did you mean cone_track/coil"
+    )
+    with pytest.raises(coil_rl.UserError, match=message):
+        coil_rl.pretrained("cone_track/coin")
+
+
+@pytest.mark.parametrize("file", ["policy_last.pt", "config.yaml", CARD])
+def test_changed_file_is_refused_before_it_is_read(file, tmp_path, monkeypatch):
+    name = "cone_track/ppo"
+    shutil.copytree(PLACE, tmp_path / "policies")
+    monkeypatch.setattr(pretrained, "_place", lambda: tmp_path / "policies")
+    path = tmp_path / "policies" / name / file
+    path.write_bytes(path.read_bytes() + b"\n")
+    with pytest.raises(coil_rl.UserError, match=f"{file} is not the file that was shipped"):
+        coil_rl.pretrained(name)
+    path.unlink()
+    with pytest.raises(coil_rl.UserError, match=f"{file} is not the file that was shipped"):
+        coil_rl.pretrained(name)
+
+
+def test_every_file_has_a_checksum():
+    known = json.loads((PLACE / CHECKSUMS).read_text())
+    for name in NAMES:
+        assert sorted(known[name]) == sorted(path.name for path in (PLACE / name).iterdir())
+
+
+def test_program_takes_a_shipped_policy(tmp_path):
+    words = ["evaluation.repeats=1", "evaluation.cases=2", f"hydra.run.dir={tmp_path / 'results'}"]
+    done = called("evaluate", "run=pretrained:pendulum/coil", *words)
+    assert "coil: mean test reward" in done.stdout
+
+
+def test_program_names_an_unknown_shipped_policy(tmp_path):
+    words = [f"hydra.run.dir={tmp_path / 'results'}"]
+    done = called("evaluate", "run=pretrained:pendulum", *words, code=2)
+    assert "evaluate: pretrained:pendulum does not exist; there are" in done.stderr
+    assert not (tmp_path / "results").exists()
+
+
+def test_shipped_policy_is_a_guide():
+    guide = coil_rl.LearnedGuide("pretrained:pendulum/coil")
+    env = coil_rl.GymnasiumEnv("Pendulum-v1", num_envs=2)
+    assert guide(env.reset())["action"].shape == (2, 1)

@@ -1,0 +1,98 @@
+"""The driver that ships with an exported policy: short, without this package, and right."""
+
+import ast
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torchrl.envs import ExplorationType, set_exploration_type
+
+import coil_rl
+from coil_rl.config.build import assemble
+from coil_rl.config.pretrained import folder_of
+from coil_rl.config.saved import read_config
+from coil_rl.export import ExportedPolicy, drive, export_policy
+from coil_rl.run.parts import TEST
+
+SOURCE = Path(drive.__file__)
+LONGEST = 25  # statements
+
+
+def test_driver_is_short_and_needs_no_other_package():
+    tree = ast.parse(SOURCE.read_text())
+    imported = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name for alias in node.names}
+        if isinstance(node, ast.ImportFrom):
+            imported.add(node.module)
+    others = {name for name in imported if name not in sys.stdlib_module_names}
+    assert others == {"numpy", "onnxruntime"}
+    docstrings = sum(isinstance(node, ast.Expr) for node in ast.walk(tree))
+    statements = sum(isinstance(node, ast.stmt) for node in ast.walk(tree)) - docstrings
+    assert statements <= LONGEST
+
+
+def driven(env, act, most):
+    """Return the sum of the rewards of one row, and its number of steps."""
+    carrier, total = env.reset(), 0.0
+    for step in range(1, most + 1):
+        action = torch.as_tensor(act(carrier), dtype=torch.float32).reshape(1, 1)
+        after = env.step(carrier.set("action", action))
+        total += float(after["next", "reward"])
+        if after["next", "done"].any():
+            return total, step
+        carrier = env.step_mdp(after)
+    raise AssertionError(f"the lap did not end within {most} steps")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["coil", "ppo"])
+def test_lap_driven_by_the_file_alone_has_the_reward_of_torch(name, tmp_path):
+    folder = folder_of(f"cone_track/{name}")
+    config = read_config(folder, "run")
+    config.env.laps = 1
+    run = assemble(config, folder)
+    export_policy(run, tmp_path, observations=300)
+    spec = importlib.util.spec_from_file_location("copied", tmp_path / SOURCE.name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    policy, controller = module.Policy(), run.controller()
+    read = [entry["name"] for entry in policy.contract["inputs"]]
+
+    def by_file(carrier):
+        return policy.act({key: carrier[key][0].numpy() for key in read})
+
+    def by_torch(carrier):
+        keys = controller.plant.observation_spec.keys()
+        with torch.no_grad(), set_exploration_type(ExplorationType.DETERMINISTIC):
+            return controller.act_on(carrier.select(*keys).clone())
+
+    rewards = [
+        driven(run.make_env.bare(1, TEST, None), act, most=1_000) for act in (by_file, by_torch)
+    ]
+    assert rewards[0][1] == rewards[1][1]
+    assert rewards[0][0] == pytest.approx(rewards[1][0], abs=0.01)
+    exported = ExportedPolicy(tmp_path)
+    exported.reset()
+    policy.reset()
+    carrier = run.make_env.bare(1, TEST, None).reset()
+    own = exported.act({key: carrier[key][0].numpy() for key in read})
+    np.testing.assert_array_equal(own, by_file(carrier))
+
+
+@pytest.mark.slow
+def test_driver_runs_where_this_package_is_not(tmp_path):
+    export_policy(coil_rl.pretrained("pendulum/coil"), tmp_path, observations=50)
+    code = (
+        "import sys; sys.modules['torch'] = sys.modules['coil_rl'] = None; import drive; "
+        "print(drive.Policy().act({'observation': [1.0, 0.0, 0.5]}).shape)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "(1,)"

@@ -1,0 +1,210 @@
+"""An exported policy acts as the controller of its run does, or is refused in one sentence."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from learned_runs import learned
+from outside_package.install import SOURCE
+
+import coil_rl
+from coil_rl.export import write
+from coil_rl.export.contract import CONTRACT, DRIVER, ONNX, TORCH
+
+CONF = Path(__file__).parents[3] / "conf"
+METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
+OBSERVATIONS = 30
+REFUSED = {"dagger", "oil"}  # forests
+
+
+@pytest.fixture(autouse=True)
+def package(monkeypatch):
+    """Make the user's package importable, as one that is installed."""
+    monkeypatch.syspath_prepend(SOURCE)
+
+
+def exported(folder, method, *overrides, **parts):
+    run = coil_rl.open_run(learned(folder / "run", method, *overrides, **parts))
+    return run, coil_rl.export_policy(run, folder / "exported", observations=OBSERVATIONS)
+
+
+def same_actions(run, policy, observations, advice=None):
+    """Check that both act alike in an episode, in which the advice is that of `advice`."""
+    controller = run.controller()
+    for _ in range(2):
+        controller.reset()
+        policy.reset()
+        for observation in observations:
+            own = controller.act(observation)
+            given = None if advice is None else advice(controller)
+            np.testing.assert_allclose(policy.act(observation, given), own, rtol=0, atol=1e-5)
+
+
+def rooms(count=12):
+    generator = np.random.default_rng(0)
+    return generator.normal([-3, 5], 2, (count, 2)).astype(np.float32)
+
+
+def test_torch_guide_with_memory_is_inside(tmp_path):
+    guide = "thermostat.control:BatchedPI"
+    run, policy = exported(tmp_path, "coil", "learner.normalise=true", guide=guide)
+    assert policy.contract["guide"] == {"place": "inside", "names": ["controller"]}
+    assert [entry["name"] for entry in policy.contract["inputs"]] == ["observation"]
+    states = [entry["input"] for entry in policy.contract["state"]]
+    assert states == [
+        "state.guide_state.controller.integral",
+        "state.guide_state.controller.wish",
+        "state.last_action",
+    ]
+    same_actions(run, policy, rooms())
+
+
+def test_python_guide_is_an_input_in_the_unit_of_the_env(tmp_path, capsys):
+    run, policy = exported(tmp_path, "residual")
+    assert "Python object for each row (thermostat.control:PI)" in capsys.readouterr().out
+    assert policy.contract["guide"]["place"] == "outside"
+    advice = policy.contract["inputs"][-1]
+    assert (advice["name"], advice["shape"]) == ("guide_action", [1, 1])
+    observation = rooms(1)[0]
+    with pytest.raises(ValueError, match="guide of this policy is outside: give its action"):
+        policy.act(observation)
+
+    def heard(controller):
+        part = next(p for p in controller.env.transform.modules() if hasattr(p, "given_space"))
+        normalised = controller._acted["guide_action"][0]
+        return part.given_units.denormalise(normalised).numpy()
+
+    same_actions(run, policy, rooms(), heard)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in REFUSED])
+def test_every_method_is_exported(method, tmp_path):
+    run, policy = exported(tmp_path, method, guide="thermostat.control:Feedforward")
+    place = "absent" if method == "ppo" else "inside"
+    assert policy.contract["guide"]["place"] == place
+    same_actions(run, policy, rooms())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["coil", "residual", "jump_start"])
+def test_memory_of_a_policy_goes_in_and_out(method, tmp_path):
+    words = ["network=gru", "learner.minibatches=1"]
+    run, policy = exported(tmp_path, method, *words, guide="thermostat.control:Feedforward")
+    assert "state.policy_state" in policy.state
+    same_actions(run, policy, rooms())
+    before = policy.state_dict()
+    action = policy.act(rooms(1)[0])
+    policy.load_state_dict(json.loads(json.dumps(before)))
+    assert policy.act(rooms(1)[0]) == action
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("guide", "place", "reason"),
+    [
+        ("proportional", "inside", None),
+        ("PI", "outside", "Python object"),
+        ("KnowsTheDay", "outside", "draws|Python|beside"),
+    ],
+)
+def test_place_of_a_guide_depends_on_what_it_is(guide, place, reason, tmp_path):
+    words, parts = [], {"guide": f"thermostat.control:{guide}"}
+    if guide == "KnowsTheDay":
+        words = ["+env.controllers.day=thermostat.control:KnowsTheDay"]
+        words += ["guide.entry.key=[controller,day]"]
+        parts = {"guide": "entry"}
+    _, policy = exported(tmp_path, "coil", *words, **parts)
+    assert policy.contract["guide"]["place"] == place
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["learner.squash=false"],
+        ["learner=sac"],
+        ["action=choices"],
+        ["action=choices", "learner=dqn"],
+        ["degrade=[biased]"],
+        ["network=mlp", "network.activation=relu"],
+    ],
+)
+def test_other_heads_are_exported(overrides, tmp_path):
+    small = ["learner.starts=16"] if overrides[-1] in ("learner=sac", "learner=dqn") else []
+    method = "coil"
+    folder = tmp_path / "run"
+    words = [word for word in overrides if not word.startswith("network.")]
+    run = coil_rl.prepare(
+        "thermostat:Room-v0",
+        guide="thermostat.control:Feedforward",
+        method=method,
+        frames=32,
+        folder=folder,
+        overrides=[
+            "budget.num_envs=2",
+            "budget.steps=16",
+            "evaluation.cases=2",
+            "logger=none",
+            "evaluation.gif=false",
+            "env.max_steps=24",
+            *words,
+            *small,
+        ],
+    )
+    run.begin()
+    run.learn()
+    opened = coil_rl.open_run(folder)
+    policy = coil_rl.export_policy(opened, tmp_path / "exported", observations=OBSERVATIONS)
+    same_actions(opened, policy, rooms())
+
+
+@pytest.mark.slow
+def test_numbering_of_an_env_of_choices_is_kept(tmp_path):
+    run, policy = exported(tmp_path, "ppo", env="CartPole-v1")
+    action = policy.act(np.zeros(4))
+    assert action.shape == ()
+    assert action in (0, 1)
+    observations = np.random.default_rng(0).normal(0, 1, (10, 4)).astype(np.float32)
+    same_actions(run, policy, observations)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", sorted(REFUSED))
+def test_forest_is_refused(method, tmp_path):
+    run = coil_rl.open_run(learned(tmp_path / "run", method))
+    with pytest.raises(coil_rl.UserError, match=r"its policy cannot be exported: .*run.controller"):
+        coil_rl.export_policy(run, tmp_path / "exported", observations=5)
+    assert not (tmp_path / "exported").exists()
+
+
+@pytest.mark.slow
+def test_delayed_advice_is_refused(tmp_path):
+    run = coil_rl.open_run(learned(tmp_path / "run", "coil", "degrade=[delayed]"))
+    with pytest.raises(coil_rl.UserError, match="DelayedAdvice degrades the advice"):
+        coil_rl.export_policy(run, tmp_path / "exported", observations=5)
+
+
+def test_wrong_file_is_not_written(tmp_path, monkeypatch):
+    run = coil_rl.open_run(learned(tmp_path / "run", "ppo"))
+    monkeypatch.setattr(write, "LIMIT", -1.0)
+    with pytest.raises(coil_rl.UserError, match="depends on more than its inputs"):
+        coil_rl.export_policy(run, tmp_path / "exported", observations=5)
+    assert not (tmp_path / "exported").exists()
+
+
+def test_files_hold_no_path_of_this_machine(tmp_path):
+    _, policy = exported(tmp_path, "ppo")
+    folder = policy.file.parent
+    assert sorted(path.name for path in folder.iterdir()) == [CONTRACT, DRIVER, ONNX, TORCH]
+    root = str(Path(coil_rl.__file__).parents[1]).encode()
+    for path in folder.iterdir():
+        content = path.read_bytes()
+        for text in (root, b"site-packages", b".py:", str(tmp_path).encode()):
+            assert text not in content, f"{path.name} has {text!r}"
+    program = torch.export.load(folder / TORCH).module()
+    observation = rooms(3)
+    own = policy.session({"observation": observation})[0]
+    np.testing.assert_allclose(program(torch.from_numpy(observation))[0], own, rtol=0, atol=1e-5)
