@@ -78,11 +78,12 @@ class ExportedPolicy:
             ValueError: for an observation that does not fit the contract.
         """
         inputs = {}
+        entries = [entry for entry in self.contract["inputs"] if entry["name"] != ADVICE]
         for entry in self.contract["inputs"]:
             if entry["name"] == ADVICE:
                 value = _advice(observation, guide_action)
             else:
-                value = _found(observation, entry, len(self.contract["inputs"]))
+                value = _found(observation, entry, only=len(entries) == 1)
             inputs[entry["name"]] = _row(value, entry)
         action = self.act_on(inputs)[0]
         space = self.contract["outputs"][0]["space"]
@@ -130,13 +131,13 @@ def _advice(observation: Any, guide_action: Any) -> Any:
     return guide_action
 
 
-def _found(observation: Any, entry: Mapping[str, Any], inputs: int) -> Any:
+def _found(observation: Any, entry: Mapping[str, Any], *, only: bool) -> Any:
     """Return the part of an observation that an input of the contract stands for.
 
     Args:
         observation: of the env.
         entry: of the contract.
-        inputs: number of inputs.
+        only: whether there is no other one.
     """
     source, path = entry.get("from"), entry["key"]
     if source is not None:
@@ -144,7 +145,7 @@ def _found(observation: Any, entry: Mapping[str, Any], inputs: int) -> Any:
         named = isinstance(observation, Mapping) and entry["key"][0] in observation
         if source["path"] or not named:
             path = source["path"]
-    elif inputs == 1 and not isinstance(observation, Mapping):
+    elif only and not isinstance(observation, Mapping):
         path = []
     for part in path:
         try:

@@ -28,14 +28,10 @@ def demo(path: Path) -> None:
     from coil_rl.report.lines import draw_lines
 
     print(f"demo: one lap on a track that {POLICY} has never seen ...", flush=True)
-    results = driven()
-    (agent, guide) = results.split(2)
-    lines = {
-        "guide alone": guide.histories["pose"],
-        "agent with its advice": agent.histories["pose"],
-    }
-    crashed = {"guide alone": [False], "agent with its advice": [False]}
-    for name, result in zip(crashed, (guide, agent), strict=True):
+    agent, guide = driven().split(2)
+    lines, crashed = {}, {}
+    for name, result in (("guide alone", guide), ("agent with its advice", agent)):
+        lines[name] = [pose[:, :2] for pose in result.histories["pose"]]
         crashed[name] = [bool(episode["crashed"]) for episode in result.episodes]
     draw_lines([shipped_track(TRACK)], lines, path, crashed=crashed)
     print(
