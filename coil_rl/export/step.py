@@ -33,11 +33,13 @@ from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace, first_choices
 from coil_rl.transforms.combined_actions import AdaptiveMixedAction, CombinedAction
 from coil_rl.transforms.degraded_advice import DegradedAdvice
+from coil_rl.transforms.disturbance import Disturbance
 from coil_rl.transforms.guide_transform import GuideTransform, SeededGenerator
 
 ADVICE = "guide_action"  # input for the actions of guides that are outside
-# Transforms that neither change what the policy sees nor what it does.
-WITHOUT_EFFECT = (InitTracker, RewardSum, StepCounter, TensorDictPrimer)
+# Transforms that neither change what the policy sees nor what it does. A controller takes off what
+# disturbs its env.
+WITHOUT_EFFECT = (Disturbance, InitTracker, RewardSum, StepCounter, TensorDictPrimer)
 
 
 class NotExportableError(Exception):
