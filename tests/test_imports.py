@@ -22,6 +22,7 @@ PUBLIC = [
     "coil_rl.envs",
     "coil_rl.envs.recordings",
     "coil_rl.envs.robot",
+    "coil_rl.export",
     "coil_rl.guides",
     "coil_rl.imitation",
     "coil_rl.learners",

@@ -31,6 +31,7 @@ from coil_rl.learners.critics import Critics
 from coil_rl.run.controller import Controller
 from coil_rl.transforms import GuideActions
 from coil_rl.transforms.action_space import ActionSpace, first_choices
+from coil_rl.transforms.advice_dropout import AdviceDropout
 from coil_rl.transforms.combined_actions import AdaptiveMixedAction, CombinedAction
 from coil_rl.transforms.degraded_advice import DegradedAdvice
 from coil_rl.transforms.disturbance import Disturbance
@@ -177,6 +178,18 @@ class _Combined(_Part):
             after["agent_weight"] = self.transform.weight_after(data["agent_weight"], doubt)
 
 
+class _Dropout(_Part):
+    """Advice that is missing in some episodes of a training; outside of one it is there, or not."""
+
+    def __init__(self, transform: AdviceDropout) -> None:
+        self.transform = transform
+
+    def observe(self, data: TensorDictBase, after: dict[NestedKey, Tensor]) -> None:
+        shape, device = (*data.batch_size, 1), data[self.transform.advice_key].device
+        given = torch.full(shape, self.transform.in_evaluation, device=device)
+        self.transform._write(data, given)
+
+
 class _Other(_Part):
     """Any other transform, which must not remember anything."""
 
@@ -290,6 +303,8 @@ def _flat(policy: TensorDictModuleBase) -> Iterable[TensorDictModuleBase]:
     if isinstance(policy, TensorDictSequential):
         for module in policy.module:
             yield from _flat(module)
+    elif any(hasattr(part, "estimator") for part in policy.modules()):
+        raise NotExportableError("it is a regressor of scikit-learn, not a network")
     elif isinstance(policy, GRUModule):
         yield WrittenGru(policy)
     elif isinstance(policy, Critics):
@@ -312,6 +327,8 @@ def _part(transform: Transform, inside: bool) -> _Part:
         return _Advice(transform, inside)
     if isinstance(transform, CombinedAction):
         return _Combined(transform)
+    if isinstance(transform, AdviceDropout):
+        return _Dropout(transform)
     return _Other(transform)
 
 

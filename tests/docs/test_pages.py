@@ -11,7 +11,7 @@ DOCS = ROOT / "docs"
 PAGES = sorted([*DOCS.rglob("*.md"), *(ROOT / "paper").rglob("*.md"), *ROOT.glob("*.md")])
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 # Their blocks need nothing but the installation, and run one after the other.
-EXECUTED = ("python.md", "recordings.md", "coil.md")
+EXECUTED = ("python.md", "recordings.md", "coil.md", "pretrained.md")
 
 
 @cache
