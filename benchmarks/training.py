@@ -86,7 +86,11 @@ class Training:
             if isinstance(transform, GuideActions):
                 stopwatch.wrap(transform, "_call", "guide")
                 stopwatch.wrap(transform, "_reset", "guide")
-        stopwatch.wrap(learner.policy, "forward", "policy")
+        lean = self.experiment.rollout.lean
+        if lean is None:
+            stopwatch.wrap(learner.policy, "forward", "policy")
+        else:
+            stopwatch.wrap(lean.policy, "act", "policy")
         stopwatch.wrap(learner, "update", "update")
 
 

@@ -17,46 +17,60 @@ class ClippedLoss(ClipPPOLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return the losses of a minibatch [N] and TorchRL's other values, scalars."""
         rows = tensordict.copy()
-        advantage, target = rows["advantage"], rows["value_target"]
-        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
         *modules, last = self.actor_network.module
         for module in modules:
             rows = module(rows)
         distribution = last.get_dist(rows)
         log_ratio = (distribution.log_prob(rows["action"]) - rows["action_log_prob"]).unsqueeze(-1)
-        ratio, clipped = log_ratio.exp(), log_ratio.clamp(*self._clip_bounds)
-        gain = torch.minimum(ratio * advantage, clipped.exp() * advantage)
-        value = self.critic_network(rows)["state_value"]
-        losses = {
-            "loss_objective": -gain.mean(),
-            "clip_fraction": (clipped != log_ratio).to(ratio.dtype).mean(),
-            "kl_approx": (-log_ratio.detach()).mean(),
-        }
+        value, target = self.critic_network(rows)["state_value"], rows["value_target"]
+        losses = {"loss_objective": self.objective(log_ratio, rows["advantage"])}
+        losses |= self.of_policy(log_ratio)
         if self.entropy_bonus:
-            entropy = self._get_entropy(distribution, advantage.shape[:-1])
+            entropy = self._get_entropy(distribution, log_ratio.shape[:-1])
             losses["entropy"] = entropy.detach().mean()
             losses["loss_entropy"] = self._weighted_loss_entropy(entropy).mean()
-        error = F.mse_loss(target, value, reduction="none")
-        losses |= {
-            "loss_critic": (self.critic_coeff * error).mean(),
+        losses["loss_critic"] = self.error(value, target)
+        return TensorDict(losses | self.of_fit(log_ratio, value, target))
+
+    def objective(self, log_ratio: Tensor, advantage: Tensor) -> Tensor:
+        """Return the loss of the policy for a minibatch, [N, 1] each."""
+        advantage = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-4)
+        clipped = log_ratio.clamp(*self._clip_bounds)
+        return -torch.minimum(log_ratio.exp() * advantage, clipped.exp() * advantage).mean()
+
+    def error(self, value: Tensor, target: Tensor) -> Tensor:
+        """Return the loss of the critic for a minibatch, [N, 1] each."""
+        return (self.critic_coeff * F.mse_loss(target, value, reduction="none")).mean()
+
+    @torch.no_grad()
+    def of_policy(self, log_ratio: Tensor) -> dict[str, Tensor]:
+        """Return how far a policy has moved, for each of some minibatches [..., N, 1]."""
+        clipped = log_ratio.clamp(*self._clip_bounds)
+        share = (clipped != log_ratio).to(log_ratio.dtype).mean((-2, -1))
+        return {"clip_fraction": share, "kl_approx": (-log_ratio).mean((-2, -1))}
+
+    @torch.no_grad()
+    def of_fit(self, log_ratio: Tensor, value: Tensor, target: Tensor) -> dict[str, Tensor]:
+        """Return further values for each of some minibatches [..., N, 1]."""
+        ratio = log_ratio.exp()
+        return {
             "explained_variance": explained_variance(target, value),
             "ESS": effective_share(log_ratio.squeeze(-1)),
-            "max_ratio": ratio.detach().max(),
-            "mean_ratio": ratio.detach().mean(),
+            "max_ratio": ratio.amax((-2, -1)),
+            "mean_ratio": ratio.mean((-2, -1)),
         }
-        return TensorDict(losses)
 
 
 @torch.no_grad()
 def explained_variance(target: Tensor, value: Tensor) -> Tensor:
-    """Return the share of the variance of targets [N, 1] that values [N, 1] explain, [1]."""
-    unexplained = torch.var(target - value, correction=0, dim=0)
-    variance = torch.var(target, correction=0, dim=0) + torch.finfo(target.dtype).eps
+    """Return the share of the variance of targets [..., N, 1] that values explain, [..., 1]."""
+    unexplained = torch.var(target - value, correction=0, dim=-2)
+    variance = torch.var(target, correction=0, dim=-2) + torch.finfo(target.dtype).eps
     return 1.0 - unexplained / variance
 
 
 @torch.no_grad()
 def effective_share(log_ratio: Tensor) -> Tensor:
-    """Return the effective sample size as a share of all N, from logarithmic weights [N]."""
-    size = (2 * log_ratio.logsumexp(0) - (2 * log_ratio).logsumexp(0)).exp()
-    return size / len(log_ratio)
+    """Return the effective sample size as a share of all N, [...] from log-weights [..., N]."""
+    size = (2 * log_ratio.logsumexp(-1) - (2 * log_ratio).logsumexp(-1)).exp()
+    return size / log_ratio.shape[-1]

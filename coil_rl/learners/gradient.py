@@ -85,19 +85,28 @@ class GradientStep(Stateful):
         Returns all losses, in the order of `names`. If `compile` is true and there is no C++
         compiler, that is a `UserError`.
         """
-        self.steps += 1
         if self.compile is True:
             try:
-                return self._compiled(minibatch, weights)
+                values = self._compiled(minibatch, weights)
             except UserError as error:
                 if self.required:
                     raise
                 warnings.warn(f"{error}; the update goes on uncompiled", stacklevel=2)
                 self.compile = False
+            else:
+                self.steps += 1
+                return values
         losses = self.losses(minibatch)
-        self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
+        self.take(losses, weights)
         self.names = list(losses.keys())
         return _vector(losses)
+
+    def take(
+        self, losses: TensorDictBase | Mapping[str, Tensor], weights: Mapping[str, float]
+    ) -> None:
+        """Take a step, not compiled, on the sum of losses times `weights`; both are by name."""
+        self.steps += 1
+        self.minimise(sum(weight * losses[name] for name, weight in weights.items()))
 
     def _compiled(self, minibatch: TensorDictBase, weights: Mapping[str, float]) -> Tensor:
         self.keys, self.weighted = list(minibatch.keys(True, True)), list(weights)

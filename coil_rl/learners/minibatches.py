@@ -6,6 +6,7 @@ from typing import ClassVar
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
 from coil_rl.errors import UserError
@@ -38,14 +39,27 @@ class Minibatches(Stateful):
         Raises:
             ValueError: if there are too few rows.
         """
-        size = len(rows) // self.count
+        for order in self.orders(rows):
+            yield from rows[order].split(self.size(rows))
+
+    def size(self, rows: TensorDictBase) -> int:
+        """Return the number of rows of a minibatch."""
+        return len(rows) // self.count
+
+    def orders(self, rows: TensorDictBase) -> Iterator[Tensor]:
+        """Yield the indices of the rows of each pass, those of its minibatches one after the other.
+
+        Raises:
+            ValueError: if there are too few rows.
+        """
+        size = self.size(rows)
         if size * rows.shape[1:].numel() < 2:  # one advantage cannot be standardised
             raise ValueError(
                 f"minibatches={self.count} leaves less than 2 of {rows.numel()} frames to each"
             )
         for _ in range(self.epochs):
             order = torch.randperm(len(rows), generator=self.generator)[: size * self.count]
-            yield from rows[order.to(rows.device)].split(size)
+            yield order.to(rows.device)
 
 
 class RowMinibatches(Minibatches):

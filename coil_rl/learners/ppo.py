@@ -28,6 +28,7 @@ from coil_rl.learners.extension import Extension
 from coil_rl.learners.extensions import extensions_of
 from coil_rl.learners.gradient import GradientStep
 from coil_rl.learners.guided_steps import AGENT_ACTS, LossesOfAgentSteps, guide_may_act
+from coil_rl.learners.lean_update import LeanUpdate
 from coil_rl.learners.learner import Callback, Cases, Learner
 from coil_rl.learners.minibatches import minibatches_of
 from coil_rl.learners.normaliser import normaliser
@@ -165,7 +166,23 @@ class PPO(Stateful, Learner):
             compile=compile,
             compilable=self.compilable and memory is None and not guide_may_act(env),
         )
+        self.lean: LeanUpdate | None = None
+        if self._is_lean():
+            self.lean = LeanUpdate(self.policy, self.critic, self.loss, self.sampler, self.gradient)
         self._set_keys(env, in_keys)
+
+    def _is_lean(self) -> bool:
+        """Return whether an update that is not compiled takes its lean form, see `LeanUpdate`.
+
+        It does unless a subclass, an extension or a guide that acts has losses of its own.
+        """
+        own = [type(each).losses for each in self.extensions.each]
+        return (
+            self.objective == self.losses
+            and type(self).losses is PPO.losses
+            and all(losses is Extension.losses for losses in own)
+            and LeanUpdate.covers(self.policy, self.critic, self.loss, self.sampler)
+        )
 
     def build_policy(
         self,
@@ -231,12 +248,16 @@ class PPO(Stateful, Learner):
             reports; the learning rate; and the metrics of the extensions.
         """
         rows, weights = self.prepare(batch, progress), self.loss_weights(progress)
-        reports = [self.gradient(minibatch, weights) for minibatch in self.sampler.draw(rows)]
+        if self.lean is not None and self.gradient.compile is not True:
+            means = self.lean(rows, weights)
+        else:
+            steps = [self.gradient(minibatch, weights) for minibatch in self.sampler.draw(rows)]
+            means = self.gradient.means(steps)
         known = {
             "learning_rate": self.learning_rate(progress),
             "compiled": float(self.gradient.compile is True),
         }
-        return self.gradient.means(reports) | known | self.extensions.finish(batch, progress)
+        return means | known | self.extensions.finish(batch, progress)
 
     def prepare(self, batch: TensorDictBase, progress: float) -> TensorDictBase:
         """Apply the schedules and compute advantages; returns what minibatches are drawn from."""

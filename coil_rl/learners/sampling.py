@@ -33,6 +33,7 @@ class Sample(SafeProbabilisticModule):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         self.read, self.distribution, self.options = list(parameters), distribution, options
+        self.sample_key = key
         super().__init__(
             list(parameters),
             [key],
@@ -80,4 +81,8 @@ class ClippedNormal(Sample):
     def forward(self, tensordict: TensorDictBase, *args: Any, **options: Any) -> TensorDictBase:
         """Write the sample and the action."""
         tensordict = super().forward(tensordict, *args, **options)
-        return tensordict.set(self.action_key, tensordict[UNCLIPPED].clamp(self.low, self.high))
+        return tensordict.set(self.action_key, self.clipped(tensordict[UNCLIPPED]))
+
+    def clipped(self, sample: Tensor) -> Tensor:
+        """Return the action of a sample [*batch, *event]."""
+        return sample.clamp(self.low, self.high)

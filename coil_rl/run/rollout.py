@@ -15,6 +15,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from coil_rl.envs.limits import check_range
 from coil_rl.errors import UserError
 from coil_rl.learners.sampling import NOISE
+from coil_rl.run.lean_steps import LeanSteps
 from coil_rl.transforms.guide_transform import set_progress
 
 
@@ -50,6 +51,9 @@ class Rollout:
         self.env, self.policy, self.steps = env.train(), policy, steps
         self.base_env = self.env.base_env if isinstance(self.env, TransformedEnv) else self.env
         self.keys = None if keys is None else list(dict.fromkeys(keys))
+        self.lean: LeanSteps | None = None
+        if self.keys is not None and LeanSteps.covers(env, policy, self.keys):
+            self.lean = LeanSteps(env, policy, self.keys)
         spec = env.full_action_spec[env.action_key] if noise_correlation else None
         self.noise_spec = spec if spec is not None and spec.dtype.is_floating_point else None
         self.noise_correlation = noise_correlation
@@ -71,20 +75,16 @@ class Rollout:
         A number that is NaN or infinite is a `UserError` with its entry, step and row.
         """
         set_progress(self.env, progress)
-        carrier = acting = self.env.reset() if self.carrier is None else self.carrier
+        self.acting = self.env.reset() if self.carrier is None else self.carrier
         columns: dict[NestedKey, list[Tensor]] = {}
         try:
             with set_exploration_type(ExplorationType.RANDOM):
-                for _ in range(self.steps):
-                    acting = self.policy(self._with_noise(carrier))
-                    step, carrier = self.env.step_and_maybe_reset(acting)
-                    for key in self.keys or step.keys(True, True):
-                        columns.setdefault(key, []).append(step[key])
+                carrier = self._drive(columns) if self.lean is None else self._drive_lean(columns)
         except Exception:
             # NaN of an earlier step may be the cause.
             check_batch(self._stacked(columns), self.taken)
             check_batch(
-                acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0)
+                self.acting.unsqueeze(-1), self.taken + max(map(len, columns.values()), default=0)
             )
             raise
         batch = self._stacked(columns)
@@ -93,7 +93,36 @@ class Rollout:
         self.taken += self.steps
         return batch
 
-    def _with_noise(self, carrier: TensorDictBase) -> TensorDictBase:
+    def _drive(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
+        """Take the steps of a batch by TorchRL's step, and return the data of the next one.
+
+        Args:
+            columns: gets the entries of each step.
+        """
+        carrier = self.acting
+        for _ in range(self.steps):
+            self.acting = self.policy(self._with_noise(carrier))
+            step, carrier = self.env.step_and_maybe_reset(self.acting)
+            for key in self.keys or step.keys(True, True):
+                columns.setdefault(key, []).append(step[key])
+        return carrier
+
+    def _drive_lean(self, columns: dict[NestedKey, list[Tensor]]) -> TensorDictBase:
+        """Take the steps of a batch as `_drive` does, in less time."""
+        lean: Any = self.lean
+        entries = acting = lean.carry(self.acting)
+        try:
+            for _ in range(self.steps):
+                acting = self._with_noise(entries)
+                step, entries = lean(acting)
+                for key, value in step.items():
+                    columns.setdefault(key, []).append(value)
+        except Exception:
+            self.acting = lean.data(acting)
+            raise
+        return lean.data(entries)
+
+    def _with_noise(self, carrier: Any) -> Any:
         """Write the exploration noise of the next step.
 
         It is correlated with that of the step before.

@@ -1,0 +1,150 @@
+"""Steps of an env and its policy from tensors to tensors, with the numbers of TorchRL's steps.
+
+TorchRL's step is for any env: it looks for keys, completes what an env leaves out, and carries all
+that was written to the next step. With a small network this takes longer than a step of an env that
+is known. `LeanSteps` is for those: it calls the env and its transforms directly, and carries only
+what is read. All others keep TorchRL's step, see `LeanSteps.covers`.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from torch import Tensor, where
+from torchrl.envs import Compose, EnvBase, RewardSum, Transform, TransformedEnv
+
+from coil_rl.envs.cone_track import SeededEnv
+from coil_rl.learners.lean_policy import Entries, LeanPolicy
+from coil_rl.transforms import GuideActions
+from coil_rl.transforms.normalised_action import NormalisedAction
+
+ENDS = ["done", "terminated", "truncated"]
+
+
+class LeanSteps:
+    """Steps with resets of an env, taken by a policy.
+
+    Args:
+        env: for which `covers` is true.
+        policy: of the same.
+        keys: of the same.
+    """
+
+    def __init__(self, env: EnvBase, policy: Any, keys: Sequence[NestedKey]) -> None:
+        self.policy = LeanPolicy(policy)
+        self.base_env = env.base_env if isinstance(env, TransformedEnv) else env
+        self.batch_size, self.device = env.batch_size, env.device
+        self.before = [key for key in keys if not _is_next(key)]
+        self.after = {key: _in_next(key) for key in keys if _is_next(key)}
+        transforms = _transforms(env)
+        self.advice = [each for each in transforms if isinstance(each, GuideActions)]
+        self.actions = [each for each in transforms if isinstance(each, NormalisedAction)]
+        self.sums = [each.out_keys[0] for each in transforms if isinstance(each, RewardSum)]
+        self.carried = [*_observed(policy, keys), *self.sums]
+
+    @staticmethod
+    def covers(env: EnvBase, policy: Any, keys: Sequence[NestedKey] | None) -> bool:
+        """Return whether the steps of an env and a policy have this form.
+
+        They have if the env is one of this project with advice, a normalised action and a sum of
+        rewards at most, if no guide looks at the past, if the policy has a lean form, and if all
+        that it observes is written by the env.
+
+        Args:
+            env: with transforms.
+            policy: of the env.
+            keys: entries that are kept of each step; None: all.
+        """
+        base = env.base_env if isinstance(env, TransformedEnv) else env
+        return (
+            keys is not None
+            and LeanPolicy.covers(policy)
+            and isinstance(base, SeededEnv)
+            and len(env.batch_size) == 1
+            and (env.action_key, env.reward_key, sorted(env.done_keys))
+            == ("action", "reward", ENDS)
+            and not list(base.state_spec.keys(True, True))
+            and all(_is_known(each) for each in _transforms(env))
+            and set(_observed(policy, keys)) <= set(env.observation_spec.keys(True, True))
+        )
+
+    def carry(self, carrier: TensorDictBase) -> Entries:
+        """Return what is read of the state of the env before a step."""
+        return Entries({key: carrier[key] for key in self.carried})
+
+    def __call__(self, entries: Entries) -> tuple[dict[NestedKey, Tensor], Entries]:
+        """Act and take a step; return the entries to keep, and what is read in the next step.
+
+        Args:
+            entries: what is read in this step; it gets what the policy writes.
+        """
+        action = self.policy.act(entries)["action"]
+        for each in self.actions:
+            if each.units is not None:
+                action = each.units.denormalise(action)
+        after = self.base_env._step(self._few(action=action))
+        for key in self.sums:
+            after.set(key, entries[key] + after["reward"])
+        for guides in self.advice:
+            after = guides._call(after)
+        kept = {key: entries[key] for key in self.before}
+        kept |= {key: after[name] for key, name in self.after.items()}
+        return kept, self._begun(after)
+
+    def _begun(self, after: TensorDictBase) -> Entries:
+        """Return what is read in the next step, after a reset of the rows that are done."""
+        done, carried = after["done"], self.carry(after)
+        if not done.any():
+            return carried
+        mask = self._few(_reset=done.clone())
+        first = self.base_env._reset(mask)
+        for guides in self.advice:
+            first = guides._reset(mask, first)
+        for key in self.sums:
+            first.set(key, carried[key].new_zeros(()).expand_as(carried[key]))
+        for key, value in carried.items():
+            rows = done.view(-1, *(1,) * (value.ndim - 1))
+            carried[key] = where(rows, first[key], value)
+        return carried
+
+    def _few(self, **entries: Tensor) -> TensorDict:
+        return TensorDict(entries, self.batch_size, device=self.device)
+
+    def data(self, entries: Entries) -> TensorDict:
+        """Return entries as data of the env."""
+        data = TensorDict({}, self.batch_size, device=self.device)
+        for key, value in entries.items():
+            data[key] = value
+        return data
+
+
+def _transforms(env: EnvBase) -> list[Transform]:
+    """Return the transforms of an env."""
+    if not isinstance(env, TransformedEnv):
+        return []
+    return list(env.transform) if isinstance(env.transform, Compose) else [env.transform]
+
+
+def _is_known(transform: Transform) -> bool:
+    """Return whether a lean step does what a transform does."""
+    if type(transform) is GuideActions:
+        return not transform.needs_past
+    if type(transform) is RewardSum:
+        return list(transform.in_keys) == ["reward"]
+    return type(transform) is NormalisedAction
+
+
+def _observed(policy: Any, keys: Sequence[NestedKey]) -> list[NestedKey]:
+    """Return the entries before a step that are read: what the policy does not write itself."""
+    before = [key for key in keys if not _is_next(key)]
+    read = dict.fromkeys([*policy.in_keys, *before])
+    return [key for key in read if key not in policy.out_keys]
+
+
+def _is_next(key: NestedKey) -> bool:
+    return isinstance(key, tuple) and key[0] == "next"
+
+
+def _in_next(key: Any) -> NestedKey:
+    """Return the key of an entry after a step, without `next`."""
+    return key[1] if len(key) == 2 else key[1:]
