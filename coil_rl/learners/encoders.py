@@ -16,13 +16,8 @@ from torchrl.envs import EnvBase, InitTracker, TensorDictPrimer, Transform
 from torchrl.modules import MLP, ConvNet
 
 from coil_rl.envs.limits import check_choice, check_range
+from coil_rl.learners.activations import ACTIVATIONS, ORTHOGONAL
 
-ACTIVATIONS: Mapping[str, type[nn.Module]] = {
-    "tanh": nn.Tanh,
-    "relu": nn.ReLU,
-    "elu": nn.ELU,
-    "silu": nn.SiLU,
-}
 Shapes = Mapping[NestedKey, torch.Size]
 STATE = "policy_state"  # what an env carries for a network with a memory
 
@@ -183,7 +178,7 @@ class Mlp:
 
     Args:
         hidden: widths of the hidden layers.
-        activation: tanh, relu, elu or silu.
+        activation: tanh, relu, elu, silu or fast_tanh, see `FastTanh`.
         layer_norm: whether the numbers of a hidden layer are normalised before its activation.
     """
 
@@ -216,7 +211,7 @@ class Mlp:
             device=device,
             **norm,
         )
-        if activation is nn.Tanh:
+        if activation in ORTHOGONAL:
             linear = [layer for layer in layers if isinstance(layer, nn.Linear)]
             for layer in linear:
                 nn.init.orthogonal_(layer.weight, gain if layer is linear[-1] else 2**0.5)
@@ -237,7 +232,7 @@ class Cnn(Mlp):
 
     Args:
         hidden: widths of the hidden layers after the convolutions.
-        activation: of all layers: tanh, relu, elu or silu.
+        activation: of all layers: tanh, relu, elu, silu or fast_tanh.
         channels: output channels of each convolution.
         kernels: width of each convolution.
         strides: step of each convolution.
@@ -274,7 +269,7 @@ class Gru(Mlp):
 
     Args:
         hidden: widths of the hidden layers after the GRU.
-        activation: of the hidden layers: tanh, relu, elu or silu.
+        activation: of the hidden layers: tanh, relu, elu, silu or fast_tanh.
         state: width of the state of the GRU.
         layer_norm: whether the numbers of a hidden layer are normalised before its activation.
 
