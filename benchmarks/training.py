@@ -1,7 +1,4 @@
-"""Training speed beside yardsticks.
-
-These are PPO by hand, Stable-Baselines3, and one car in NumPy and SciPy.
-"""
+"""Training speed beside yardsticks: PPO by hand, and Stable-Baselines3."""
 
 from __future__ import annotations
 
@@ -19,9 +16,9 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from benchmarks.driving import Driving, driving_env, train_config
+from benchmarks.driving import train_config
 from benchmarks.ppo import PlainPPO
-from benchmarks.timing import Row, Stopwatch, Work, measure, median_ratio, medians
+from benchmarks.timing import Row, Stopwatch, Work, clock_of, measure, median_ratio, medians
 from coil_rl.compiled import compile_steps
 from coil_rl.config.build import (
     build_bare_env,
@@ -39,8 +36,6 @@ from coil_rl.transforms import GuideActions
 
 METHODS = ("ppo", "coil")
 SHARES = ("env", "guide", "policy", "update")
-TESTS = Path(__file__).parents[1] / "tests"
-ORACLE_STEPS = 20
 SB3_ENVS = (1, 8)
 
 
@@ -55,10 +50,18 @@ class Training:
         cars: number of cars.
         steps: length of a rollout.
         compile: whether the update is compiled.
+        lean: whether collection and update take their lean forms, where they have some.
     """
 
     def __init__(
-        self, args: Namespace, method: str, cars: int, steps: int, compile: bool = False
+        self,
+        args: Namespace,
+        method: str,
+        cars: int,
+        steps: int,
+        *,
+        compile: bool = False,
+        lean: bool = True,
     ) -> None:
         config = train_config(args, method, *(["learner.compile=true"] if compile else []))
         env = env_maker(config)(cars)
@@ -67,6 +70,8 @@ class Training:
         learner = build_learner(config, env)
         keys = [*learner.keys, *watched_keys(env, {})]
         rollout = Rollout(env, learner.policy, steps, keys, config.training.noise_correlation)
+        if not lean:
+            without_lean_forms(rollout, learner)
         self.folder = tempfile.TemporaryDirectory()  # for the best policy
         self.experiment = Experiment(learner, rollout, 1, Path(self.folder.name))
         while isinstance(learner, OffPolicy) and len(learner.buffer) < learner.starts:
@@ -94,6 +99,11 @@ class Training:
         stopwatch.wrap(learner, "update", "update")
 
 
+def without_lean_forms(rollout: Rollout, learner: Any) -> None:
+    """Let a rollout and a learner take TorchRL's steps and losses, as before there were others."""
+    rollout.lean = learner.lean = None
+
+
 def has_yardstick(args: Namespace) -> bool:
     """Return whether the configured learner is PPO with continuous actions."""
     config = train_config(args, "ppo")
@@ -115,16 +125,19 @@ def by_hand(args: Namespace, method: str, cars: int, steps: int) -> Work:
 
 
 def measure_training(args: Namespace) -> list[Row]:
-    """Return a row for each batch: frames per second with and without a guide, also by hand."""
+    """Return a row for each batch: frames per second with and without a guide, also by hand.
+
+    On one thread of a CPU they are per second of its time.
+    """
     rows = []
     by_hand_too = has_yardstick(args)
     for cars, steps in args.batches:
-        rates = measure(args, _trainings(args, cars, steps, by_hand_too))
+        rates = measure(args, _trainings(args, cars, steps, by_hand_too), clock_of(args))
         row: Row = {"batch": f"{cars} x {steps}", **medians(rates)}
         if by_hand_too:
             row["floor, ppo"] = floor_rate(args, cars * steps)
         row["cost of a frame, coil / ppo"] = median_ratio(rates["ppo"], rates["coil"])
-        for kind in ("", " compiled"):
+        for kind in ("", " by TorchRL's steps", " compiled"):
             for method in METHODS:
                 name, yardstick = f"{method}{kind}", f"{method} by hand"
                 if name in rates and yardstick in rates:
@@ -138,6 +151,8 @@ def _trainings(args: Namespace, cars: int, steps: int, by_hand_too: bool) -> dic
     subjects: dict[str, Work] = {}
     for method in METHODS:
         subjects[method] = Training(args, method, cars, steps)
+        plain = f"{method} by TorchRL's steps"
+        subjects[plain] = Training(args, method, cars, steps, lean=False)
     if args.compile_updates:
         for method in METHODS:
             subjects[f"{method} compiled"] = Training(args, method, cars, steps, compile=True)
@@ -210,43 +225,6 @@ def measure_shares(args: Namespace, updates: int = 2) -> list[Row]:
             shares["framework"] = 1 - sum(shares.values())
             rows.append({"method": method, "batch": f"{cars} x {steps}", **shares})
     return rows
-
-
-def measure_one_car(args: Namespace) -> list[Row]:
-    """Return the speed of cars driven by the guide beside one car in NumPy and SciPy."""
-    ours = Driving(driving_env(args, args.compare_cars, guide=True), follow=True)
-    rates = measure(args, {"one car": one_car(args), "ours": ours})
-    row: Row = {"cars": args.compare_cars}
-    for name, rate in medians(rates).items():
-        row[f"{name} (steps/s)"] = rate
-    row["ratio"] = median_ratio(rates["ours"], rates["one car"])
-    return [{**row, "rounds": rates}]
-
-
-def one_car(args: Namespace) -> Work:
-    """Return steps of `tests/oracle.py` on the training tracks in turn, driven by the guide."""
-    sys.path.append(str(TESTS))
-    import oracle  # type: ignore[import-not-found,import-untyped,unused-ignore]
-
-    config = train_config(args, "coil")
-    keys = ("rate", "spline", "smoothing", "cone_bonus", "held_steps", "laps")
-    options = {key: config.env[key] for key in keys}
-    node = config.guide.get("spline", {})
-    guide = {key: node[key] for key in ("spline", "smoothing", "gain") if key in node}
-    cars = []
-    for track in build(config.track.train, "track.train"):
-        cars.append(oracle.OneCar(track.left, track.right, track.start, **options))
-
-    def steps() -> int:
-        for _ in range(ORACLE_STEPS):
-            car = cars[0]
-            result = car.step(oracle.guide_action(*car.cones(), car.steering, **guide))
-            if result.terminated or result.truncated:
-                cars.append(cars.pop(0))
-                cars[0].reset()
-        return ORACLE_STEPS
-
-    return steps
 
 
 def measure_sb3(args: Namespace) -> list[Row]:
