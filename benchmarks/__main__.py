@@ -150,6 +150,7 @@ def parse(argv: Sequence[str] | None = None) -> Namespace:
         help="training without compiled updates, which take minutes to compile",
     )
     parser.add_argument("--seconds", type=float, help="of each subject, all rounds together")
+    parser.add_argument("--repeats", type=int, help="rounds, in each of which every subject works")
     parser.add_argument("--quick", action="store_true", help="tiny sizes, to see that it works")
     parser.add_argument(
         "--output",
