@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from coil_rl.envs.gate import foreign
-from coil_rl.envs.gymnasium_env import controller_of, fitted_action, resolved_controller
+from coil_rl.envs.gymnasium_rows import controller_of, fitted_action, resolved_controller
 from coil_rl.envs.gymnasium_spaces import action_spec, check_action_space, lowest_choices
 from coil_rl.transforms.action_space import ActionSpace
 

@@ -1,0 +1,125 @@
+"""Makers of Gymnasium envs: how one is found by its name and called, and why it cannot be."""
+
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import gymnasium
+from gymnasium import error as errors
+
+from coil_rl.envs.gate import shortened, shown
+
+# What an error about a missing package mentions, and the extra of coil-rl that installs it.
+EXTRAS = {"box2d": "gym", "pygame": "gym", "mujoco": "mujoco", "minigrid": "babyai"}
+
+Env = gymnasium.Env[Any, Any]
+
+
+def maker_of(id: str | Callable[..., Env]) -> str | Callable[..., Env]:
+    """Return the maker that MODULE:NAME names, if it is no registered name; else `id` itself."""
+    if not isinstance(id, str) or ":" not in id:
+        return id
+    module, _, name = id.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name, None)
+    except ImportError:
+        return id  # Gymnasium says what is wrong
+    return found if callable(found) and name not in gymnasium.registry else id
+
+
+def name_of(maker: str | Callable[..., Env]) -> str:
+    """Return the name of an env for messages."""
+    return maker if isinstance(maker, str) else getattr(maker, "__qualname__", repr(maker))
+
+
+def make_env(
+    maker: str | Callable[..., Env],
+    wrappers: Sequence[Callable[[Env], Env]],
+    settings: Mapping[str, Any],
+) -> Env:
+    """Return an env in its wrappers; a `ValueError` says why it cannot be made."""
+    name = name_of(maker)
+    try:
+        if isinstance(maker, str):
+            env: Env = gymnasium.make(maker, **{"disable_env_checker": True, **settings})
+        else:
+            env = _called(maker, settings)
+        for wrapper in wrappers:
+            env = wrapper(env)
+        missing = [
+            which
+            for which in ("action_space", "observation_space")
+            if isinstance(env, gymnasium.Env) and getattr(env, which, None) is None
+        ]
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"the env {name} cannot be made: {_reason(name, error)}") from error
+    if not isinstance(env, gymnasium.Env):
+        raise ValueError(
+            f"the env {name} is {shown(env)}, not an env of Gymnasium: derive its class from "
+            "gymnasium.Env"
+        )
+    if missing:
+        raise ValueError(f"the env {name} has no {missing[0]}: set it in its __init__")
+    _check_statistics(env, name)
+    return env
+
+
+def _check_statistics(env: Env, name: str) -> None:
+    """Refuse wrappers that normalise by statistics, which a new env of an evaluation lacks."""
+    layer: Any = env
+    while layer is not None:
+        kinds = {kind.__name__ for kind in type(layer).__mro__}
+        if any(kind.startswith("NormalizeObservation") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, whose statistics an "
+                "evaluation begins anew; leave it out and give learner.normalise=true"
+            )
+        if any(kind.startswith("NormalizeReward") for kind in kinds):
+            raise ValueError(
+                f"the env {name} has the wrapper {type(layer).__name__}, which changes the returns "
+                "that a table shows by statistics of its own; leave it out, returns are the env's "
+                "own"
+            )
+        layer = getattr(layer, "env", None)
+
+
+def _called(maker: Callable[..., Env], settings: Mapping[str, Any]) -> Env:
+    """Return the env of a maker, with the settings that `gymnasium.make` would handle itself."""
+    options = dict(settings)
+    steps = options.pop("max_episode_steps", None)
+    parameters = inspect.signature(maker).parameters.values()
+    takes_any = any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters)
+    if not takes_any and "render_mode" not in [parameter.name for parameter in parameters]:
+        options.pop("render_mode", None)
+    env = maker(**options)
+    return env if steps is None else gymnasium.wrappers.TimeLimit(env, steps)
+
+
+def _reason(id: str, error: BaseException) -> str:
+    """Return in a few words why an env cannot be made, with a remedy where one is known."""
+    extra = next((EXTRAS[name] for name in EXTRAS if name in f"{id} {error}".lower()), None)
+    if extra and isinstance(error, (errors.DependencyNotInstalled, ModuleNotFoundError)):
+        return f"a package is not installed: python -m pip install 'coil-rl[{extra}]'"
+    if not isinstance(error, errors.Error):  # of the env itself
+        text = shortened(re.split(r" was raised from", str(error).strip())[0])
+        return f"it raised {type(error).__name__}: {text}" if text else type(error).__name__
+    first_line = re.split(r"\n| was raised from", str(error).strip())[0].rstrip(".")
+    if not id:
+        return "env.id is empty; write env.id=MODULE:NAME, or the id of a registered env"
+    if not isinstance(error, (errors.NameNotFound, errors.NamespaceNotFound)):
+        return first_line or type(error).__name__
+    module, _, name = id.rpartition(":")
+    if module:
+        return f"{module} has no env {name}, and registers none of this name"
+    # Gymnasium may have a suggestion of its own: "Did you mean ...".
+    if "mean" in first_line:
+        return first_line
+    return f"{first_line}; if a package registers it, write PACKAGE:{id}"
+
+
+def metadata_of(env: Env, key: str, default: Any) -> Any:
+    """Return an entry of the metadata of an env, which may have none."""
+    metadata = getattr(env, "metadata", None)
+    return (metadata.get(key) or default) if isinstance(metadata, Mapping) else default
