@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from cmaes import CMA
 from numpy.typing import NDArray
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -211,6 +210,8 @@ class Tuner:
 
     def _begin(self) -> None:
         """Begin the search at the guide's own numbers."""
+        from cmaes import CMA  # imports scipy.stats, which takes a second in every training
+
         self.told = []
         first = np.array([number.place(number.own) for number in self.numbers])
         self.cma = CMA(

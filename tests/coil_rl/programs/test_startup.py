@@ -64,6 +64,20 @@ def test_wrong_override_is_refused_without_heavy_imports(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_training_imports_no_library_that_it_does_not_use():
+    """Each of these takes half a second or more in every training, and is for something else."""
+    script = (
+        "import coil_rl.config.build, coil_rl.config.check, sys\n"
+        "others = {'pandas', 'scipy.stats', 'scipy.interpolate', 'sklearn', 'skops'}\n"
+        "print(sorted(others & set(sys.modules)))\n"
+    )
+    command = [sys.executable, "-c", script]
+    done = subprocess.run(
+        command, env=environment(ROOT), capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "[]"
+
+
 def test_info_imports_nothing_heavy(tmp_path):
     ((code, _, _, heavy),) = start(tmp_path, ["info"])
     assert (code, heavy) == (0, set())
