@@ -77,25 +77,40 @@ def keep_written(
                 f"{text} chooses several files of a group that takes one; for a run with each "
                 f"write -m {group}={value.strip('[]')}"
             )
-    if all(source.full_path().startswith(SHIPPED) for source in files.get_sources()):
-        return  # to look for files of users takes as long as to compose all of them
-    defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
-    # A choice of a file, such as method=coil, gives no value.
-    typed = [key for key in map(key_of, task) if not files.group_exists(key.replace(".", "/"))]
-    last: dict[str, Written] = {}
     with open_dict(config):
-        for written in _written(defaults, files):
-            if any(_covers(key, written.key) for key in typed):
-                continue
-            other = last.get(written.key, written)
-            last[written.key] = written
-            if other.value != written.value and not _lists(other, written):
-                raise UserError(
-                    f"{written.key} is {other.value} in {other.file} and {written.value} in "
-                    f"{written.file}; leave one out, or give it on the command line"
-                )
-            _put(config, written)
+        # To look for files of users takes as long as to compose all files.
+        if not all(source.full_path().startswith(SHIPPED) for source in files.get_sources()):
+            defaults = loader.compute_defaults_list(config_name, overrides, RunMode.RUN).defaults
+            # A choice of a file, such as method=coil, gives no value.
+            keys = [key_of(text) for text in task]
+            typed = [key for key in keys if not files.group_exists(key.replace(".", "/"))]
+            _keep(config, _written(defaults, files), typed)
         complete_measures(config)
+
+
+def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -> None:
+    """Put values of users' files into their places.
+
+    Args:
+        config: composed; it is changed in place.
+        values: in the order of composition.
+        typed: keys that the command line gives.
+
+    Raises:
+        UserError: for a value that two files give differently, or that has no place.
+    """
+    last: dict[str, Written] = {}
+    for written in values:
+        if any(_covers(key, written.key) for key in typed):
+            continue
+        other = last.get(written.key, written)
+        last[written.key] = written
+        if other.value != written.value and not _lists(other, written):
+            raise UserError(
+                f"{written.key} is {other.value} in {other.file} and {written.value} in "
+                f"{written.file}; leave one out, or give it on the command line"
+            )
+        _put(config, written)
 
 
 def _put(config: DictConfig, written: Written) -> None:

@@ -46,13 +46,7 @@ def driven_once(
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         pass  # they are driven
     results = drive()
-    numbers = sum(
-        history.size
-        for result in results.values()
-        for histories in result.histories.values()
-        for history in histories
-    )
-    if results and numbers <= MOST_NUMBERS:
+    if results and _numbers(results) <= MOST_NUMBERS:
         guides = {name: _plain(result) for name, result in results.items()}
         write_text(file, json.dumps({"key": key, "guides": guides}))
     return results
@@ -63,6 +57,15 @@ def _key(settings: Mapping[str, Any], evaluation: object) -> str:
     values = {name: settings.get(name) for name in OF_GUIDES}
     text = json.dumps([values, repr(evaluation)], sort_keys=True, default=repr)
     return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _numbers(results: Results) -> int:
+    """Return how many numbers the recorded steps have."""
+    count = 0
+    for result in results.values():
+        for histories in result.histories.values():
+            count += sum(history.size for history in histories)
+    return count
 
 
 def _plain(result: EvaluationResult) -> dict[str, Any]:
