@@ -440,7 +440,9 @@ class GuideActions(ActionTransform):
         somebody else, in every step.
         """
         try:
-            if name not in self._checked or getattr(self.guides.guides[name], "foreign", False):
+            foreign = getattr(self.guides.guides[name], "foreign", False)
+            # An exported function cannot raise.
+            if (name not in self._checked or foreign) and not torch.compiler.is_exporting():
                 self.guide_space.check_advice(action, batch)
                 self._checked.add(name)
             advice = self.guide_space.advice(action, batch)

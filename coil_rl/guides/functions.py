@@ -52,13 +52,14 @@ class FunctionGuide(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action."""
-        flat = tensordict.select(*self.in_keys).reshape(-1)
-        entries = [flat[key] for key in self.in_keys]
         if self.for_batch is None:
-            self.for_batch = self._takes_batch(entries)
+            first = tensordict.select(*self.in_keys).reshape(-1)
+            self.for_batch = self._takes_batch([first[key] for key in self.in_keys])
         if self.for_batch:
             action = self._of_batch([tensordict[key] for key in self.in_keys])
             return tensordict.set("action", action)
+        flat = tensordict.select(*self.in_keys).reshape(-1)
+        entries = [flat[key] for key in self.in_keys]
         rows = [self._alone(entries, row) for row in range(len(flat))]
         if len({row.shape for row in rows}) > 1:
             shapes = ", ".join(sorted({str(list(row.shape)) for row in rows}))
