@@ -152,5 +152,7 @@ def _reason(error: BaseException) -> str:
     """Return in a few words what a library says about a function that it cannot write."""
     if "data-dependent" in str(error):
         return "what it does depends on the values of its numbers, as an `if` on a tensor does"
+    if "Constraints violated" in str(error):
+        return "it takes one number of rows only, not any"
     lines = str(error).strip().splitlines() or [""]
     return textwrap.shorten(f"{type(error).__name__}: {lines[0]}", 200, placeholder=" ...")

@@ -59,6 +59,7 @@ def driven() -> EvaluationResult:
     from coil_rl.config.saved import read_config
     from coil_rl.run.judge import PolicyAndGuides
     from coil_rl.run.parts import TEST
+    from coil_rl.run.policy_batch import TracedPolicy
 
     folder = folder_of(POLICY)
     config = read_config(folder, "run")
@@ -69,7 +70,7 @@ def driven() -> EvaluationResult:
     config.evaluation.cases = [TRACK]
     run = assemble(config, folder)
     env = run.make_env(2, TEST)
-    policy = PolicyAndGuides(env, run.policy(env), 1, 1)
+    policy = PolicyAndGuides(env, TracedPolicy(run.policy(env)), 1, 1)
     evaluation = build_evaluation(config, {"pose": ("info", "pose")})
     return evaluation.run(env, policy)
 
