@@ -76,7 +76,8 @@ def record(
         seed: of the env and of the drawn actions.
         tick: called after every step.
     """
-    env = transformed(run.make_env.bare(1, TRAIN, None), [], "env").eval()
+    bare = run.make_env.of_agent or run.make_env.bare
+    env = transformed(bare(1, TRAIN, None), [], "env").eval()
     env.set_seed(seed)
     keys = [*env.base_env.observation_spec.keys()]
     recording, heard = Recording(), _Heard(controller)

@@ -32,8 +32,20 @@ def export(config: DictConfig) -> None:
     guide = exported.contract["guide"]["place"]
     size = exported.contract["files"][exported.file.name]["bytes"] / 1000
     print(f"export: {exported.file} has {size:.0f} kB; guide {guide}; see {config.run_dir}")
-    run, folder = shlex.quote(str(config.run)), shlex.quote(str(config.run_dir))
-    print(f"Next: coil-evaluate run={run} exported={folder}")
+    print(f"Next: {next_step(str(config.run), str(config.run_dir), guide)}")
+
+
+def next_step(run: str, folder: str, guide: str) -> str:
+    """Return what to type after an export.
+
+    Args:
+        run: that was exported.
+        folder: of the files.
+        guide: its place, "inside", "outside" or "absent".
+    """
+    if guide == "outside":
+        return f"coil_rl.ExportedPolicy({folder!r}).act(observation, guide_action) in Python"
+    return f"coil-evaluate run={shlex.quote(run)} exported={shlex.quote(folder)}"
 
 
 def check(config: DictConfig) -> None:

@@ -6,6 +6,7 @@ import pytest
 from programs import called
 
 from coil_rl.export.contract import CONTRACT
+from coil_rl.programs.export import next_step
 
 RUN = "run=pretrained:pendulum/coil"
 
@@ -24,6 +25,12 @@ def test_export_prints_what_it_does_and_what_comes_next(exported):
     assert lines[0] == "export: 30 observations of coil in its env ..."
     assert any("the file differs from torch by at most" in line for line in lines)
     assert f"Next: coil-evaluate {RUN} exported={folder}" == lines[-1]
+
+
+def test_next_step_of_a_guide_outside_is_python():
+    assert next_step("RUN", "folder", "absent") == "coil-evaluate run=RUN exported=folder"
+    text = "coil_rl.ExportedPolicy('folder').act(observation, guide_action) in Python"
+    assert next_step("RUN", "folder", "outside") == text
 
 
 def test_contract_says_what_the_numbers_mean(exported):
