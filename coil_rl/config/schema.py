@@ -284,6 +284,31 @@ class ExportConfig(ProgramConfig):
 
 
 @dataclass
+class DriveConfig(ProgramConfig):
+    """Configuration of `coil-drive`."""
+
+    run: str | None = None
+    controller: dict[str, Any] = field(default_factory=dict)
+    policy: WhichPolicy = "handed_over"
+    where: Annotated[str, one_of("simulation", "recording", "ros")] = "simulation"
+    recording: Any = None
+    rate: Annotated[float | None, Field(gt=0)] = None
+    car: dict[str, Any] = MISSING
+    perception: dict[str, Any] = MISSING
+    spline: Annotated[str, one_of("cubic", "quadratic")] = "cubic"
+    smoothing: Annotated[float, Field(ge=0)] = 0.1
+    limits: dict[str, Any] = field(default_factory=dict)
+    simulation: dict[str, Any] = field(default_factory=dict)
+    ros: dict[str, Any] = field(default_factory=dict)
+    lift_after: Annotated[float | None, Field(ge=0)] = None
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 1
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+@dataclass
 class ReportConfig(ProgramConfig):
     """Configuration of `coil-report`."""
 
@@ -350,3 +375,4 @@ _store(name="report_schema", node=ReportConfig)
 _store(name="listen_schema", node=_open_to_measures(ListenConfig))
 _store(name="replay_schema", node=ReplayConfig)
 _store(name="export_schema", node=ExportConfig)
+_store(name="drive_schema", node=DriveConfig)

@@ -1,4 +1,4 @@
-"""The robot's cone classifier: training and evaluation."""
+"""The robot: its cone classifier, and live driving by its scans."""
 
 from coil_rl.robot.classifier import LabelledClusters as LabelledClusters
 from coil_rl.robot.classifier import Scans as Scans
@@ -12,3 +12,12 @@ from coil_rl.robot.classifier import recall as recall
 from coil_rl.robot.classifier import save_classifier as save_classifier
 from coil_rl.robot.classifier import share_of as share_of
 from coil_rl.robot.classifier import train_on_drives as train_on_drives
+from coil_rl.robot.drive_log import DriveLog as DriveLog
+from coil_rl.robot.driver import Car as Car
+from coil_rl.robot.driver import Command as Command
+from coil_rl.robot.driver import LiveDriver as LiveDriver
+from coil_rl.robot.driver import Moment as Moment
+from coil_rl.robot.sources import drive_recording as drive_recording
+from coil_rl.robot.sources import drive_simulation as drive_simulation
+from coil_rl.robot.watchdog import Limits as Limits
+from coil_rl.robot.watchdog import Scan as Scan

@@ -256,6 +256,10 @@ class SimulatedRobotEnv(SeededEnv):
         )
         return self.lidar.measure(true, self.generator)[0]
 
+    def stand(self) -> None:
+        """Measure another scan while all robots stand, which is no step of their episodes."""
+        self.scan = self._measure(self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams))
+
     def _perceive(self) -> dict[str, Tensor]:
         """Update the memory with the last scan; return the entries that come from it."""
         found, number = self.perception(self.scan.numpy(), self.lidar.angles.numpy())
