@@ -25,12 +25,15 @@ from coil_rl.compiled import compile_steps
 from coil_rl.config.build import build_bare_env, build_guides
 from coil_rl.envs import (
     Perception,
+    SimulatedRobotEnv,
     read_recording,
     save_drive,
     simulated_cone_classifier,
     simulated_drive,
 )
 from coil_rl.transforms import GuideActions
+
+ROBOTS = 256  # in the simulator, side by side
 
 
 def train_config(args: Namespace, method: str, *more: str) -> DictConfig:
@@ -207,7 +210,9 @@ def measure_robot(args: Namespace) -> list[Row]:
             perceive(ranges, angles)
             return len(ranges)
 
+        simulated = Driving(SimulatedRobotEnv(num_envs=ROBOTS, starts=32, time_limit=20.0))
         subjects = {
+            f"simulator, {ROBOTS} robots": simulated,
             "reading MCAP": lambda: len(read_recording(path).ranges),
             "perception, whole recording": whole_recording,
             "perception, single scans": single_scan,

@@ -224,14 +224,21 @@ def _sort_across_zero(bearing: Array, order: Integers, first: Integers, last: In
     Returns:
         The order in which such a cluster starts after its widest gap in bearing.
     """
-    sorted_bearing = bearing[order]
     # A cluster that spans at most half a circle has its widest gap outside.
-    if not (sorted_bearing[last] - sorted_bearing[first] > np.pi).any():
+    across = np.flatnonzero(bearing[order[last]] - bearing[order[first]] > np.pi)
+    if not len(across):
         return order
-    cluster = np.repeat(np.arange(len(first)), last - first + 1)
+    size = (last - first + 1)[across]
+    end = np.cumsum(size)
+    first_own, last_own = end - size, end - 1
+    place = np.arange(end[-1]) + np.repeat(first[across] - first_own, size)
+    sorted_bearing = bearing[order[place]]
+    cluster = np.repeat(np.arange(len(across)), size)
     gap = np.diff(sorted_bearing, prepend=sorted_bearing[0])
-    gap[first] = TWO_PI - (sorted_bearing[last] - sorted_bearing[first])
-    widest = np.flatnonzero(gap == np.maximum.reduceat(gap, first)[cluster])
+    gap[first_own] = TWO_PI - (sorted_bearing[last_own] - sorted_bearing[first_own])
+    widest = np.flatnonzero(gap == np.maximum.reduceat(gap, first_own)[cluster])
     start = widest[_block_bounds(cluster[widest])[0]]
-    before = np.arange(len(order)) < start[cluster]
-    return order[np.lexsort((sorted_bearing + TWO_PI * before, cluster))]
+    before = np.arange(len(place)) < start[cluster]
+    sorted_order = order.copy()
+    sorted_order[place] = order[place[np.lexsort((sorted_bearing + TWO_PI * before, cluster))]]
+    return sorted_order

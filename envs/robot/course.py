@@ -143,12 +143,28 @@ class RobotCourse:
         """
         cones, radius = self.cones[:, track].transpose(1, 2), self.radius[track].t()
         outside = Frame(pose).to_car(cones).abs() - torch.tensor(OUTLINE).view(2, 1, 1) / 2
-        to_cone = (outside.clamp(min=0).norm(dim=0) - radius).amin(0)
-        centre = pose[:2].unsqueeze(-1)
-        to_boundaries = torch.stack(
-            [(line[:, track] - centre).norm(dim=0).amin(-1) for line in self.boundaries]
+        to_cone = (_root(_squares(*outside.clamp(min=0))) - radius).amin(0)
+        x, y = pose[:2].unsqueeze(-1)
+        # The smallest square has the smallest root.
+        to_boundaries = _root(
+            torch.stack(
+                [
+                    _squares(line_x[track] - x, line_y[track] - y).amin(-1)
+                    for line_x, line_y in self.boundaries
+                ]
+            )
         )
         return torch.minimum(to_cone, to_boundaries.amin(0) - BOUNDARY_MARGIN), to_boundaries
+
+
+def _squares(x: Tensor, y: Tensor) -> Tensor:
+    """Return x^2 + y^2."""
+    return (x * x).add_(y * y)
+
+
+def _root(squares: Tensor) -> Tensor:
+    """Return the square root with the rounding of a norm; that of float32 differs in the end."""
+    return squares.double().sqrt().to(squares.dtype)
 
 
 def cones_of(track: Track, *, left: bool = True, right: bool = True) -> tuple[Tensor, Tensor]:

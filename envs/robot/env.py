@@ -138,6 +138,8 @@ class SimulatedRobotEnv(SeededEnv):
         finish = np.stack([track.finish for track in self.tracks], axis=1)
         self.finish = torch.tensor(finish).float()
         self._register_state(num_envs)
+        # The last scans, and the cones and their numbers that were perceived in them.
+        self._seen: tuple[Tensor, Tensor, Tensor] | None = None
         declare_specs(self, self._reset())
         self.set_seed(seed)
 
@@ -147,6 +149,11 @@ class SimulatedRobotEnv(SeededEnv):
         scale = self.perception.scale
         sight = self.perception.range_max * scale
         return of_cones(sight, math.degrees(self.max_steering), scale)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restore the state of the generator; the scans are perceived anew."""
+        super().set_extra_state(state)
+        self._seen = None
 
     def _register_state(self, num_envs: int) -> None:
         """Register all state that is not in the memory of the boundaries as buffers."""
@@ -184,12 +191,13 @@ class SimulatedRobotEnv(SeededEnv):
             setattr(self, name, torch.where(mask, value, getattr(self, name)))
         begun = self.lap_start > NEVER
         self.in_finish = torch.where(mask, self._inside() & begun, self.in_finish)
+        rows = mask.nonzero().squeeze(-1)
         standing = self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams)
-        self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing), self.scan)
+        known = self._seen is not None and self._seen[0] is self.scan
+        self.scan = torch.where(mask.unsqueeze(-1), self._measure(standing, rows), self.scan)
         self.memory.reset(mask)
-        # Robots that are not reset perceive their last scan again, which does not change their
-        # memory.
-        view = self._perceive()
+        # Robots that are not reset see what they saw, which does not change their memory.
+        view = self._perceive(rows if known else None)
         zero = torch.zeros(self.batch_size)
         terms = dict.fromkeys(TERMS, zero)
         flags = {"crashed": zero.bool(), "completed": zero.bool()}
@@ -246,24 +254,41 @@ class SimulatedRobotEnv(SeededEnv):
         self.pose = move_along_arc(self.pose, torch.full_like(turn, self.step_length), turn)
         self.scan = self._measure(poses)
 
-    def _measure(self, poses: Tensor) -> Tensor:
-        """Return a scan [B, P] m, measured at a pose for each beam, [3, B, P]."""
-        true, _ = cast_beams(
-            poses,
-            self.lidar.angles,
-            self.course.cones[:, self.track],
-            self.course.radius[self.track],
-        )
+    def _measure(self, poses: Tensor, rows: Tensor | None = None) -> Tensor:
+        """Return a scan [B, P] m, measured at a pose for each beam.
+
+        Args:
+            poses: [3, B, P].
+            rows: indices of the robots whose scan is needed; None for all. Noise is drawn for all.
+        """
+        if rows is None:
+            rows = torch.arange(self.batch_size[0])
+        track = self.track[rows]
+        cones, radius = self.course.cones[:, track], self.course.radius[track]
+        distance, _ = cast_beams(poses[:, rows], self.lidar.angles, cones, radius)
+        true = torch.full_like(self.scan, torch.inf).index_copy(0, rows, distance)
         return self.lidar.measure(true, self.generator)[0]
 
     def stand(self) -> None:
         """Measure another scan while all robots stand, which is no step of their episodes."""
         self.scan = self._measure(self.pose.unsqueeze(-1).expand(-1, -1, self.lidar.beams))
 
-    def _perceive(self) -> dict[str, Tensor]:
-        """Update the memory with the last scan; return the entries that come from it."""
-        found, number = self.perception(self.scan.numpy(), self.lidar.angles.numpy())
+    def _perceive(self, rows: Tensor | None = None) -> dict[str, Tensor]:
+        """Update the memory with the last scan; return the entries that come from it.
+
+        Args:
+            rows: indices of the robots whose scan is a new one; None for all.
+        """
+        scans = self.scan if rows is None else self.scan[rows]
+        found, number = self.perception(scans.numpy(), self.lidar.angles.numpy())
         cones, count = torch.from_numpy(found).float(), torch.from_numpy(number)
+        if rows is not None and self._seen is not None:
+            _, all_cones, all_counts = self._seen
+            cones, count = (
+                all_cones.index_copy(0, rows, cones),
+                all_counts.index_copy(0, rows, count),
+            )
+        self._seen = self.scan, cones, count
         observation, valid = self.memory(cones, count)
         return {"observation": observation, "cones": cones, "cone_count": count, "valid": valid}
 

@@ -88,8 +88,10 @@ class ConeClassifier:
         """Return the decision values of both machines [C, 2] for features [C, F]."""
         rows = np.asarray(features, dtype=np.float64).reshape(-1, len(self.mean))
         x = (rows - self.mean) / self.scale
-        squares = (x * x).sum(1)[:, None] + (self.support * self.support).sum(1)
-        kernel = np.exp(-self.gamma * (squares - 2 * (x @ self.support.T)))
+        kernel = (x * x).sum(1)[:, None] + (self.support * self.support).sum(1)
+        kernel -= 2 * (x @ self.support.T)
+        kernel *= -self.gamma
+        np.exp(kernel, out=kernel)
         return np.asarray(kernel @ self.weights.T + self.intercept, dtype=np.float64)
 
     def classify(self, features: NDArray[np.floating]) -> Integers:

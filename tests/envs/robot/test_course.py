@@ -122,3 +122,13 @@ def test_only_complete_laps_count_without_the_time_before_the_start():
     assert laps(*waiting).seconds == pytest.approx([4 * np.pi], rel=1e-3)
     swaying = np.outer([0, 0.1, -0.1, 0.1, -0.1, 0.1], [1, 0, 0])
     assert len(laps(swaying, np.arange(6.0)).seconds) == 0
+
+
+def test_clearance_is_that_of_norms_over_all_points_to_the_last_bit():
+    course, draw = RobotCourse(robot_tracks(count=2)), torch.Generator().manual_seed(0)
+    track = torch.arange(200) % 2
+    pose = 3 * torch.rand(3, 200, generator=draw) - 1.5
+    _, found = course.clearance(track, pose)
+    centre = pose[:2].unsqueeze(-1)
+    expected = [(line[:, track] - centre).norm(dim=0).amin(-1) for line in course.boundaries]
+    assert torch.equal(found, torch.stack(expected))

@@ -189,3 +189,19 @@ def test_configuration_agrees_with_the_defaults():
         }
         assert {name: vars(one)[name] for name in numbers} == pytest.approx(numbers, rel=1e-5)
     assert {key: float(value) for key, value in env.weights.items()} == plain.weights
+
+
+def test_robots_that_are_not_reset_keep_what_they_saw():
+    def driven(forget):
+        env = SimulatedRobotEnv(num_envs=16, starts=16, time_limit=2.0, assignment="cyclic")
+        torch.manual_seed(0)
+        state, rows = env.reset(), []
+        for _ in range(20):
+            step, state = env.step_and_maybe_reset(env.rand_action(state))
+            rows.append(step)
+            if forget:  # all scans are perceived anew
+                env.load_state_dict(env.state_dict())
+        return rows
+
+    for one, other in zip(driven(False), driven(True), strict=True):
+        assert (one == other).all()

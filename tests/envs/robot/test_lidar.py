@@ -104,3 +104,53 @@ def test_arc_equals_many_small_steps():
 def test_invalid_options_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))}="):
         SimulatedLidar(**wrong)
+
+
+def all_pairs(poses, angles, cones, radius):
+    """Return what `cast_beams` does, computed for all pairs of beams and cones."""
+    direction = poses[2] + angles
+    cos, sin = direction.cos().unsqueeze(-1), direction.sin().unsqueeze(-1)
+    x, y = (
+        centre.unsqueeze(-2) - sensor.unsqueeze(-1)
+        for centre, sensor in zip(cones, poses[:2], strict=True)
+    )
+    along, across = x * cos + y * sin, y * cos - x * sin
+    half_chord_squared = radius.square().unsqueeze(-2) - across.square()
+    distance = along - half_chord_squared.clamp(min=0).sqrt()
+    nearest, cone = torch.where((half_chord_squared > 0) & (along > 0), distance, torch.inf).min(-1)
+    return nearest, torch.where(nearest.isfinite(), cone, -1)
+
+
+@pytest.mark.parametrize("own", ["one turn for all", "bearings, cones and gaps of each sensor"])
+def test_beams_in_windows_are_those_of_all_pairs_to_the_last_bit(own):
+    lidar, draw = SimulatedLidar(), torch.Generator().manual_seed(0)
+    cones, radius = 3 * torch.rand(2, 40, 40, generator=draw), 0.1 * torch.rand(40, generator=draw)
+    start = torch.cat(
+        [3 * torch.rand(2, 40, generator=draw), 20 * torch.randn(1, 40, generator=draw)]
+    )
+    start[:2, :3] = cones[:, 0, :3] + 0.01  # within a cone
+    turn = torch.randn(40, 1, generator=draw)
+    poses = move_along_arc(start.unsqueeze(-1), 0.1 * lidar.phase, turn * lidar.phase)
+    angles = lidar.angles
+    if own.startswith("one"):
+        cones = cones[:, 0]
+    else:
+        angles = angles + torch.randn(40, 1, generator=draw)
+        angles[::2] = angles[::2].flip(-1)
+        radius = radius.expand(40, 40)
+        poses[:, 5:9, 300:] = torch.nan
+    expected = all_pairs(poses, angles, cones, radius)
+    for found, value in zip(cast_beams(poses, angles, cones, radius), expected, strict=True):
+        known = ~poses[0].isnan()
+        assert torch.equal(found[known], value[known])
+        assert bool((found[~known].isinf() | (found[~known] == -1)).all())
+
+
+def test_no_sensor_and_no_cone_are_allowed():
+    lidar = SimulatedLidar()
+    poses = torch.zeros(3, 2, 360)
+    nearest, cone = cast_beams(poses, lidar.angles, torch.zeros(2, 0), torch.zeros(0))
+    assert bool(nearest.isinf().all())
+    assert bool((cone == -1).all())
+    cones = torch.ones(2, 4)
+    assert cast_beams(poses[:, :0], lidar.angles, cones, torch.ones(4))[0].shape == (0, 360)
