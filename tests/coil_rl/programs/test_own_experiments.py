@@ -36,6 +36,7 @@ REFUSED = {
     "advice_sparse_reward": "it leaves out the cone world's reward for cones",
     "driving_guides": "it is about the tasks of env=driving_tasks",
     "driving_tasks": "it is about the tasks of env=driving_tasks",
+    "robot_delay": "its control rate and its delay are those of the robot",
     "promise": "its tasks are envs of their own; for another env take its arms",
 }
 ENV = [
