@@ -86,7 +86,7 @@ def _controller(config: DictConfig, car: Any) -> tuple[Any, float]:
 
     if config.run is None:
         return build(config.controller, "controller"), config.rate
-    controller = open_run(Path(config.run).expanduser()).controller(config.policy)
+    controller = open_run(config.run, device=config.device).controller(config.policy)
     if config.rate is not None:
         return controller, config.rate
     plant: Any = controller.plant

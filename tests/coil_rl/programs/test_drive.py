@@ -52,6 +52,13 @@ def test_a_run_of_the_cone_world_drives_the_robot(tmp_path):
     assert "rate: scans arrive 5.5 times per second, the policy was trained for 12.6" in done.stdout
 
 
+@pytest.mark.slow
+def test_a_shipped_policy_completes_a_lap_of_the_robot(tmp_path):
+    words = ["run=pretrained:cone_track/coil", "simulation.laps=1", "hydra.run.dir=drive"]
+    done = called("drive", *words, cwd=tmp_path)
+    assert "210 scans (driving 210); the robot completed its laps; 1 laps." in done.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
