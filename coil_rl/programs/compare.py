@@ -20,14 +20,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hydra import compose, initialize_config_module
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
+from omegaconf.errors import OmegaConfBaseException
 
+import coil_rl.config.schema  # noqa: F401  the types that the configurations begin with
 from coil_rl.config.sentences import sentence
 from coil_rl.config.trust import trust_packages
 from coil_rl.config.written import quoted
 from coil_rl.errors import UserError
-from coil_rl.output import say
 from coil_rl.programs import app, folders
 
 CONFIG_DIR = ("--config-dir", "-cd")  # of Hydra: a folder with YAML files of the user
@@ -45,6 +47,8 @@ def compare(arguments: Sequence[str]) -> None:
     minutes, seed = _number(own, "minutes", 2.0), _number(own, "seed", 0)
     if not isinstance(seed, int):
         raise UserError(f"seed={own['seed']} must be a whole number")
+    _check_composes(words)
+    # They import PyTorch, which takes seconds.
     from coil_rl.config.python import Named
     from coil_rl.worth.comparison import Comparison, new_folder
 
@@ -57,8 +61,8 @@ def compare(arguments: Sequence[str]) -> None:
     place = new_folder() if folder is None else folder
     others = [argument for argument in arguments if not argument.startswith("folder=")]
     command = shlex.join(["coil-compare", *others, f"folder={place}"])
-    comparison = Comparison(Named(words, nodes), place, minutes=float(minutes), seed=seed)
-    say(f"if this is stopped, go on with: {command}", error=True)
+    given = Named(words, nodes)
+    comparison = Comparison(given, place, minutes=float(minutes), seed=seed, command=command)
     try:
         comparison.run()
     except KeyboardInterrupt:
@@ -78,6 +82,8 @@ def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
                 raise UserError(f"{key}: {place} is no folder; give one with YAML files")
             words.append(f"hydra.searchpath=[{quoted(f'file://{place}')}]")
             continue
+        if argument.startswith("-"):
+            raise UserError(f"{argument} is no argument of coil-compare; give KEY=VALUE")
         if key in OWN:
             if not equals or not value:
                 raise UserError(f"{argument}: give {key}=VALUE")
@@ -85,6 +91,15 @@ def _split(arguments: Sequence[str]) -> tuple[dict[str, str], list[str]]:
         else:
             words.append(folders.spelled(argument))
     return own, words
+
+
+def _check_composes(words: Sequence[str]) -> None:
+    """Raise a `UserError` for a word that does not fit the configuration, in a moment."""
+    try:
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            compose("train", [*words, "method=coil_anchored", "run_dir=unused"])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise UserError(sentence(error)) from error
 
 
 def _number(own: dict[str, str], key: str, default: float) -> float:

@@ -84,8 +84,6 @@ def check_words(words: Sequence[str]) -> None:
         reason = OWN.get(key_of(word))
         if reason is not None:
             raise UserError(f"{word} cannot be given to coil-compare: {reason}; leave it out")
-        if word.startswith("-"):
-            raise UserError(f"{word} is no argument of coil-compare; give KEY=VALUE")
 
 
 def short_words(words: Sequence[str], config: DictConfig, cases: int | None) -> list[str]:

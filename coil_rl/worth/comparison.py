@@ -128,16 +128,26 @@ class Comparison:
         folder: of the comparison; each training has a folder in it.
         minutes: that it may take, about.
         seed: of the first trainings.
+        command: by which it goes on if it is stopped; empty for none.
 
     Raises:
         UserError: for a word that a comparison decides itself, and for no time.
     """
 
-    def __init__(self, given: Named, folder: Path, *, minutes: float = 2.0, seed: int = 0) -> None:
+    def __init__(
+        self,
+        given: Named,
+        folder: Path,
+        *,
+        minutes: float = 2.0,
+        seed: int = 0,
+        command: str = "",
+    ) -> None:
         check_words(given.words)
         if not 0 < minutes < math.inf:
             raise UserError(f"minutes={minutes:g} must be above 0; 2 is the default")
         self.given, self.folder, self.minutes, self.seed = given, folder, minutes, seed
+        self.command = command
         self.overhead = 0.0  # s, to prepare a training
 
     def run(self) -> Worth:
@@ -213,6 +223,8 @@ class Comparison:
             return self._known_plan(file, json.loads(json.dumps(identity)))
         if any(self.folder.rglob("config.yaml")):
             raise UserError(f"{self.folder} holds runs of something else; choose another folder")
+        if self.command:
+            say(f"if this is stopped, go on with: {self.command}", error=True)
         say("coil-compare: timing the env and the guide", error=True)
         with quietly():
             pace = timing.measure(config, self.overhead)
