@@ -49,7 +49,7 @@ napoleon_use_ivar = True  # attributes once, in the docstring of their class
 nb_execution_mode = "cache"
 nb_execution_cache_path = str(Path(__file__).parents[1] / "build" / "notebooks")
 nb_execution_raise_on_error = True
-nb_execution_timeout = 300
+nb_execution_timeout = 1200  # seconds a cell, also on a busy machine
 nb_merge_streams = True
 nb_output_stderr = "remove"  # progress bars
 

@@ -9,6 +9,7 @@ NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
 # A part of what a cell of each must show.
 SHOWN = {
     "your_env_and_controller": ("coil_anchored", "l/s"),
+    "is_my_guide_worth_it": ("coil_anchored", "coil_rl.train(env"),
     "from_a_recording": ("scans with a command", "network  reward"),
 }
 
@@ -23,7 +24,7 @@ def test_it_runs_with_the_backend_that_a_notebook_sets(notebook, tmp_path, monke
     monkeypatch.setenv("MPLBACKEND", "module://matplotlib_inline.backend_inline")
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     cells = jupytext.read(notebook, fmt="py:percent")
-    NotebookClient(cells, timeout=600, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    NotebookClient(cells, timeout=1200, resources={"metadata": {"path": str(tmp_path)}}).execute()
     outputs = [output for cell in cells.cells for output in cell.get("outputs", ())]
     texts = [output.get("text", "") for output in outputs]
     data = [output.get("data", {}) for output in outputs]
