@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench test-extras kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench test-extras test-versions kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -16,7 +16,7 @@ venv: $(INSTALLED) ## make .venv with the tested versions (PYTHON=... selects th
 
 $(INSTALLED): pyproject.toml constraints.txt
 	@command -v $(PYTHON) >/dev/null || { \
-		echo "$(PYTHON) was not found; install Python 3.11, or name yours: make PYTHON=/path/to/python" >&2; exit 2; }
+		echo "$(PYTHON) was not found; install Python 3.11 to 3.13, or name yours: make PYTHON=/path/to/python" >&2; exit 2; }
 	@echo "Installing coil-rl, PyTorch and the developer tools into .venv (a few minutes the first time) ..."
 	@$(PYTHON) -m venv .venv
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[dev]'
@@ -55,6 +55,9 @@ test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that com
 test-extras: $(INSTALLED) ## install Weights & Biases and MLflow and run the tests of the loggers
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[wandb,mlflow]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m '' tests/coil_rl/config/test_logger.py tests/coil_rl/programs/test_loggers.py
+
+test-versions: $(INSTALLED) ## try the floor and the ceiling of each range (minutes and gigabytes each)
+	$(BIN)/python tests/try_versions.py $(ARGS)
 
 kill-test: $(INSTALLED) ## kill 20 short trainings at random moments, resume and compare (20 minutes)
 	$(BIN)/python tests/kill_and_resume.py --kills 20 $(ARGS)
