@@ -5,7 +5,7 @@ BIN := .venv/bin
 INSTALLED := .venv/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench test-extras test-versions kill-test check format wheel clean
+.PHONY: help venv train evaluate bench reproduce docs test test-all test-bench test-extras test-wheel test-versions kill-test check format wheel clean
 
 help: ## show this list
 	@echo "make TARGET [ARGS='...']"
@@ -55,6 +55,9 @@ test-bench: $(INSTALLED) ## install Stable-Baselines3 and run the tests that com
 test-extras: $(INSTALLED) ## install Weights & Biases and MLflow and run the tests of the loggers
 	@$(BIN)/python -m pip install -qq --disable-pip-version-check -c constraints.txt -e '.[wandb,mlflow]'
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -m '' tests/coil_rl/config/test_logger.py tests/coil_rl/programs/test_loggers.py
+
+test-wheel: $(INSTALLED) ## run the tests that need no checkout with a wheel in a bare environment
+	$(BIN)/python tests/try_wheel.py $(ARGS)
 
 test-versions: $(INSTALLED) ## try the floor and the ceiling of each range (minutes and gigabytes each)
 	$(BIN)/python tests/try_versions.py $(ARGS)

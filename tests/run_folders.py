@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,6 @@ import torch
 import yaml
 from hydra import compose, initialize_config_module
 from omegaconf import OmegaConf
-from programs import ROOT
 
 import coil_rl.config.schema  # noqa: F401 registers the configuration schema
 from coil_rl.config.build import build_learner, env_maker
@@ -18,7 +18,7 @@ from coil_rl.report import write_csv
 from coil_rl.run import checkpoint
 
 Row = dict[str, Any]
-MEASURES = yaml.safe_load((ROOT / "conf" / "measures" / "driving.yaml").read_text())
+MEASURES = yaml.safe_load((files("coil_rl.conf") / "measures" / "driving.yaml").read_text())
 OTHERS = {"lap_time": 50.0, "smoothness": 0.1, "completed": 1.0, "crashed": 0.0, "clearance": 0.3}
 
 
