@@ -9,10 +9,10 @@ from coil_rl.envs.level_files import save_track as save_track
 from coil_rl.envs.level_files import shipped_track as shipped_track
 from coil_rl.envs.level_files import shipped_tracks as shipped_tracks
 from coil_rl.envs.level_files import track_names as track_names
+from coil_rl.envs.recordings.folders import RecordingError as RecordingError
 from coil_rl.envs.recordings.mcap_files import RecordingWriter as RecordingWriter
-from coil_rl.envs.recordings.reading import Recording as Recording
-from coil_rl.envs.recordings.reading import RecordingError as RecordingError
 from coil_rl.envs.recordings.reading import read_recording as read_recording
+from coil_rl.envs.recordings.recording import Recording as Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv as McapReplayEnv
 from coil_rl.envs.robot.course import robot_track as robot_track
 from coil_rl.envs.robot.course import robot_tracks as robot_tracks

@@ -35,9 +35,11 @@ def scan(number, points=360, seed=0, **changed):
     draw = np.random.default_rng([seed, number])
     ranges = (draw.integers(600, 12_000, points) * 0.00025).astype(np.float32)
     ranges[draw.random(points) < 0.1] = np.inf
-    increment = 2 * 3.1241 / (points - 1)
+    points = len(changed.get("ranges", ranges))
+    increment = 2 * 3.1241 / max(1, len(ranges) - 1)
     fields = {
         "angle_min": -3.1241,
+        "angle_max": -3.1241 + increment * max(0, points - 1),
         "angle_increment": increment,
         "range_min": 0.15,
         "range_max": 12.0,

@@ -35,8 +35,9 @@ def replay(config: DictConfig) -> None:
     from coil_rl.envs import McapReplayEnv
     from coil_rl.files import write_text
     from coil_rl.output import progress
+    from coil_rl.replay.cautions import caution
     from coil_rl.replay.open_loop import open_loop
-    from coil_rl.replay.report import caution, describe, outcome
+    from coil_rl.replay.report import describe, outcome
     from coil_rl.report.table import TABLES
 
     torch.set_num_threads(config.threads)
@@ -129,17 +130,18 @@ def _write(config: DictConfig, result: OpenLoop, runs: Runs, folder: Path) -> No
     about = {}
     for name, content in inputs.items():
         about[f"{name}_sha256"] = hashlib.sha256(content).hexdigest()
+    topics = (robot.scan, robot.odometry, robot.command, result.recording.command_topic)
     annotate(
         result,
         folder / "annotated.mcap",
-        topics=[topic for topic in (robot.scan, robot.odometry, robot.command) if topic],
+        topics=dict.fromkeys(topic for topic in topics if topic),
         speed=robot.speed,
         scale=OmegaConf.select(robot, "perception.scale", default=7.0),
         laser_yaw=math.radians(OmegaConf.select(robot, "perception.laser_yaw", default=0.0)),
         about=about,
         attachments=attachments,
     )
-    layout = foxglove_layout(result, scan=robot.scan, command=robot.command)
+    layout = foxglove_layout(result, scan=robot.scan)
     write_text(folder / "foxglove_layout.json", layout)
     write_csv(over_time(result), folder / "steering.csv")
     simulated = " (simulated)" if result.recording.simulated else ""

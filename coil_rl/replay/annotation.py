@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from coil_rl.envs.recordings.mcap_files import RecordingWriter, digest, read_messages
-from coil_rl.envs.recordings.messages import TWIST, header, twist
+from coil_rl.envs.recordings.messages import TWIST, TWIST_STAMPED, header, twist
 from coil_rl.envs.robot.course import THICK, THIN
 from coil_rl.envs.sight import SAMPLES, SIGHT, WIDEST_ANGLE
 from coil_rl.envs.track import SIDES
-from coil_rl.replay.open_loop import RECORDED, Floats, OpenLoop
+from coil_rl.replay.open_loop import Floats, OpenLoop
 from coil_rl.report import style
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
@@ -160,13 +160,12 @@ def _marker(
     }
 
 
-def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None = COMMAND) -> str:
+def foxglove_layout(result: OpenLoop, *, scan: str = SCAN) -> str:
     """Return the shipped Foxglove layout with the policies, frame and topics of a recording.
 
     Args:
         result: of the recording.
         scan: topic of the LiDAR.
-        command: topic of the robot's commands; None for none.
     """
     text = files("coil_rl.replay").joinpath("foxglove_layout.json").read_text(encoding="utf-8")
     layout: dict[str, Any] = json.loads(text)
@@ -180,17 +179,15 @@ def foxglove_layout(result: OpenLoop, *, scan: str = SCAN, command: str | None =
         elif name.startswith("Plot!"):
             lines = []
             for path in panel["paths"]:
-                lines += _plot_lines(path, result, command)
+                lines += _plot_lines(path, result)
             panel["paths"] = lines
     return json.dumps(layout, indent=2) + "\n"
 
 
-def _plot_lines(
-    path: Mapping[str, Any], result: OpenLoop, command: str | None
-) -> list[dict[str, Any]]:
+def _plot_lines(path: Mapping[str, Any], result: OpenLoop) -> list[dict[str, Any]]:
     """Return the lines for a path of the shipped layout.
 
-    It is one line per policy, or the line of the recorded commands if there are any.
+    It is one line per policy, or the line of the recorded commands if they have turn rates.
     """
     if POLICY in path["value"]:
         lines = []
@@ -198,7 +195,9 @@ def _plot_lines(
             value = path["value"].replace(POLICY, policy)
             lines.append({**path, "value": value, "label": policy, "color": stroke.colour})
         return lines
-    if command is None or RECORDED not in result.steering:
+    recording = result.recording
+    if recording.command_topic is None or recording.steered:
         return []
-    fields = f"{command}.twist" if result.recording.stamped_commands else command
+    stamped = recording.command_type == TWIST_STAMPED
+    fields = f"{recording.command_topic}.twist" if stamped else recording.command_topic
     return [{**path, "value": path["value"].replace(COMMAND, fields)}]

@@ -3,6 +3,7 @@
 The policies act at every scan of a drive that they did not control.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +15,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase, ExplorationType, set_exploration_type
 
-from coil_rl.envs.recordings.reading import Recording
+from coil_rl.envs.recordings.recording import Recording
 from coil_rl.envs.recordings.replay_env import McapReplayEnv
 from coil_rl.envs.reward import HISTORY, recent_mean
 
 RECORDED = "recorded"  # name of the recorded commands among the policies
+ROUNDING = 1.001  # of commands at the limit
 STEERING_KEYS = (("next", "steering"), ("next", "omega"), ("next", "info", "smoothness"))
 VIEW_KEYS = ("cones", "cone_count", "observation", ("info", "valid"))
 
@@ -56,6 +58,7 @@ class OpenLoop:
         valid: [N, 2], whether each side is valid in the scan.
         steering: by policy; `recorded_steering` is last, as `RECORDED`, if there are commands.
         max_steering: radians of an action of 1.
+        beyond: share of the recorded commands that ask for more than the robot can steer.
     """
 
     recording: Recording
@@ -65,6 +68,7 @@ class OpenLoop:
     valid: NDArray[np.bool_]
     steering: dict[str, Steering]
     max_steering: float
+    beyond: float = 0.0
 
     @property
     def both_valid(self) -> NDArray[np.bool_]:
@@ -117,17 +121,18 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
     recording = env.recordings[row]
     # A recording shorter than the longest one restarts; its first pass counts.
     steps = {name: rollout[row, : len(recording.ranges)] for name, rollout in rollouts.items()}
-    steering = {}
+    steering: dict[str, Steering] = {}
+    beyond = 0.0
     for name, step in steps.items():
         columns = [step[key].squeeze(-1).double().numpy() for key in STEERING_KEYS]
         steering[name] = Steering(*columns)
     if recording.commands is not None:
-        steering[RECORDED] = recorded_steering(
-            recording, env.speed, env.car_length, env.max_steering
-        )
+        robot = env.speed, env.car_length, env.max_steering
+        steering[RECORDED] = recorded_steering(recording, *robot)
+        beyond = _share_beyond(recording, *robot)
     view = next(iter(steps.values()))  # equal for all policies
     cones, count, observation, valid = (view[key].numpy() for key in VIEW_KEYS)
-    return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering)
+    return OpenLoop(recording, cones, count, observation, valid, steering, env.max_steering, beyond)
 
 
 def recorded_steering(
@@ -135,8 +140,8 @@ def recorded_steering(
 ) -> Steering:
     """Return the recorded commands as steering (equations 99 and 100).
 
-    See `Recording.commands_of_scans` for the command of a scan. Where it stops the robot, the
-    steering is straight. It is NaN before the first command.
+    See `Recording.commands_of_scans` for the command of a scan. Where a turn rate is to be had
+    without a speed, the steering is straight. It is NaN where there is no command.
 
     Args:
         recording: a recording with commands.
@@ -144,11 +149,48 @@ def recorded_steering(
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.
     """
-    speeds, omega = recording.commands_of_scans(speed).T
-    sine = np.divide(
-        omega * car_length, speeds, out=np.where(np.isnan(omega), np.nan, 0.0), where=speeds != 0
-    )
-    action = (np.arcsin(sine.clip(-1, 1)) / max_steering).clip(-1, 1)
+    angle, omega = _angle_and_turn_rate(recording, speed, car_length)
+    action = (angle / max_steering).clip(-1, 1)
     before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
     return Steering(action, omega, np.abs(action - recent_mean(torch.from_numpy(history)).numpy()))
+
+
+def _angle_and_turn_rate(
+    recording: Recording, speed: float, car_length: float
+) -> tuple[Floats, Floats]:
+    """Return the recorded steering angle (radians) and turn rate (radians/s) at each scan, [N].
+
+    Args:
+        recording: a recording with commands.
+        speed: m/s of the robot, for a recording without speeds.
+        car_length: length L of the robot, m.
+    """
+    speeds, second = recording.commands_of_scans(speed).T
+    if recording.steered:
+        return second, speeds * np.sin(second) / car_length
+    straight = np.where(np.isnan(second), np.nan, 0.0)
+    sine = np.divide(second * car_length, speeds, out=straight, where=speeds != 0)
+    return np.arcsin(sine.clip(-1, 1)), second
+
+
+def _share_beyond(
+    recording: Recording, speed: float, car_length: float, max_steering: float
+) -> float:
+    """Return the share of the recorded commands that no steering of the robot fulfils.
+
+    Args:
+        recording: a recording with commands.
+        speed: m/s of the robot, for a recording without speeds.
+        car_length: length L of the robot, m.
+        max_steering: radians of an action of 1.
+    """
+    speeds, second = recording.commands_of_scans(speed).T
+    moves = speeds != 0
+    if recording.steered:
+        beyond = np.abs(second) > max_steering * ROUNDING
+    else:
+        largest = np.abs(speeds) * math.sin(max_steering) / car_length
+        beyond = moves & (np.abs(second) > largest * ROUNDING)
+    known = ~np.isnan(second)
+    return float(beyond[known].mean()) if known.any() else 0.0

@@ -12,12 +12,8 @@ from matplotlib.artist import Artist
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from coil_rl.envs import Perception
 from coil_rl.replay.open_loop import RECORDED, OpenLoop
 from coil_rl.report import markdown_table, style
-
-CHECKED_SCANS = 512  # of a recording at most, evenly spread
-MOST = 0.5  # share of the clusters
 
 
 def describe(result: OpenLoop) -> str:
@@ -51,45 +47,21 @@ def describe(result: OpenLoop) -> str:
 def extent(result: OpenLoop) -> str:
     """Return what a recording holds.
 
-    These are the number of scans, their duration, the share of them with both boundaries valid, and
-    remarks on the file.
+    These are the number of scans and of commands, the duration, the rate, the share of scans with
+    both boundaries valid, and remarks on the file.
 
     Args:
         result: of the recording.
     """
+    recording = result.recording
+    rate = f", {1 / recording.turn:.1f} a second" if recording.turn else ""
     text = (
-        f"{len(result.both_valid)} scans in {result.recording.seconds[-1]:.1f} s; "
+        f"{len(result.both_valid)} scans in {recording.seconds[-1]:.1f} s{rate}; "
         f"both boundaries valid in {result.both_valid.mean():.0%} of them"
     )
-    return "; the file ".join([text, *result.recording.remarks])
-
-
-def caution(result: OpenLoop, perception: object) -> str:
-    """Return a warning if the perception hardly fits the recording, else an empty text.
-
-    It does not if no scan shows both boundaries, or if most clusters in sight are no cones.
-
-    Args:
-        result: of the recording.
-        perception: of the env; only a `Perception` is asked for the clusters.
-    """
-    problems, recording = [], result.recording
-    if not result.both_valid.any():
-        problems.append("no scan shows both boundaries")
-    if isinstance(perception, Perception):
-        some = slice(None, None, -(-len(recording.ranges) // CHECKED_SCANS))
-        rejected = perception.rejected(recording.ranges[some], recording.angles(some))
-        if rejected > MOST:
-            problems.append(
-                f"{rejected:.0%} of the clusters in sight are unlike any cone of the training"
-            )
-    if not problems:
-        return ""
-    return (
-        f"{recording.path}: {' and '.join(problems)}, so the actions mean little; "
-        "check env.perception, or train the classifier on your own cones "
-        "with coil-reproduce figure=25"
-    )
+    if recording.commands is not None:
+        text += f"; {len(recording.commands[0])} commands"
+    return "; the file ".join([text, *recording.remarks])
 
 
 def disagreement(result: OpenLoop) -> pd.DataFrame:

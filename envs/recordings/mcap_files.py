@@ -7,7 +7,6 @@ cannot be used is refused in one sentence with a remedy.
 
 import hashlib
 import os
-import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,18 +21,15 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
+from coil_rl.envs.recordings.folders import CONVERT, MAGIC, RecordingError, files_of
 from coil_rl.envs.recordings.messages import definition, encode
-from coil_rl.envs.regular_files import open_regular, read_regular
+from coil_rl.envs.regular_files import open_regular
 
-MAGIC = b"\x89MCAP0\r\n"
 # If a recording is cut off, only the last chunk is lost: ten seconds of a small scanner.
 CHUNK = 128 * 1024  # bytes
 
-LARGEST_METADATA = 1_000_000  # bytes of the metadata.yaml of a folder
 # A file unpacks to at most this many bytes, and this many for each of its own.
 UNPACKED, UNPACKED_SHARE = 20_000_000, 100
-
-CONVERT = "rosbags-convert --src FOLDER --dst OTHER --dst-storage mcap"
 
 # First bytes of other files with the name of a recording, what they are, and the remedy.
 _OTHER_FORMATS = {
@@ -54,10 +50,6 @@ _OTHER_FORMATS = {
     b"\x04\x22\x4d\x18": ("compressed as a whole with lz4", "unpack it first"),
     b"PK\x03\x04": ("a zip archive", "unpack it first"),
 }
-
-
-class RecordingError(ValueError):
-    """A recording that cannot be used; the message is one sentence for the user."""
 
 
 class Channel(NamedTuple):
@@ -105,6 +97,7 @@ class Contents:
         channels: of all topics.
         notes: metadata records by name.
         attachments: by name.
+        remarks: what the metadata of a folder say and its files do not.
         cut_off: whether a file ends early.
         damage: the damaged places that were skipped.
         lost: number of messages that damage made unreadable, by topic; a topic is missing if the
@@ -115,12 +108,17 @@ class Contents:
     channels: list[Channel] = field(default_factory=list)
     notes: dict[str, dict[str, str]] = field(default_factory=dict)
     attachments: dict[str, records.Attachment] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
     cut_off: bool = False
     damage: list[str] = field(default_factory=list)
     lost: dict[str, int] = field(default_factory=dict)
 
 
-def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None = None) -> Contents:
+def read_messages(
+    path: str | os.PathLike[str],
+    topics: Collection[str] | None = None,
+    types: Collection[str] = (),
+) -> Contents:
     """Read a recording from start to end, with its checksums verified.
 
     One that ends early is read as far as it goes, and damaged chunks are skipped. Another kind of
@@ -129,10 +127,13 @@ def read_messages(path: str | os.PathLike[str], topics: Collection[str] | None =
     Args:
         path: an MCAP file, or the folder of a rosbag2 recording in MCAP files.
         topics: topics to read; None for all. A missing one has no messages.
+        types: message types whose topics are read too.
     """
     contents = Contents({topic: [] for topic in topics or ()})
-    for file in _files(Path(path)):
-        _read_file(file, topics, contents)
+    folder = files_of(Path(path))
+    for file in folder.files:
+        _read_file(file, topics, types, contents)
+    contents.remarks = [*folder.remarks, *_miscounted(folder.counts, contents)]
     for messages in contents.messages.values():
         messages.sort(key=lambda message: message.log_time)
     contents.channels = list(dict.fromkeys(contents.channels))
@@ -147,7 +148,7 @@ def digest(path: str | os.PathLike[str]) -> str:
             is taken.
     """
     sha256 = hashlib.sha256()
-    for file in _files(Path(path)):
+    for file in files_of(Path(path)).files:
         _check_format(file)
         with open_regular(file) as stream:
             while block := stream.read(CHUNK):
@@ -252,12 +253,35 @@ class RecordingWriter:
         writer.finish()
 
 
-def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -> None:
+def _miscounted(counts: Mapping[str, int], contents: Contents) -> list[str]:
+    """Return remarks on topics of which the metadata of a folder claim other numbers of messages.
+
+    Args:
+        counts: that the metadata claim, by topic.
+        contents: of the files.
+    """
+    if contents.cut_off or contents.damage:
+        return []
+    remarks = []
+    for topic, messages in contents.messages.items():
+        claimed = counts.get(topic, len(messages))
+        if claimed != len(messages):
+            remarks.append(
+                f"has {len(messages)} messages on topic {topic}, and its metadata claim {claimed}: "
+                "copy all its files, or let ROS count again: ros2 bag reindex FOLDER"
+            )
+    return remarks
+
+
+def _read_file(
+    file: Path, topics: Collection[str] | None, types: Collection[str], contents: Contents
+) -> None:
     """Add the contents of a file.
 
     Args:
         file: an MCAP file.
         topics: topics to read; None for all.
+        types: message types whose topics are read too.
         contents: to which the contents are added.
     """
     size, complete = _check_format(file)
@@ -278,7 +302,8 @@ def _read_file(file: Path, topics: Collection[str] | None, contents: Contents) -
             elif type(record) is records.Channel:
                 channel = _channel(record, schemas.get(record.schema_id))
                 contents.channels.append(channel)
-                if topics is None or channel.topic in topics:
+                wanted = topics is None or channel.topic in topics
+                if wanted or channel.message_type in types:
                     selected[record.id] = channel, contents.messages.setdefault(channel.topic, [])
             elif type(record) is records.Metadata:
                 contents.notes[record.name] = dict(record.metadata)
@@ -449,37 +474,3 @@ def _check_format(file: Path) -> tuple[int, bool]:
     raise RecordingError(
         f"{file} is not an MCAP file: it begins with {start[:8].hex(' ')}; give one that is."
     )
-
-
-def _files(path: Path) -> Iterator[Path]:
-    """Yield the file itself, or the files that the metadata of a rosbag2 folder lists."""
-    if not path.is_dir():
-        yield path
-        return
-    metadata = path / "metadata.yaml"
-    try:
-        text = read_regular(metadata, LARGEST_METADATA).decode()
-    except (OSError, UnicodeDecodeError):
-        raise RecordingError(
-            f"{path} is a folder without a readable metadata.yaml; let ROS write it: ros2 bag "
-            "reindex FOLDER."
-        ) from None
-    # The file is written by a program, so two of its lines are found without a YAML parser.
-    storage = re.search(r"^\s*storage_identifier:\s*[\"']?(\w*)", text, re.MULTILINE)
-    listed = re.search(r"^\s*relative_file_paths:\s*\n((?:\s*-\s+.*\n?)+)", text, re.MULTILINE)
-    if storage and storage[1] != "mcap":
-        raise RecordingError(
-            f"{path} is a recording in {storage[1]}, not in MCAP; convert it: {CONVERT}."
-        )
-    if not listed:
-        raise RecordingError(
-            f"{metadata} lists no files; let ROS write it: ros2 bag reindex FOLDER."
-        )
-    for line in listed[1].splitlines():
-        # Older versions of ROS put the folder's own name before the file's.
-        file = path / Path(line.strip().removeprefix("-").strip(" \"'")).name
-        if not file.is_file():
-            raise RecordingError(
-                f"{metadata} lists {file.name}, which is missing; copy all its files."
-            )
-        yield file

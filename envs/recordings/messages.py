@@ -21,6 +21,22 @@ SCAN = "sensor_msgs/msg/LaserScan"
 ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
+ACKERMANN_STAMPED = "ackermann_msgs/msg/AckermannDriveStamped"
+COMMANDS = (TWIST, TWIST_STAMPED, ACKERMANN, ACKERMANN_STAMPED)
+
+# Types that the store of rosbags lacks.
+_OWN_TYPES = {
+    ACKERMANN: """float32 steering_angle
+float32 steering_angle_velocity
+float32 speed
+float32 acceleration
+float32 jerk
+""",
+    ACKERMANN_STAMPED: """std_msgs/Header header
+ackermann_msgs/AckermannDrive drive
+""",
+}
 
 # Of a definition that comes with a recording.
 LARGEST_DEFINITION = 100_000  # bytes
@@ -37,8 +53,11 @@ NUMBERS = frozenset(
 
 @cache
 def ros_types() -> Typestore:
-    """Return the standard message types."""
-    return get_typestore(Stores.ROS2_HUMBLE)
+    """Return the standard message types, with those of commands to cars."""
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in _OWN_TYPES.items():
+        types.register(get_types_from_msg(text, name))
+    return types
 
 
 @cache
@@ -105,10 +124,17 @@ def pose_of(message: Any) -> tuple[float, float, float]:
     )
 
 
-def twist_of(message: Any) -> tuple[float, float]:
-    """Return forward speed in m/s and turn rate in radians/s of a Twist or TwistStamped message."""
-    twist = getattr(message, "twist", message)
-    return twist.linear.x, twist.angular.z
+def command_of(message: Any) -> tuple[float, float]:
+    """Return the two numbers of a command, a message of one of `COMMANDS`.
+
+    They are the forward speed in m/s, and the turn rate in radians/s or, of the Ackermann types,
+    the steering angle in radians.
+    """
+    for name in ("twist", "drive"):
+        message = getattr(message, name, message)
+    if hasattr(message, "steering_angle"):
+        return message.speed, message.steering_angle
+    return message.linear.x, message.angular.z
 
 
 @lru_cache(maxsize=16)

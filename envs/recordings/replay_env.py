@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
-from coil_rl.envs.recordings.reading import Recording, read_recording
+from coil_rl.envs.recordings.reading import read_recording
+from coil_rl.envs.recordings.recording import Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
 from coil_rl.envs.sight import SIGHT
@@ -120,7 +121,7 @@ class McapReplayEnv(EnvBase):
         views = [_perceive(each, perception, kept_cones) for each in self.recordings]
         self.cones = _joined([cones for cones, _ in views])
         self.count = _joined([count for _, count in views])
-        poses = [_from_start(each.poses()) for each in self.recordings]
+        poses = [_from_start(each.poses(car_length)) for each in self.recordings]
         self.pose = _joined([pose.astype(np.float32) for pose in poses])
         self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
         length = torch.tensor([len(each.ranges) for each in self.recordings])

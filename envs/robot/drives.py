@@ -20,9 +20,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase, ExplorationType, TransformedEnv, set_exploration_type, step_mdp
 
 from coil_rl.envs.limits import check_choice
+from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import RecordingWriter
 from coil_rl.envs.recordings.messages import ODOMETRY, SCAN, TWIST, header, twist
-from coil_rl.envs.recordings.reading import SIMULATED, Recording, RecordingError
+from coil_rl.envs.recordings.recording import SIMULATED, Recording
 from coil_rl.envs.robot.course import (
     THICK,
     THIN,

@@ -81,7 +81,7 @@ def test_files_and_printed_table(done):
     assert "Warning" not in text
     assert "replay: drive.mcap" not in program.stderr
     assert "coil_seed1 is coil_1 (policy handed_over)." in text
-    assert f"\ndrive.mcap: {SCANS} scans in 2.5 s; " in program.stdout
+    assert f"\ndrive.mcap: {SCANS} scans in 2.5 s, 5.5 a second; " in program.stdout
 
 
 def test_annotated_recording_agrees_with_the_csv(messages, rows):

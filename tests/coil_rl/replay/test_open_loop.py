@@ -132,7 +132,7 @@ def test_disagreement_is_a_mean_over_the_scans_with_both_known(result):
 def test_table_has_a_row_and_a_column_per_policy(result):
     text = describe(result)
     assert "## drive.mcap (simulated)" in text
-    assert "4 scans in 3.0 s; both boundaries valid in 50% of them." in text
+    assert "4 scans in 3.0 s, 1.0 a second; both boundaries valid in 50% of them." in text
     rows = [
         [cell.strip() for cell in line.split("|")[1:-1]]
         for line in text.splitlines()

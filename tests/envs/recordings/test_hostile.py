@@ -9,7 +9,8 @@ import pytest
 from drives import scan, store
 from mcap.writer import CompressionType, Writer
 
-from coil_rl.envs.recordings.mcap_files import RecordingError, digest, read_messages
+from coil_rl.envs.recordings.folders import RecordingError
+from coil_rl.envs.recordings.mcap_files import digest, read_messages
 from coil_rl.envs.recordings.messages import SCAN, TWIST, decode, definition, encode, twist
 from coil_rl.envs.recordings.reading import read_recording
 

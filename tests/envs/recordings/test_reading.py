@@ -16,8 +16,10 @@ from rosbags.convert.cli import main as convert
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from coil_rl.envs.recordings.folders import RecordingError
 from coil_rl.envs.recordings.mcap_files import Channel, RawMessage, RecordingWriter, digest
 from coil_rl.envs.recordings.messages import (
+    COMMANDS,
     ODOMETRY,
     SCAN,
     TWIST,
@@ -27,7 +29,7 @@ from coil_rl.envs.recordings.messages import (
     header,
     twist,
 )
-from coil_rl.envs.recordings.reading import RecordingError, read_recording
+from coil_rl.envs.recordings.reading import read_recording
 
 REAL = Path(__file__).parents[3] / "../shared/recordings"
 EITHER_COMPRESSION = pytest.mark.parametrize(
@@ -427,7 +429,7 @@ OTHERS = {
     (
         "/cmd_vel",
         "geometry_msgs/msg/Vector3",
-    ): f"not of {TWIST} or {TWIST_STAMPED} in cdr, and they are ignored",
+    ): f"not of {' or '.join(COMMANDS)} in cdr, and they are ignored",
 }
 
 
@@ -454,8 +456,8 @@ def test_commands_may_be_stamped(tmp_path, kind):
         rosbag_of(tmp_path / "drive", ("/scan", SCAN, START, scan(0)), *commands)
     )
     np.testing.assert_array_equal(recording.commands[0], [[0.3, 0.0], [0.3, 0.1], [0.3, 0.2]])
-    assert recording.stamped_commands == (kind == TWIST_STAMPED)
-    assert recording.remarks == []
+    assert (recording.command_topic, recording.command_type) == ("/cmd_vel", kind)
+    assert recording.remarks == ["has a single scan"]
 
 
 def scanners(path, *, frames=("front", "rear"), ranges=(12.0, 12.0), senders=("", "")):

@@ -1,0 +1,150 @@
+"""What makes the meaning of a recording doubtful: its clocks, gaps, scans, odometry and commands.
+
+A recording whose scanner stood still, whose clock jumps or whose commands ended early is read
+without an error, and gives numbers that mean little. Each of the functions here says so in the end
+of a sentence that begins with the name of the file.
+"""
+
+import numpy as np
+
+from coil_rl.envs.recordings.recording import Recording, Times, ascending, believed
+
+RATES = (2.0, 50.0)  # scans per second for which guides and policies are made
+GAP = 2.5  # turns without a scan
+MANY = 0.1  # share of the scans
+NARROW = 0.8  # of the largest number of ranges
+CLOCKS_DIFFER = 2.0  # times as fast
+
+
+def doubts_about(recording: Recording) -> list[str]:
+    """Return remarks on what makes the meaning of a recording doubtful.
+
+    Args:
+        recording: as it was read.
+    """
+    return [
+        *_about_clock(recording),
+        *_about_scans(recording),
+        *_about_odometry(recording),
+        *_about_commands(recording),
+    ]
+
+
+def _about_clock(recording: Recording) -> list[str]:
+    """Return remarks on stamps that are no clock, on the rate of the scans, and on gaps."""
+    stamp, log_time = recording.stamp, recording.log_time
+    if len(stamp) < 2:
+        return ["has a single scan"]
+    remarks = []
+    if not ascending(stamp):
+        remarks.append(f"has scans whose stamps {_fault(stamp)}, so their log times are the clock")
+    elif not believed(stamp, log_time):
+        remarks.append(
+            f"has scans {_rate(stamp)} times a second by their stamps, so their log times are the "
+            "clock"
+        )
+    elif ascending(log_time):
+        ratio = float((stamp[-1] - stamp[0]) / (log_time[-1] - log_time[0]))
+        if not 1 / CLOCKS_DIFFER < ratio < CLOCKS_DIFFER:
+            remarks.append(
+                f"has stamps that run {ratio:.3g} times as fast as its log times; the stamps are "
+                "the clock"
+            )
+    if not log_time.any() or log_time[0] == log_time[-1]:
+        remarks.append("has log times that are all the same, so no command belongs to a scan")
+    turn = recording.turn
+    if turn == 0:
+        return [*remarks, "has no clock: most of its scans have the same time"]
+    if not RATES[0] <= 1 / turn <= RATES[1]:
+        remarks.append(
+            f"has {1 / turn:.3g} scans a second, and policies are made for {RATES[0]:g} to "
+            f"{RATES[1]:g}"
+        )
+    between = np.diff(recording.seconds)
+    gaps = between[between > GAP * turn]
+    if len(gaps):
+        number = "1 gap" if len(gaps) == 1 else f"{len(gaps)} gaps"
+        remarks.append(
+            f"has {number} of more than {GAP:g} turns without a scan, the longest of "
+            f"{gaps.max():.1f} s"
+        )
+    return remarks
+
+
+def _fault(stamp: Times) -> str:
+    """Return what is wrong with stamps that do not ascend."""
+    if not stamp.any():
+        return "are zero"
+    step = np.diff(stamp)
+    repeated, falling = int((step == 0).sum()), int((step < 0).sum())
+    parts = [f"repeat {repeated} times"] if repeated else []
+    parts += [f"fall {falling} times"] if falling else []
+    return " and ".join(parts)
+
+
+def _rate(times: Times) -> str:
+    """Return the scans per second by a clock."""
+    return f"{1e9 / np.median(np.diff(times)):.3g}"
+
+
+def _about_scans(recording: Recording) -> list[str]:
+    """Return remarks on scans that are empty, repeated, or of different length."""
+    ranges, points, remarks = recording.ranges, recording.points, []
+    scans = len(ranges)
+    returns = np.isfinite(ranges)
+    blind = int((~returns.any(axis=1)).sum())
+    if blind > MANY * scans:
+        remarks.append(f"has no return at all in {blind} of {scans} scans")
+    same = (ranges[1:] == ranges[:-1]).all(axis=1) & returns[1:].any(axis=1)
+    if same.sum() > MANY * scans:
+        remarks.append(
+            f"has {same.sum()} of {scans} scans that are equal to the one before, as if the "
+            "scanner stood still or the driver repeated them"
+        )
+    if points.min() < NARROW * points.max():
+        remarks.append(f"has scans of {points.min()} to {points.max()} ranges")
+    return remarks
+
+
+def _about_odometry(recording: Recording) -> list[str]:
+    """Return a remark on scans at whose time there is no odometry."""
+    if recording.odometry is None:
+        return []
+    _, log_time, stamp = recording.odometry
+    stamped = ascending(recording.stamp) and ascending(stamp)
+    at, known = (recording.stamp, stamp) if stamped else (recording.log_time, log_time)
+    limit = round(recording.command_age * 1e9)
+    outside = int(((at < known[0] - limit) | (at > known[-1] + limit)).sum())
+    if not outside:
+        return []
+    return [
+        f"has no odometry at the time of {outside} of {len(at)} scans, so their poses are those of "
+        "its start or its end"
+    ]
+
+
+def _about_commands(recording: Recording) -> list[str]:
+    """Return remarks on scans without a command, and on commands without a speed."""
+    if recording.commands is None:
+        return []
+    commands, scans = recording.commands[0], len(recording.log_time)
+    speed = recording.commands_of_scans(1.0)[:, 0]
+    topic, number = recording.command_topic, len(commands)
+    remarks = []
+    missing = int(np.isnan(speed).sum())
+    if missing:
+        remarks.append(
+            f"has no command of the last {recording.command_age:.2f} s at {missing} of {scans} "
+            f"scans ({number} on {topic}), and no recorded steering there"
+        )
+    if not commands.any():
+        return [*remarks, f"has only zeros in its commands on {topic}"]
+    if not commands[:, 0].any():
+        source = "the nominal speed" if recording.odometry is None else "that of the odometry"
+        return [*remarks, f"has commands without a speed on {topic}, so {source} is taken"]
+    standing, back = int((speed == 0).sum()), int((speed < 0).sum())
+    if standing:
+        remarks.append(f"has a robot that is told to stand at {standing} of {scans} scans")
+    if back:
+        remarks.append(f"has a robot that is told to drive backwards at {back} of {scans} scans")
+    return remarks
