@@ -126,9 +126,12 @@ def trial(config: DictConfig, make_env: EnvMaker) -> Trial:
         build_evaluation(config, recorded(pictures)),
         make_env,
         pictures=pictures,
-        guides=guide_titles(config.guide),
+        guides=guide_titles(driving_guides(config)),
         guide_results=partial(guide_results, config),
-        together=has_agent and not config.method.search and advises_only(config),
+        together=has_agent
+        and not config.method.search
+        and advises_only(config)
+        and not demonstrations(config),
         advice=list(config.evaluation.advice) if config.method.transforms else [],
         repeats=config.evaluation.repeats,
         compiled=config.compile,
@@ -209,6 +212,7 @@ def guide_results(
     """
     nodes = {key: OmegaConf.to_container(config[key], resolve=True) for key in ("guide", "degrade")}
     nodes["disturb"] = disturbances(config, TEST)
+    nodes["guide"] = driving_guides(config)
     if not nodes["guide"]:
         return {}
     node = env_node(config, config.evaluation.env)
@@ -263,7 +267,7 @@ def env_maker(config: DictConfig, folder: Path | None = None) -> EnvMaker:
         of_agent=of_agent,
         disturb=partial(build_disturbances, config),
         transforms=transforms,
-        guides=lambda: build_guides(config) if config.guide else {},
+        guides=lambda: build_nodes_of_guides(driving_guides(config)),
         degrade=partial(build_all, config.degrade, "degrade"),
         sizes={str(cases): curve.num_envs for cases in curve.cases},
     )
@@ -318,14 +322,20 @@ def _all_transforms(config: DictConfig) -> list[Transform]:
 def env_node(config: DictConfig, overrides: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return the node `env` with overrides and all references resolved."""
     overrides = overrides or {}
+    if "_target_" in overrides:  # another env, such as that of the test of a policy
+        return {key: _resolved(value) for key, value in overrides.items()}
     with open_dict(config):  # `build` checks the keys
         node = OmegaConf.merge(config.env, dict(overrides))
         for key, value in overrides.items():
             # The arguments of another target replace those of the first one.
             if isinstance(value, (Mapping, DictConfig)) and "_target_" in value:
                 OmegaConf.update(node, key, value, merge=False)
-    resolved: Any = OmegaConf.to_container(node, resolve=True)
-    return dict(resolved)
+    return dict(_resolved(node))
+
+
+def _resolved(value: Any) -> Any:
+    """Return a value of a configuration with all references resolved."""
+    return OmegaConf.to_container(value, resolve=True) if OmegaConf.is_config(value) else value
 
 
 def build_disturbances(config: DictConfig, cases: str) -> list[Transform]:
@@ -427,7 +437,33 @@ def build_guides(config: DictConfig) -> dict[str, TensorDictModuleBase]:
             f"guide: there is none, but method={config.method.name} needs one; give guide=NAME, or "
             "method=ppo"
         )
+    return build_nodes_of_guides(config.guide)
+
+
+def build_nodes_of_guides(nodes: Mapping[str, Any]) -> dict[str, TensorDictModuleBase]:
+    """Return guides by name."""
     guides = {}
-    for name, node in config.guide.items():
+    for name, node in nodes.items():
         guides[str(name)] = build(node, f"guide.{name}", TensorDictModuleBase)
     return guides
+
+
+def demonstrations(config: DictConfig) -> list[str]:
+    """Return the names of the guides that demonstrate: what they do was recorded.
+
+    They have the attribute `demonstrates`, and no advice in the env in which a policy is tested.
+    """
+    names = []
+    for name, node in config.guide.items():
+        if getattr(find_target(node.get("_target_"), f"guide.{name}"), "demonstrates", False):
+            names.append(str(name))
+    return names
+
+
+def driving_guides(config: DictConfig) -> dict[str, Any]:
+    """Return the nodes of the guides that can drive, by name."""
+    if "_target_" in config.guide:  # `build_guides` says what is wrong
+        return {}
+    nodes: Any = OmegaConf.to_container(config.guide, resolve=True)
+    left_out = demonstrations(config)
+    return {name: node for name, node in nodes.items() if name not in left_out}

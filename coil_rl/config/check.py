@@ -26,6 +26,7 @@ from coil_rl.config.logger import check_logger
 from coil_rl.config.nodes import build as build_node
 from coil_rl.config.nodes import build_all, check_node
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune
+from coil_rl.config.replay import check_recordings_to_leave_out, check_replay
 from coil_rl.config.schema import TrainConfig
 from coil_rl.config.values import check_values
 from coil_rl.envs.env_batch import SeededRows
@@ -35,7 +36,7 @@ from coil_rl.guides.simple import FollowAdvice
 from coil_rl.learners.learner import Learner
 from coil_rl.measures import measures_of
 from coil_rl.report.runs import EVALUATION, SELECTION
-from coil_rl.run.parts import TEST, EnvMaker, transformed
+from coil_rl.run.parts import TEST, TRAIN, EnvMaker, transformed
 from coil_rl.run.run import HANDED_OVER
 from coil_rl.run.tuning import Search
 from coil_rl.transforms import GuideActions
@@ -73,6 +74,8 @@ def check_parts(config: DictConfig) -> None:
     make_env = build.env_maker(config)
     cases = len(build.build_evaluation(config).cases)
     recorded = build.recorded(build.build_pictures(config))
+    if trains:
+        check_replay(config, make_env)
     if trains or OmegaConf.select(config, "run") is None:
         _check_env(config, make_env, cases, recorded.values())
     build_all(config.evaluation.advice, "evaluation.advice")
@@ -172,8 +175,10 @@ def _check_env(
             )
         return
     guides = build.build_guides(config)
+    demonstrations = build.demonstrations(config)
     for name, guide in guides.items():
-        check_guide_in_env(guide, env, f"guide.{name}")
+        its_env = make_env.bare(1, TRAIN, None) if name in demonstrations else env
+        check_guide_in_env(guide, its_env, f"guide.{name}")
     build_all(config.degrade, "degrade")
     if build.build_disturbances(config, TEST):
         transformed(env, make_env.disturb(TEST), "disturb")
@@ -237,7 +242,12 @@ def check_guide_in_env(guide: TensorDictModuleBase, env: EnvBase, name: str) -> 
         for key in guide.in_keys:
             if key not in known:
                 has = ", ".join(map(_dotted, env.observation_spec.keys()))
-                raise UserError(f"{name}: it reads {_dotted(key)}, but the env has only {has}")
+                remedy = ""
+                if getattr(guide, "demonstrates", False):
+                    remedy = "; give env=mcap_replay recording=[FILE,...], see also guide=recorded"
+                raise UserError(
+                    f"{name}: it reads {_dotted(key)}, but the env has only {has}{remedy}"
+                )
         advised = TransformedEnv(env, transform)
         advised.step(FollowAdvice(advised)(advised.reset()))
         advised.state_dict()  # a state that no checkpoint can hold is refused before the training
@@ -305,6 +315,8 @@ def _check_batch(config: DictConfig, learner: Learner) -> None:
 def _check_validation(config: DictConfig, learner: Learner) -> None:
     """Raise a `UserError` if tracks are to be left out to validate, and there is only one."""
     if not config.track or not learner.validates_groups:
+        return
+    if check_recordings_to_leave_out(config):
         return
     if len(build_node(config.track.train, "track.train")) == 1:
         raise UserError(

@@ -106,6 +106,8 @@ def holds(folder: Path, config: DictConfig) -> bool:
 def identity(config: DictConfig) -> dict[str, Any]:
     """Return the values on which the numbers of a run depend, by their full keys."""
     values: Any = OmegaConf.to_container(config, resolve=True)
+    if values.get("recording") is None:  # of all envs but one
+        values.pop("recording", None)
     flat = _flat(values)
     ignored = set(IGNORED_KEYS)
     return {

@@ -215,6 +215,7 @@ class DrivingConfig(ProgramConfig):
     compile: bool = False
     trust: list[str] = field(default_factory=list)
     run_dir: str = MISSING
+    recording: Any = None
 
 
 @dataclass
@@ -327,6 +328,8 @@ def fingerprint(config: DictConfig) -> str:
         if key in (*IGNORED_KEYS, "hydra"):
             continue
         value = config[key]
+        if key == "recording" and value is None:  # of all envs but one
+            continue
         if OmegaConf.is_config(value):
             value = OmegaConf.to_container(value, resolve=True)
         if key == "env" and isinstance(value, dict):
@@ -349,6 +352,18 @@ def agent_label(config: DictConfig) -> str:
     return learner if name == "ppo" else f"{name}_{learner}"
 
 
+def of_replay(what: str, otherwise: int, *, _root_: DictConfig) -> int:
+    """Return what a training on all scans of recordings takes, see `coil_rl.config.replay`.
+
+    Args:
+        what: "num_envs", "steps" or "frames".
+        otherwise: the value in other envs.
+    """
+    from coil_rl.config import replay
+
+    return replay.of_replay(_root_, what) if replay.replays(_root_) else otherwise
+
+
 # Process id in run folders: two runs may start within a microsecond.
 OmegaConf.register_new_resolver("pid", os.getpid, replace=True)
 # Keys of a table in a label: ${names:${degrade},intact}
@@ -358,6 +373,8 @@ OmegaConf.register_new_resolver(
 # ${label}_seed${seed}_${fingerprint:}
 OmegaConf.register_new_resolver("fingerprint", lambda *, _root_: fingerprint(_root_), replace=True)
 OmegaConf.register_new_resolver("agent_label", lambda *, _root_: agent_label(_root_), replace=True)
+# ${of_replay:steps,2700}
+OmegaConf.register_new_resolver("of_replay", of_replay, replace=True)
 
 _store = ConfigStore.instance().store
 

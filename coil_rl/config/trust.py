@@ -227,7 +227,8 @@ def _shipped_targets() -> frozenset[str]:
     """
     conf = resources.files("coil_rl.conf")
     found: set[str] = set()
-    for name in (*(field.name for field in fields(TrainConfig)), "cases", "network", "transform"):
+    others = ("cases", "network", "robot", "transform")
+    for name in (*(field.name for field in fields(TrainConfig)), *others):
         group = conf / name
         if name == "logger" or not group.is_dir():
             continue

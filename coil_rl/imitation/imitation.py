@@ -38,6 +38,8 @@ class Imitation(Learner):
         guide: row of the advice, the index of the guide to imitate.
         group_key: entry with the track of a sample, for the validation on unseen tracks. None, or
             an entry that the env does not have, skips that validation.
+        kept_key: entry that says which samples are learned, such as the scans of a recording with a
+            recent command. None, or an entry that the env does not have, keeps all.
         validate: whether to validate in each update, which takes several more fits.
         dataset: file of a data set to start from, `dataset.pt` of another run; None to start
             without.
@@ -80,6 +82,7 @@ class Imitation(Learner):
         advice_key: str = "guide_action",
         guide: int = 0,
         group_key: str | Sequence[str] | None = ("info", "track"),
+        kept_key: str | Sequence[str] | None = ("info", "usable"),
         validate: bool = True,
         dataset: str | os.PathLike[str] | None = None,
         seed: int = 0,
@@ -105,9 +108,14 @@ class Imitation(Learner):
         self.in_keys, self.advice_key, self.guide = list(in_keys), advice_key, guide
         group: NestedKey | None = nested_key(group_key)
         self.group_key = group if group in available else None
-        self.keys: list[NestedKey] = [*in_keys, advice_key]
+        kept: NestedKey | None = nested_key(kept_key)
+        self.kept_key = kept if kept in available else None
+        self.sample_keys: list[NestedKey] = [*in_keys, advice_key]
         if self.group_key is not None:
-            self.keys.append(self.group_key)
+            self.sample_keys.append(self.group_key)
+        self.keys: list[NestedKey] = list(self.sample_keys)
+        if self.kept_key is not None:
+            self.keys.append(self.kept_key)
         self.validate, self.seed, self.device = validate, seed, env.device
         self.dataset: TensorDictBase | None = None
         if dataset is not None:
@@ -121,7 +129,8 @@ class Imitation(Learner):
             progress: of the run; ignored.
 
         Returns:
-            The number of `samples`; `target_variance`, the mean squared error of predicting the
+            The number of `samples`, and with `kept_key` of the steps that were `left_out`;
+            `target_variance`, the mean squared error of predicting the
             mean; `mse_ahead` and `r2_ahead`, on this batch before the fit; `mse_training` and
             `r2_training`, on the data set after the fit; with `validate`, the metrics (and errors)
             of `cross_validate`.
@@ -130,10 +139,17 @@ class Imitation(Learner):
         dataset: TensorDictBase = pairs
         if self.dataset is not None:
             dataset = torch.cat([self.dataset, pairs])
+        if not len(pairs):
+            raise UserError(
+                f"none of {batch.numel()} steps is to be learned: there is no recent command at "
+                "any, the robot stands, or all were learned before; check env.command, the topic "
+                "of the commands"
+            )
         self.dataset = dataset
         x, y = self.concat(*(dataset[key] for key in self.in_keys)), dataset["action"]
         metrics = {
             "samples": float(len(y)),
+            "left_out": float(batch.numel() - len(pairs)),
             "target_variance": float(y.var(0, correction=0).mean()),
         }
         with torch.no_grad():
@@ -159,7 +175,9 @@ class Imitation(Learner):
     def _pairs(self, batch: TensorDictBase) -> TensorDictBase:
         """Return the samples of a batch: what the policy observes and the action of the guide."""
         rows = batch.select(*self.keys).reshape(-1)
-        kept = [key for key in self.keys if key != self.advice_key or key in self.in_keys]
+        if self.kept_key is not None:
+            rows = rows[rows[self.kept_key].reshape(-1)]
+        kept = [key for key in self.sample_keys if key != self.advice_key or key in self.in_keys]
         pairs = rows.select(*kept)
         return pairs.set("action", rows[self.advice_key][:, self.guide])
 

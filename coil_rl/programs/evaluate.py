@@ -23,6 +23,7 @@ OWN = (
     "advice",
     "fallback",
 )  # keys of `evaluation` of the command, not of the run
+SOME_ROWS = 2  # of an env for its specs; some ways to degrade advice need several
 OF_A_TRACK = ("cases", "env", "pictures", "sections")  # those that depend on `track`
 
 
@@ -46,7 +47,7 @@ def evaluate(config: DictConfig) -> float:
         judge(trial(exported, env_maker(exported)), None, results, config.seed)
         return report_outcome(results)
     run = assemble(of_run, folder)
-    policy = run.policy()
+    policy = run.policy(run.trial.env(SOME_ROWS))  # not of the training, whose env may be another
     fallback = run.make_fallback(policy) if run.fallback else None
     judge(run.trial, policy, results, config.seed, fallback)
     return report_outcome(results)
@@ -92,6 +93,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
     from coil_rl.config.check import check_measures
     from coil_rl.config.saved import read_config
     from coil_rl.config.values import check_values
+    from coil_rl.run.parts import TEST
 
     config = read_config(folder, "run", {"device": requested.device})
     resolved: Any = OmegaConf.to_container(requested, resolve=True)
@@ -106,7 +108,7 @@ def configured(folder: Path, requested: DictConfig) -> DictConfig:
         config.evaluation.env["cases"] = config.evaluation.cases
     check_values(config)
     if config.method.observes is not None:
-        check_measures(config, env_maker(config)())
+        check_measures(config, env_maker(config)(SOME_ROWS, TEST))
     return config
 
 

@@ -138,10 +138,9 @@ def _result(env: McapReplayEnv, row: int, rollouts: Mapping[str, TensorDictBase]
 def recorded_steering(
     recording: Recording, speed: float, car_length: float, max_steering: float
 ) -> Steering:
-    """Return the recorded commands as steering (equations 99 and 100).
+    """Return the recorded commands as steering, see `Recording.steering`.
 
-    See `Recording.commands_of_scans` for the command of a scan. Where a turn rate is to be had
-    without a speed, the steering is straight. It is NaN where there is no command.
+    It is NaN where there is no command.
 
     Args:
         recording: a recording with commands.
@@ -149,29 +148,11 @@ def recorded_steering(
         car_length: length L of the robot, m.
         max_steering: radians of an action of 1.
     """
-    angle, omega = _angle_and_turn_rate(recording, speed, car_length)
+    angle, omega, _ = recording.steering(speed, car_length)
     action = (angle / max_steering).clip(-1, 1)
     before = np.concatenate([np.zeros(HISTORY), np.nan_to_num(action[:-1])])
     history = np.lib.stride_tricks.sliding_window_view(before, HISTORY)[:, ::-1].T.copy()
     return Steering(action, omega, np.abs(action - recent_mean(torch.from_numpy(history)).numpy()))
-
-
-def _angle_and_turn_rate(
-    recording: Recording, speed: float, car_length: float
-) -> tuple[Floats, Floats]:
-    """Return the recorded steering angle (radians) and turn rate (radians/s) at each scan, [N].
-
-    Args:
-        recording: a recording with commands.
-        speed: m/s of the robot, for a recording without speeds.
-        car_length: length L of the robot, m.
-    """
-    speeds, second = recording.commands_of_scans(speed).T
-    if recording.steered:
-        return second, speeds * np.sin(second) / car_length
-    straight = np.where(np.isnan(second), np.nan, 0.0)
-    sine = np.divide(second * car_length, speeds, out=straight, where=speeds != 0)
-    return np.arcsin(sine.clip(-1, 1)), second
 
 
 def _share_beyond(

@@ -15,6 +15,7 @@ SIMULATED = "simulated"  # metadata record of simulated recordings
 # drive send them faster, and robots stop without one.
 LIVES = 3  # turns
 LIVES_LONG = 0.5  # s
+STANDS = 0.01  # m/s, below which a robot does not drive
 PLAUSIBLE_RATES = (1.0, 100.0)  # scans per second of a clock that is believed
 
 Floats = NDArray[np.float64]
@@ -149,6 +150,26 @@ class Recording:
         if not commands[:, 0].any():
             rows[:, 0] = np.where(stale, np.nan, self._speeds(nominal_speed))
         return rows
+
+    def steering(self, nominal_speed: float, car_length: float) -> tuple[Floats, Floats, Floats]:
+        """Return the recorded steering at each scan (equations 99 and 100), NaN without a command.
+
+        Where a turn rate is to be had without a speed, the steering is straight.
+
+        Args:
+            nominal_speed: m/s, for commands without speeds.
+            car_length: m, between the axles.
+
+        Returns:
+            The steering angle in radians, the turn rate in radians/s and the speed in m/s, each
+            [N].
+        """
+        speed, second = self.commands_of_scans(nominal_speed).T
+        if self.steered:
+            return second, speed * np.sin(second) / car_length, speed
+        straight = np.where(np.isnan(second), np.nan, 0.0)
+        sine = np.divide(second * car_length, speed, out=straight, where=speed != 0)
+        return np.arcsin(sine.clip(-1, 1)), second, speed
 
     def _speeds(self, nominal_speed: float) -> Floats:
         """Return the speed from each scan to the next one by the odometry, or the nominal one."""

@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from coil_rl.envs.limits import check_range
 from coil_rl.envs.recordings.reading import read_recording
-from coil_rl.envs.recordings.recording import Recording
+from coil_rl.envs.recordings.recording import STANDS, Recording
 from coil_rl.envs.reward import HISTORY, recent_mean
 from coil_rl.envs.robot.perception import BoundaryMemory, declare_specs
 from coil_rl.envs.sight import SIGHT
@@ -40,15 +40,22 @@ class McapReplayEnv(EnvBase):
     and `reward`. The only term of the reward is `smooth`, as a replay cannot show the effect of
     other actions.
 
+    For imitation it also writes under `info`: `recorded` [B, 1], the recorded steering as an action
+    (0 where it is unknown); `stale`, whether no command is recent enough to belong to the scan;
+    `standing`, whether the robot was told to stand or to drive backwards; `usable`, whether the
+    recorded steering is to be learned (it is neither, and the scan is seen for the first time); and
+    `track`, the number of the recording.
+
     A step takes the action for the current scan and moves on to the next scan, so a recording of N
     scans takes N actions; then the episode is truncated, and the last scan is repeated.
 
     Args:
-        recordings: B recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
+        recordings: recordings or a single one: MCAP files, rosbag2 folders, or `Recording`s.
         perception: maps scans [N, P] m (infinite without a return) and bearings [P] radians to
             cones [N, 2, K, 2] in the car's frame, m in the scale of the cone world, left side
             first, nearest first; and their number [N, 2]. Called once for all scans of a recording
             with equal bearings.
+        num_envs: B; row i replays recording i modulo their number. None for one row each.
         scan: topic of the LiDAR.
         odometry: topic of the odometry, or None; ignored if the recording does not have it.
         command: topic of the commands, or None; ignored if the recording does not have it.
@@ -75,6 +82,7 @@ class McapReplayEnv(EnvBase):
         recordings: AnyPath | Recording | Sequence[AnyPath | Recording],
         perception: Perceive,
         *,
+        num_envs: int | None = None,
         scan: str = "/scan",
         odometry: str | None = "/odom",
         command: str | None = "/cmd_vel",
@@ -112,29 +120,56 @@ class McapReplayEnv(EnvBase):
         self.recordings = [
             source if isinstance(source, Recording) else read(source) for source in sources
         ]
-        super().__init__(device=torch.device(device), batch_size=torch.Size([len(self.recordings)]))
+        rows = len(self.recordings) if num_envs is None else num_envs
+        check_range(0, above=True, num_envs=rows)
+        super().__init__(device=torch.device(device), batch_size=torch.Size([rows]))
         self.smooth, self.max_steering = smooth, math.radians(max_steering)
         self.speed, self.car_length = speed, car_length
-        self.memory = BoundaryMemory(len(sources), spline, smoothing, sight=sight)
-        # All scans are perceived here and stored end to end, [T] scans per buffer.
+        self.memory = BoundaryMemory(rows, spline, smoothing, sight=sight)
         self.perception = perception
-        views = [_perceive(each, perception, kept_cones) for each in self.recordings]
+        self._store_scans(kept_cones)
+        numbers = torch.arange(rows)
+        self.track: Tensor = nn.Buffer(numbers % len(self.recordings), persistent=False)
+        scans = torch.tensor([len(each.ranges) for each in self.recordings])
+        self.length: Tensor = nn.Buffer(scans[self.track], persistent=False)
+        self.first: Tensor = nn.Buffer((scans.cumsum(0) - scans)[self.track], persistent=False)
+        self.steps: Tensor = nn.Buffer(torch.zeros(rows, dtype=torch.int64))
+        # How often the scans of a row were seen before, by the row itself or by an earlier one.
+        self.passes: Tensor = nn.Buffer(numbers // len(self.recordings))
+        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, rows))
+        self.to(self.device)
+        declare_specs(self, self._reset())
+
+    def _store_scans(self, kept_cones: int) -> None:
+        """Perceive all scans of all recordings, and keep what is known of them, end to end.
+
+        Args:
+            kept_cones: K.
+        """
+        views = [_perceive(each, self.perception, kept_cones) for each in self.recordings]
         self.cones = _joined([cones for cones, _ in views])
         self.count = _joined([count for _, count in views])
-        poses = [_from_start(each.poses(car_length)) for each in self.recordings]
+        poses = [_from_start(each.poses(self.car_length)) for each in self.recordings]
         self.pose = _joined([pose.astype(np.float32) for pose in poses])
         self.seconds = _joined([each.seconds.astype(np.float32) for each in self.recordings])
-        length = torch.tensor([len(each.ranges) for each in self.recordings])
-        self.length: Tensor = nn.Buffer(length, persistent=False)
-        self.first: Tensor = nn.Buffer(length.cumsum(0) - length, persistent=False)
         # Much faster here, for all scans at once, than step by step.
         samples, valid = self.memory.estimate(self.cones, self.count)
         self.samples: Tensor = nn.Buffer(samples, persistent=False)
         self.valid: Tensor = nn.Buffer(valid, persistent=False)
-        self.steps: Tensor = nn.Buffer(torch.zeros(len(sources), dtype=torch.int64))
-        self.history: Tensor = nn.Buffer(torch.zeros(HISTORY, len(sources)))
-        self.to(self.device)
-        declare_specs(self, self._reset())
+        steering = [self._recorded_steering(each) for each in self.recordings]
+        self.recorded = _joined([np.nan_to_num(angle) for angle, _ in steering])
+        self.stale = _joined([np.isnan(angle) for angle, _ in steering])
+        self.standing = _joined([speed < STANDS for _, speed in steering])
+
+    def _recorded_steering(
+        self, recording: Recording
+    ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+        """Return the recorded action and speed (m/s) at each scan, [N]; NaN where unknown."""
+        if recording.commands is None:
+            unknown = np.full(len(recording.ranges), np.nan)
+            return unknown.astype(np.float32), unknown
+        angle, _, speed = recording.steering(self.speed, self.car_length)
+        return (angle / self.max_steering).clip(-1, 1).astype(np.float32), speed
 
     def _set_seed(self, seed: int | None) -> None:
         """Do nothing: the env is deterministic."""
@@ -142,6 +177,7 @@ class McapReplayEnv(EnvBase):
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         mask = torch.ones_like(self.steps, dtype=torch.bool) if mask is None else mask.view(-1)
+        self.passes = self.passes + (mask & (self.steps > 0))
         self.steps = self.steps.masked_fill(mask, 0)
         self.history = self.history.masked_fill(mask, 0)
         self.memory.reset(mask)
@@ -180,6 +216,8 @@ class McapReplayEnv(EnvBase):
             roughness: [B], |a - mean of the last 20 actions|.
         """
         current, steering = self._current(), self.history[0].unsqueeze(-1)
+        stale, standing = self.stale[current], self.standing[current]
+        usable = ~stale & ~standing & (self.passes == 0) & (self.steps < self.length)
         reward = {"smooth": self.smooth * roughness.unsqueeze(-1)}
         info = {
             "scan": (current - self.first).unsqueeze(-1),
@@ -187,6 +225,11 @@ class McapReplayEnv(EnvBase):
             "pose": self.pose.index_select(0, current),
             "valid": view["valid"],
             "smoothness": roughness.unsqueeze(-1),
+            "recorded": self.recorded[current].unsqueeze(-1),
+            "stale": stale.unsqueeze(-1),
+            "standing": standing.unsqueeze(-1),
+            "usable": usable.unsqueeze(-1),
+            "track": self.track.unsqueeze(-1),
             "reward": TensorDict(reward, self.batch_size),
         }
         entries: dict[str, Any] = {key: view[key] for key in ("observation", "cones", "cone_count")}

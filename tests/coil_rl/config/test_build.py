@@ -58,11 +58,13 @@ def test_env_of_every_method_passes_check_env(method, preset):
 
 
 NOT_ALONE = {
+    "cone_planner",
     "controller",
     "entry",
     "learned",
     "recorded",
-}  # need a class, an entry, a run or a file
+    "recording",
+}  # need a package, a class, an entry, a run, a file or recordings
 WITH_MEMORY = {"authors", "spline_memory"}
 OF_OTHER_ENVS = {
     "bot",

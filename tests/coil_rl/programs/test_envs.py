@@ -18,7 +18,7 @@ import coil_rl.config.schema  # noqa: F401 registers the schema
 from coil_rl.config.build import env_maker
 
 FILES = sorted(file.stem for file in (Path(__file__).parents[3] / "conf" / "env").glob("*.yaml"))
-REPLAYS = ["mcap_replay"]  # for coil-replay alone, see test_replay.py
+REPLAYS = ["mcap_replay"]  # of recordings, see config/test_replay.py
 # Envs of other libraries, without tracks and guides.
 OTHERS = {
     "gym": shlex.split("env.id=Pendulum-v1 env.max_steps=12"),
@@ -136,14 +136,11 @@ def test_killed_run_of_an_env_ends_like_an_uninterrupted_one(env, learner, tmp_p
 
 @pytest.mark.parametrize("learner", LEARNERS)
 @pytest.mark.parametrize("env", REPLAYS)
-def test_env_without_rows_is_refused_before_the_training(env, learner, tmp_path):
+def test_replay_without_a_recording_is_refused_before_the_training(env, learner, tmp_path):
     done = called(
         "train", f"env={env}", *LEARNERS[learner], "hydra.run.dir=run", cwd=tmp_path, code=2
     )
-    assert (
-        "McapReplayEnv has no key num_envs, so no policy can act in it; choose another env"
-        in done.stderr
-    )
+    assert "recording must be an MCAP file or a rosbag2 folder" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert not any(tmp_path.iterdir())
 

@@ -226,9 +226,11 @@ def test_invalid_arguments_are_refused(tmp_path, options, reason):
 
 
 def test_configuration_builds_the_env(tmp_path):
-    recordings = f"env.recordings=[{drive(tmp_path / 'a.mcap', 3)}]"
+    words = [f"recording=[{drive(tmp_path / 'a.mcap', 3)}]", "method=oil", "env=mcap_replay"]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
-        node = compose("train", ["env=mcap_replay", recordings, "run_dir=unused"]).env
+        config = compose("train", [*words, "run_dir=unused"])
+    assert (config.budget.num_envs, config.budget.steps, config.budget.frames) == (1, 3, 3)
+    node = config.env
     node = OmegaConf.to_container(node, resolve=True)
     del node["perception"]
     assert build(node, "env", McapReplayEnv, perception=blind).rollout(9).shape == (1, 3)
@@ -241,3 +243,29 @@ def test_configuration_builds_the_env(tmp_path):
             McapReplayEnv,
             perception=blind,
         )
+
+
+def test_recorded_steering_is_usable_once(tmp_path):
+    paths = [drive(tmp_path / f"{scans}.mcap", scans, commands=True) for scans in (4, 6)]
+    env = McapReplayEnv(paths, blind, num_envs=3)
+    steps = env.rollout(8, break_when_any_done=False)
+    steering = math.asin(0.15 * (2 / 7) / 0.15) / math.radians(80)
+    torch.testing.assert_close(steps["info", "recorded"], torch.full((3, 8, 1), steering))
+    # The short recording begins anew after four scans, and the third row repeats the first one.
+    usable = steps["info", "usable"].squeeze(-1)
+    assert usable.sum(1).tolist() == [4, 6, 0]
+    assert steps["info", "track"][:, 0, 0].tolist() == [0, 1, 0]
+    assert not steps["info", "stale"].any()
+
+
+def test_scans_without_commands_are_stale_and_those_of_a_standing_robot_are_marked(tmp_path):
+    path = drive(tmp_path / "a.mcap", 5, commands=True)
+    recording = read_recording(path)
+    commands, times = recording.commands
+    commands[2:, 0] = 0.0
+    standing = McapReplayEnv(replace(recording, commands=(commands, times)), blind).rollout(5)
+    assert standing["info", "standing"].flatten().tolist() == [False, False, True, True, True]
+    silent = McapReplayEnv(drive(tmp_path / "b.mcap", 5), blind).rollout(5)
+    assert silent["info", "stale"].all()
+    assert not silent["info", "usable"].any()
+    assert not silent["info", "recorded"].any()
