@@ -5,17 +5,20 @@ import io
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from coil_rl.envs.regular_files import read_regular
+from coil_rl.envs.simulator_files import is_of_simulator, simulator_track
 from coil_rl.envs.track import Track, TrackError
 
+Row = tuple[int, list[str]]  # number of the line, and its cells
 Split = Literal["train", "test", "all"]
 
 MAX_BYTES = 10_000_000  # a hundred times the longest track
@@ -25,7 +28,8 @@ COLUMNS = ("Cone_Type", "Cone_X", "Cone_Y")
 def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> Track:
     """Read a level file.
 
-    It is a CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down).
+    It is a CSV with the columns Cone_Type (LEFT or RIGHT), Cone_X and Cone_Y (m, pointing down), or
+    one of a Formula Student simulator, see `coil_rl.envs.simulator_files`.
 
     Args:
         path: the file; extra columns, blank lines and case are ignored.
@@ -36,8 +40,51 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
             and the fault.
     """
     path = Path(path)
+    header, rows = _table(path)
+    columns = [name.casefold() for name in header]
+    pose = _pose(path, start)
+    try:
+        if is_of_simulator(columns):
+            return simulator_track(path.stem, columns, rows, pose)
+        left, right = _sides(path, header, rows)
+        return Track(path.stem, left, right, pose)  # type: ignore[arg-type]
+    except TrackError as error:
+        text = str(error).rstrip(".")
+        raise TrackError(f"{text}." if text.startswith(str(path)) else f"{path}: {text}.") from None
+
+
+def _pose(path: Path, start: Sequence[float] | None) -> tuple[float, float, float] | None:
+    """Return a start as m, m and radians; the path is for a message."""
+    if start is None:
+        return None
+    try:
+        x, y, degrees = map(float, start)
+    except (TypeError, ValueError):
+        raise TrackError(
+            f"{path}: the start is {start!r}; give three numbers: x and y (up) in m, heading "
+            "in degrees."
+        ) from None
+    return x, y, math.radians(degrees)
+
+
+def _sides(path: Path, header: Sequence[str], rows: Sequence[Row]) -> list[NDArray[np.float64]]:
+    """Return the cones of both sides, [N, 2] m each, y pointing up.
+
+    Args:
+        path: of the file, for messages.
+        header: names of the columns.
+        rows: number of the line, and its cells.
+    """
+    columns = [name.casefold() for name in header]
+    for column in COLUMNS:
+        if column.casefold() not in columns:
+            raise TrackError(
+                f"{path} has no column {column}; the columns of its first line are {header}."
+            )
+    order = [columns.index(column.casefold()) for column in COLUMNS]
     sides: dict[str, list[tuple[float, float]]] = {"LEFT": [], "RIGHT": []}
-    for line, (side, *cells) in _rows(path):
+    for line, row in rows:
+        side, *cells = [row[i] if i < len(row) else "" for i in order]
         if side.upper() not in sides:
             raise TrackError(
                 f"{path}, line {line}: Cone_Type is {side!r}; it must be LEFT or RIGHT."
@@ -50,21 +97,7 @@ def load_track(path: str | os.PathLike[str], start: Sequence[float] | None = Non
                 "m."
             ) from None
         sides[side.upper()].append((x, -y))
-    left, right = (np.reshape(cones, (-1, 2)) for cones in sides.values())
-    pose = None
-    if start is not None:
-        try:
-            x, y, degrees = map(float, start)
-        except (TypeError, ValueError):
-            raise TrackError(
-                f"{path}: the start is {start!r}; give three numbers: x and y (up) in m, heading "
-                "in degrees."
-            ) from None
-        pose = x, y, math.radians(degrees)
-    try:
-        return Track(path.stem, left, right, pose)  # type: ignore[arg-type]
-    except TrackError as error:
-        raise TrackError(f"{path}: {error}") from None
+    return [np.reshape(cones, (-1, 2)) for cones in sides.values()]
 
 
 def load_tracks(path: str | os.PathLike[str], start: Sequence[float] | None = None) -> list[Track]:
@@ -162,29 +195,21 @@ def _shipped(split: str) -> list[Track]:
         return load_tracks(folder)
 
 
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the cells under `COLUMNS` of each row that is not blank.
-
-    Missing cells are empty.
-    """
-    text = _read(path)
-    reader = csv.reader(io.StringIO(text))
+def _table(path: Path) -> tuple[list[str], list[Row]]:
+    """Return the header, and the number of the line and the cells of each row that is not blank."""
+    reader = csv.reader(io.StringIO(_read(path)))
     try:
         header = [name.strip() for name in next(reader)]
-        columns = [name.casefold() for name in header]
-        for column in COLUMNS:
-            if column.casefold() not in columns:
-                raise TrackError(
-                    f"{path} has no column {column}; the columns of its first line are {header}."
-                )
-        order = [columns.index(column.casefold()) for column in COLUMNS]
+        rows: list[Row] = []
         for row in reader:
-            if any(cell.strip() for cell in row):
-                yield reader.line_num, [row[i].strip() if i < len(row) else "" for i in order]
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                rows.append((reader.line_num, cells))
     except csv.Error as error:
         raise TrackError(
             f"{path}, line {reader.line_num}: {error}; save the level as plain CSV."
         ) from None
+    return header, rows
 
 
 def _read(path: Path) -> str:
