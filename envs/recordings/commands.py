@@ -9,6 +9,8 @@ from coil_rl.envs.recordings.mcap_files import Contents
 from coil_rl.envs.recordings.messages import COMMANDS, command_of
 from coil_rl.envs.recordings.scans import LARGEST, decoded
 
+ADDED = "/coil/"  # topics that coil-replay adds to a copy: what policies would have done
+
 
 def command_topic(wanted: str, contents: Contents, remarks: list[str]) -> str | None:
     """Return the topic whose commands are read; None for none.
@@ -24,7 +26,8 @@ def command_topic(wanted: str, contents: Contents, remarks: list[str]) -> str | 
     """
     others = []
     for topic, messages in contents.messages.items():
-        if topic != wanted and messages and messages[0].channel.message_type in COMMANDS:
+        commands = messages and messages[0].channel.message_type in COMMANDS
+        if commands and topic != wanted and not topic.startswith(ADDED):
             others.append(topic)
     others.sort()
     if contents.messages.get(wanted):

@@ -96,3 +96,11 @@ def test_poses_of_ackermann_commands_are_those_of_the_turn_rates(good, tmp_path)
     with pytest.warns(UserWarning, match="read instead"):
         angles = read_recording(changed(good, without_odometry, tmp_path))
     np.testing.assert_allclose(angles.poses(2 / 7)[:, :2], twists.poses()[:, :2], atol=1e-5)
+
+
+def test_steering_that_a_replay_added_is_not_taken_for_commands(good, tmp_path):
+    def annotated(drive):
+        drive.command_topic = "/coil/spline/cmd_vel"
+
+    recording = read_recording(changed(good, annotated, tmp_path))
+    assert (recording.commands, list(recording.remarks)) == (None, [])
