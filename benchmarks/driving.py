@@ -7,6 +7,7 @@ import os
 import tempfile
 import time
 from argparse import Namespace
+from collections.abc import Callable
 from multiprocessing.queues import SimpleQueue
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -211,7 +212,7 @@ def measure_robot(args: Namespace) -> list[Row]:
             return len(ranges)
 
         simulated = Driving(SimulatedRobotEnv(num_envs=ROBOTS, starts=32, time_limit=20.0))
-        subjects = {
+        subjects: dict[str, Callable[[], int]] = {
             f"simulator, {ROBOTS} robots": simulated,
             "reading MCAP": lambda: len(read_recording(path).ranges),
             "perception, whole recording": whole_recording,
