@@ -216,11 +216,10 @@ def own_signature(
 ) -> tuple[str, str | None] | None:
     """Return the signature of a class by its constructor.
 
-    TorchRL's metaclass shows every env as `(*args, **kwargs)`.
+    TorchRL's metaclass shows every env as `(*args, **kwargs)`, and tensordict's `__new__` every
+    module.
     """
-    if what != "class" or not inspect.isclass(thing) or "__init__" not in dir(thing):
-        return None
-    if type(thing) is type:
+    if what != "class" or not inspect.isfunction(thing.__init__):
         return None
     from sphinx.util.inspect import signature as signature_of
     from sphinx.util.inspect import stringify_signature
