@@ -67,7 +67,7 @@ def refusal(name, *arguments):
     ("arguments", "message"),
     [
         # keys
-        ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
+        ("sed=1", "no key sed; the configuration has preset, track, env, guide, disturb, degrade"),
         ("sed=1", "init; did you mean seed?"),
         (
             "budget.step=1",
@@ -286,7 +286,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
     ("arguments", "message"),
     [
         # one of each kind above
-        ("sed=1", "no key sed; the configuration has preset, track, env, guide, degrade, method"),
+        ("sed=1", "no key sed; the configuration has preset, track, env, guide, disturb, degrade"),
         ("learner.gamma=abc", "learner.gamma='abc' must be a valid number"),
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
         (
