@@ -69,7 +69,9 @@ def quietly() -> Iterator[None]:
 
 def progress(**options: Any) -> "tqdm[Any]":
     """Return a progress bar on standard error; `options` are those of tqdm."""
-    return tqdm(file=SafeStream(sys.stderr), disable=_quiet.get(), **options)
+    if _quiet.get():
+        options["disable"] = True
+    return tqdm(file=SafeStream(sys.stderr), **options)
 
 
 def say(text: str, *, error: bool = False) -> None:

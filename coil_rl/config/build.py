@@ -13,6 +13,7 @@ from torchrl.envs import EnvBase, Transform
 
 from coil_rl.config.beside import unread_controllers
 from coil_rl.config.logger import make_logger
+from coil_rl.config.measured import complete_measures
 from coil_rl.config.nodes import build, build_all, find_target
 from coil_rl.config.numbers import GuideWithNumbers, numbers_to_tune, with_tuned
 from coil_rl.config.saved import identity, settings
@@ -36,9 +37,10 @@ def assemble(config: DictConfig, folder: Path | None = None) -> Run:
     """Return the run that a configuration describes; nothing is built or written yet.
 
     Args:
-        config: of `coil-train`, composed or read from a folder.
+        config: of `coil-train`, composed or read from a folder; its measures are completed.
         folder: of the run, instead of `run_dir`.
     """
+    complete_measures(config)
     # Here, because proxies are runs themselves.
     from coil_rl.config.distillation import distil
     from coil_rl.config.load import load_guides

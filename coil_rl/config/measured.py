@@ -1,10 +1,12 @@
 """Measures of episodes in a configuration: from files, and from the command line."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from coil_rl.config.hints import similar
 from coil_rl.config.schema import MeasureConfig
 from coil_rl.config.sentences import sentence
 from coil_rl.errors import UserError
@@ -16,7 +18,8 @@ TAKEN = ("driver", "advice", "actions", "case", "reward", "steps", "episodes", "
 def complete_measures(config: DictConfig) -> None:
     """Give measures their types, and the values that a person left out.
 
-    The schema leaves them untyped, because OmegaConf adds no typed node by an override.
+    The schema leaves them untyped, because OmegaConf adds no typed node by an override. A
+    configuration that is complete stays as it is.
 
     Args:
         config: composed; it is changed in place.
@@ -38,6 +41,13 @@ def complete_measures(config: DictConfig) -> None:
                 f"evaluation.measures.{name}.entry=ENTRY and, where it is not the mean over the "
                 "steps, its reduction"
             )
+        known = [field.name for field in fields(MeasureConfig)]
+        for key in measures[name]:
+            if key not in known:
+                raise UserError(
+                    f"there is no key {key}; evaluation.measures.{name} has {', '.join(known)}"
+                    f"{similar(str(key), known)}"
+                )
         try:
             typed = OmegaConf.merge(OmegaConf.structured(MeasureConfig), measures[name])
         except OmegaConfBaseException as error:

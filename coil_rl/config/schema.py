@@ -36,6 +36,11 @@ def one_of(*choices: str) -> GetPydanticSchema:
     return GetPydanticSchema(lambda *_: core_schema.literal_schema(list(choices)))
 
 
+def typed_as(kind: Any) -> GetPydanticSchema:
+    """Return the schema of another type than the one that OmegaConf is told."""
+    return GetPydanticSchema(lambda _, handler: handler(kind))
+
+
 def format_of_numbers(spec: str) -> str:
     """Return a format for numbers, as Python's `format` takes it.
 
@@ -133,7 +138,10 @@ class EvaluationConfig(NodeConfig):
     """
 
     cases: Any = 1
-    measures: dict[str, Any] = field(default_factory=dict)  # of `MeasureConfig`, see `measured`
+    # OmegaConf adds no typed node by an override, so these get their types in `measured`.
+    measures: Annotated[dict[str, Any], typed_as(dict[str, MeasureConfig])] = field(
+        default_factory=dict
+    )
     pictures: dict[str, Any] = field(default_factory=dict)
     sections: dict[str, Any] | None = None  # of coil-listen
     env: dict[str, Any] = field(default_factory=dict)

@@ -10,6 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from coil_rl.config.arguments import validation_message
 from coil_rl.config.hints import similar
+from coil_rl.config.measured import complete_measures
 from coil_rl.errors import UserError
 
 LARGEST_BATCH = 2**28  # frames
@@ -19,11 +20,12 @@ def check_values(config: DictConfig) -> None:
     """Check the values of the configuration of any program.
 
     Args:
-        config: composed by Hydra, or read from a folder.
+        config: composed by Hydra, or read from a folder; its measures are completed.
 
     Raises:
         UserError: for an unknown key, or a value out of range.
     """
+    complete_measures(config)
     values: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     schema: Any = OmegaConf.get_type(config)
     try:

@@ -16,7 +16,6 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from coil_rl.config.hints import OF_CONES
-from coil_rl.config.measured import complete_measures
 from coil_rl.errors import UserError
 
 # Where the files are whose order of composition is meant.
@@ -64,8 +63,7 @@ def keep_written(
         hydra: overrides of the command line for Hydra.
 
     Raises:
-        UserError: for a value that two files give differently, or that has no place, and for a
-            measure that is none.
+        UserError: for a value that two files give differently, or that has no place.
     """
     overrides = [*task, *hydra]
     loader: Any = GlobalHydra.instance().config_loader()
@@ -85,7 +83,6 @@ def keep_written(
             keys = [key_of(text) for text in task]
             typed = [key for key in keys if not files.group_exists(key.replace(".", "/"))]
             _keep(config, _written(defaults, files), typed)
-        complete_measures(config)
 
 
 def _keep(config: DictConfig, values: Iterable[Written], typed: Sequence[str]) -> None:

@@ -159,7 +159,7 @@ def _windows(
     far = torch.hypot(x, y)
     half = torch.where(far > reach, (reach / far).clamp(max=1).asin(), math.pi)
     half = (half + away[2] + MARGIN).clamp(max=math.pi)
-    order = angles.sort(-1)
+    order = angles.remainder(2 * math.pi).sort(-1)  # beams may go on beyond a turn
     lowest = order.values[..., :1]
     bearing = lowest + (torch.atan2(y, x) - middle[2] - lowest).remainder(2 * math.pi)
     turns = torch.cat([order.values + turn * 2 * math.pi for turn in (-1, 0, 1)], -1)

@@ -75,7 +75,7 @@ def test_other_learners_are_measured_without_yardsticks(tmp_path):
     main([*overrides, "--quick", "--parts", "training", "sb3", "--output", str(tmp_path / "run")])
     results = json.loads((tmp_path / "run" / "benchmark.json").read_text())
     (row,) = results["training"]
-    assert set(row["rounds"]) == {"ppo", "coil"}
+    assert {"ppo", "coil"} <= set(row["rounds"])
     assert "not measured" in results["sb3"][0]
 
 

@@ -61,6 +61,7 @@ NOT_ALONE = {
     "cone_planner",
     "controller",
     "entry",
+    "exported",
     "learned",
     "recorded",
     "recording",

@@ -1,10 +1,18 @@
 import pytest
+from omegaconf import DictConfig
 
 from coil_rl import UserError
+from coil_rl.config.measured import complete_measures
 from coil_rl.config.python import compose_train
 
 ADDED = "evaluation.measures.last_reward."
 WORDS = ["env=pendulum", "method=ppo"]
+
+
+def measures_with(*words: str) -> DictConfig:
+    config = compose_train([*WORDS, *words])
+    complete_measures(config)
+    return config.evaluation.measures
 
 
 @pytest.mark.parametrize(
@@ -16,7 +24,7 @@ WORDS = ["env=pendulum", "method=ppo"]
     ],
 )
 def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: list[str]) -> None:
-    measures = compose_train([*WORDS, *added]).evaluation.measures
+    measures = measures_with(*added)
     assert set(measures) == {"completed", "last_reward"}
     assert measures.last_reward.reduction == "last"
     assert measures.last_reward.format == ".1f"
@@ -25,9 +33,9 @@ def test_a_measure_is_added_on_the_command_line_beside_those_of_the_env(added: l
 @pytest.mark.parametrize("name", ["reward", "case", "driver", "steps"])
 def test_a_measure_named_as_another_column_is_refused(name: str) -> None:
     with pytest.raises(UserError, match=f"{name} is already a column of the tables"):
-        compose_train([*WORDS, f"evaluation.measures.{name}.entry=reward"])
+        measures_with(f"evaluation.measures.{name}.entry=reward")
 
 
 def test_values_of_a_measure_have_their_types() -> None:
     with pytest.raises(UserError, match=r"measures\.low: at_least: Value 'much'"):
-        compose_train([*WORDS, "evaluation.measures.low={entry: reward, at_least: much}"])
+        measures_with("evaluation.measures.low={entry: reward, at_least: much}")

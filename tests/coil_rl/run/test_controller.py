@@ -14,7 +14,8 @@ from coil_rl.run.controller import Controller
 from coil_rl.run.parts import TEST
 
 CONF = Path(__file__).parents[3] / "conf"
-METHODS = sorted(file.stem for file in (CONF / "method").glob("*.yaml"))
+# A search of numbers trains no policy.
+METHODS = sorted({file.stem for file in (CONF / "method").glob("*.yaml")} - {"tune"})
 # Learners that refuse a network with a memory.
 WITHOUT_MEMORY = {*OPTIONS, "advisor"} - {"coil_anchored", "guide"}
 WITHOUT_MEMORY |= {method for method in METHODS if method.startswith("dynamic_coil")}
