@@ -4,12 +4,12 @@
 
     python -m benchmarks.promise outputs/experiments/promise
 
-A task has a folder with the runs of its arms. The arm `alone` is plain PPO; in the others anchored
-COIL has an intact, detuned, reversed or random guide. The unit is the seed. An arm is compared with
-the better of its guide, as it acts alone in the cases of the table, and of PPO, seed by seed. It is
-a loss if the 95 % interval of the mean difference is below 0 and the mean below -1 % of the scale,
-a gain if both are above, and else even. The scale of a task is the distance from the return of its
-random guide to the better of PPO and its intact guide.
+A task has a folder with the runs of its arms, whose labels are METHOD_ARM. `ppo_alone` is plain
+PPO; in the others a method has an intact, detuned, reversed or random guide. The unit is the seed.
+A method is compared with the better of its guide, as it acts alone in the cases of the table, and
+of PPO, seed by seed. It is a loss if the 95 % interval of the mean difference is below 0 and the
+mean below -1 % of the scale, a gain if both are above, and else even. The scale of a task is the
+distance from the return of its random guide to the better of PPO and its intact guide.
 """
 
 import argparse
@@ -27,15 +27,17 @@ from coil_rl.report.curves import points
 from coil_rl.report.runs import GUIDE, RETURN, Run, read_runs
 from coil_rl.report.statistics import mean_interval
 
-ALONE, INTACT, RANDOM = "alone", "intact", "random"
+PPO, ALONE, INTACT, RANDOM = "ppo", "alone", "intact", "random"
+Key = tuple[str, str]  # method and arm
 MATERIAL = 0.01  # of the scale of a task
 COLUMNS = {
     "task": ("task", ""),
+    "method": ("method", ""),
     "arm": ("arm", ""),
     "seeds": ("seeds", "d"),
     "guide": ("guide", ".1f"),
     "ppo": ("ppo", ".1f"),
-    "end": ("anchored", ".1f"),
+    "end": ("end", ".1f"),
     "difference": ("difference (%)", "+.1f"),
     "low": ("low", "+.1f"),
     "high": ("high", "+.1f"),
@@ -75,32 +77,66 @@ def _reward(run: Run, driver: str) -> float:
     return float(table[plain & (table["driver"] == driver)]["reward"].mean())
 
 
+def arms_of(runs: Sequence[Run]) -> dict[Key, Arm]:
+    """Return the finished runs by method and arm, the two parts of their labels.
+
+    Args:
+        runs: of one task.
+    """
+    arms: dict[Key, Arm] = {}
+    for run in runs:
+        method, _, arm = run.label.rpartition("_")
+        if run.finished:
+            arms.setdefault((method, arm), Arm({})).runs[run.seed] = run
+    return arms
+
+
 def rows_of_task(name: str, runs: Sequence[Run]) -> list[dict[str, object]]:
-    """Return a row of the table for each arm of a task, except for `alone`.
+    """Return a row of the table for each method with each guide; none without plain PPO.
 
     Args:
         name: of the task.
-        runs: its finished runs; their labels are the arms.
+        runs: its runs.
     """
-    arms: dict[str, Arm] = {}
-    for run in runs:
-        arms.setdefault(run.label, Arm({})).runs[run.seed] = run
-    if ALONE not in arms:
+    arms = arms_of(runs)
+    alone = arms.get((PPO, ALONE))
+    if alone is None:
         return []
-    alone = arms.pop(ALONE)
-    return [_row(name, label, arm, alone, _scale(arms, alone)) for label, arm in arms.items()]
+    scale = scale_of(arms, alone)
+    return [
+        {"task": name, "method": method, "arm": arm} | _row(each, alone, scale)
+        for (method, arm), each in arms.items()
+        if arm != ALONE
+    ]
 
 
-def _scale(arms: dict[str, Arm], alone: Arm) -> float:
-    """Return the scale of a task; NaN without its random guide."""
+def scale_of(arms: dict[Key, Arm], alone: Arm) -> float:
+    """Return the scale of a task; NaN without a random guide.
+
+    Args:
+        arms: of the task.
+        alone: the runs of PPO.
+    """
     best = float(np.mean([alone.reward(seed) for seed in alone.runs]))
-    if INTACT in arms:
-        best = max(best, arms[INTACT].guide)
-    return abs(best - arms[RANDOM].guide) if RANDOM in arms else math.nan
+    intact = guide_of(arms, INTACT)
+    if not math.isnan(intact):
+        best = max(best, intact)
+    return abs(best - guide_of(arms, RANDOM))
 
 
-def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
-    """Return the row of an arm."""
+def guide_of(arms: dict[Key, Arm], name: str) -> float:
+    """Return the mean reward of the guide of an arm, which is no method's; NaN without the arm.
+
+    Args:
+        arms: of the task.
+        name: of the arm.
+    """
+    known = [each.guide for (_, arm), each in arms.items() if arm == name]
+    return float(np.mean(known)) if known else math.nan
+
+
+def _row(arm: Arm, alone: Arm, scale: float) -> dict[str, object]:
+    """Return the row of a method with one guide."""
     seeds = sorted(set(arm.runs) & set(alone.runs))
     ends = np.array([arm.reward(seed) for seed in seeds])
     of_ppo = np.array([alone.reward(seed) for seed in seeds])
@@ -108,14 +144,13 @@ def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str,
     better = of_ppo
     if guide > of_ppo.mean():
         better = np.full(len(seeds), guide)
-    mean, low, high = (100 * float(each) / scale for each in mean_interval(ends - better))
-    rows = [arm.runs[seed].curve for seed in seeds]
+    mean, low, high = (100 * each / scale for each in _interval(ends - better))
+    curves = [arm.runs[seed].curve for seed in seeds if arm.runs[seed].curve]
     lowest = [_lowest(arm.runs[seed]) for seed in seeds]
     held = [each for each in lowest if not math.isnan(each)]  # their number is in the column `held`
     seconds = [(arm.runs[seed].seconds, alone.runs[seed].seconds) for seed in seeds]
+    tests = [rows[-1].get("frames/tests", 0.0) / rows[-1]["frames"] for rows in curves]
     return {
-        "task": name,
-        "arm": label,
         "seeds": len(seeds),
         "guide": guide,
         "ppo": float(of_ppo.mean()),
@@ -125,11 +160,19 @@ def _row(name: str, label: str, arm: Arm, alone: Arm, scale: float) -> dict[str,
         "high": high,
         "verdict": verdict(mean, low, high),
         "lowest": 100 * min(held, default=math.nan) / scale,
-        "tests": 100 * max(each[-1]["frames/tests"] / each[-1]["frames"] for each in rows),
-        "held": _counted(f"{each[0].get('start/weight', math.nan):g}" for each in rows),
+        "tests": 100 * max(tests, default=math.nan),
+        "held": _counted(f"{rows[0].get('start/weight', math.nan):g}" for rows in curves),
         "handed_over": _counted(arm.runs[seed].handed_over for seed in seeds),
         "time": float(np.median([a / b for a, b in seconds if a and b] or [math.nan])),
     }
+
+
+def _interval(values: np.ndarray) -> tuple[float, float, float]:
+    """Return the mean over seeds and its interval, NaN with fewer than two seeds."""
+    if len(values) < 2:
+        return float(values[0]) if len(values) else math.nan, math.nan, math.nan
+    mean, low, high = mean_interval(values)
+    return float(mean), float(low), float(high)
 
 
 def verdict(mean: float, low: float, high: float) -> str:
@@ -146,7 +189,7 @@ def _lowest(run: Run) -> float:
 
     NaN if no guide was held.
     """
-    if not run.curve[0].get("start/weight", 0):
+    if not run.curve or not run.curve[0].get("start/weight", 0):
         return math.nan
     return float(points(run.curve, RETURN)[:, 1].min()) - max(run.guide_returns.values())
 
@@ -164,7 +207,7 @@ def main() -> None:
     folder = parser.parse_args().folder
     rows: list[dict[str, object]] = []
     for task in sorted(path for path in folder.iterdir() if path.is_dir()):
-        rows += rows_of_task(task.name, [run for run in read_runs([task]) if run.finished])
+        rows += rows_of_task(task.name, read_runs([task]))
     counts = Counter(row["verdict"] for row in rows)
     losses = [f"{row['task']} {row['arm']}" for row in rows if row["verdict"] == "loss"]
     sentence = f"{counts['gain']} gains, {counts['even']} even, {counts['loss']} losses"

@@ -56,7 +56,9 @@ def folder(tmp_path_factory):
 def test_experiment_trains_the_arms_of_a_task_in_its_folder(folder):
     labels = [(run.label, run.seed) for run in read_runs([folder / "pendulum"])]
     assert sorted(labels) == sorted(
-        (arm, seed) for arm in ("alone", "intact", "random") for seed in (0, 1)
+        (label, seed)
+        for label in ("ppo_alone", "coil_anchored_intact", "coil_anchored_random")
+        for seed in (0, 1)
     )
 
 
@@ -71,13 +73,13 @@ def test_table_compares_each_arm_with_the_better_of_guide_and_ppo(folder):
     assert intact["difference"] == pytest.approx(expected)
     shares = [
         row["frames/tests"] / row["frames"]
-        for row in (run.curve[-1] for run in runs if run.label == "intact")
+        for row in (run.curve[-1] for run in runs if run.label == "coil_anchored_intact")
     ]
     assert intact["tests"] == pytest.approx(100 * max(shares))
     chosen = [
         json.loads((run.folder / "delivery.json").read_text())["policy"]
         for run in runs
-        if run.label == "intact"
+        if run.label == "coil_anchored_intact"
     ]
     assert all(policy in intact["handed_over"] for policy in chosen)
 

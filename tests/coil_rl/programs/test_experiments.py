@@ -1,5 +1,6 @@
 """Every experiment file is a sweep that can be run and resumed."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -11,9 +12,24 @@ from coil_rl.config.check import check
 from coil_rl.programs.train import train
 
 CONF = Path(__file__).parents[3] / "conf"
-EXPERIMENTS = sorted(file.stem for file in (CONF / "experiment").glob("*.yaml"))
+FOLDER = CONF / "experiment"
+EXPERIMENTS = sorted(
+    file.relative_to(FOLDER).with_suffix("").as_posix() for file in FOLDER.rglob("*.yaml")
+)
 OF_TRACKS = ("track", "env.", "evaluation.curve.env.")  # words of worlds with tracks
 NEEDS_RUNS = ["driving_tasks"]
+NEEDS_EXTRA = {"guide_benchmark/babyai": "minigrid", "guide_benchmark/swimmer": "mujoco"}
+
+
+def with_tracks(experiment):
+    """Return whether an experiment is about a world with tracks."""
+    task = experiment.removeprefix("guide_benchmark/")
+    return experiment != "promise" and (task == experiment or task.startswith("cones"))
+
+
+def present(experiment):
+    """Return whether the extra of an experiment is installed."""
+    return not (extra := NEEDS_EXTRA.get(experiment)) or find_spec(extra) is not None
 
 
 def first(experiment, run_dir):
@@ -32,7 +48,9 @@ def first(experiment, run_dir):
         if not key.startswith("budget.")
     ]
     tiny = TINY_SWEEP
-    if experiment == "promise":  # of no world with tracks
+    if "guide_benchmark/" in experiment:
+        chosen = [word for word in chosen if not word.startswith("+arm")] + ["+arm=intact"]
+    if not with_tracks(experiment):
         tiny = [word for word in TINY_SWEEP if not word.startswith(OF_TRACKS)]
     with initialize_config_module("coil_rl.conf", version_base="1.3"):
         return compose("train", [f"+experiment={experiment}", *chosen, *tiny, f"run_dir={run_dir}"])
@@ -40,6 +58,8 @@ def first(experiment, run_dir):
 
 @pytest.mark.parametrize("experiment", sorted({*EXPERIMENTS} - {*NEEDS_RUNS}))
 def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
+    if not present(experiment):
+        pytest.skip(f"{NEEDS_EXTRA[experiment]} is not installed")
     config = first(experiment, tmp_path / "run")
     check(config)
     assert config.existing == "resume"
@@ -48,7 +68,8 @@ def test_experiment_passes_the_check_and_can_be_resumed(experiment, tmp_path):
 @pytest.mark.slow
 def test_every_experiment_trains_and_evaluates(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for experiment in [*(name for name in EXPERIMENTS if name not in NEEDS_RUNS), *NEEDS_RUNS]:
+    able = [name for name in EXPERIMENTS if name not in NEEDS_RUNS and present(name)]
+    for experiment in [*able, *NEEDS_RUNS]:
         for task in ("centred", "left", "right") if experiment == "driving_guides" else ("",):
             run = tmp_path / "outputs" / "experiments" / experiment / (task or "run")
             config = first(experiment, run)

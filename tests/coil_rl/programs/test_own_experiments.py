@@ -22,6 +22,7 @@ OWN = {
     "anchored": "controller",
     "coil_vs_ppo": "controller",
     "dynamic_coil": "[controller,random,zero]",
+    "guide_benchmark": "controller",
     "guide_phase": "controller",
     "guide_quality": "controller",
     "guide_removed": "controller",
