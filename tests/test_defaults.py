@@ -25,6 +25,7 @@ VARIATIONS = {
     ],  # None in the constructor: no options, no controllers; from Python processes are asked for
     "env/torchrl.yaml": ["env.max_steps"],
     "env/mcap_replay.yaml": ["evaluation.env."],  # two laps of robots that start alike
+    "task/cones_noisy_view.yaml": ["method.transforms.view.sigma"],
     "robot/replayed.yaml": ["car_length"],
     "disturb/late.yaml": ["min_lag", "max_lag", "in_keys", "memory_key"],
     "guide/authors.yaml": ["oddities"],

@@ -1,0 +1,1 @@
+"""Experiments of the guide benchmark with envs of other packages (YAML only)."""

@@ -1,0 +1,160 @@
+"""Pages of the guide benchmark: one a task, and one that holds all."""
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.guide_benchmark.picture import ARMS, LIMIT, draw
+from benchmarks.guide_benchmark.rows import references
+from benchmarks.promise import ALONE, GUIDE, INTACT, PPO, arms_of
+from coil_rl.files import write_text
+from coil_rl.report import draw_learning_curves, markdown_table
+from coil_rl.report.runs import Run
+
+Row = dict[str, Any]
+LADDER = {
+    "method": ("method", ""),
+    "arm": ("arm", ""),
+    "effort": ("effort", ""),
+    "seeds": ("seeds", "d"),
+    "end": ("end", ".1f"),
+    "score": ("score", ".2f"),
+    "guide": ("its guide", ".1f"),
+    "difference": ("end - better of guide and PPO (%)", "+.1f"),
+    "low": ("low", "+.1f"),
+    "high": ("high", "+.1f"),
+    "verdict": ("verdict", ""),
+    "first": ("first - guide (%)", "+.1f"),
+    "lowest": ("lowest - guide (%)", "+.1f"),
+    "frames_to_guide": ("frames to the guide", ".0f"),
+    "failures": ("failures", ".0%"),
+    "frames": ("frames", ".0f"),
+    "seconds": ("seconds", ".0f"),
+    "guide_calls": ("guide calls", ".0f"),
+}
+ALL = {
+    "arm": ("arm", ""),
+    "method": ("method", ""),
+    "tasks": ("tasks", "d"),
+    "score": ("score", ".2f"),
+    "difference": ("end - better of guide and PPO (%)", "+.1f"),
+    "gain": ("gains", "d"),
+    "even": ("even", "d"),
+    "loss": ("losses", "d"),
+    "worst": ("worst task (%)", "+.1f"),
+    "lowest": ("lowest - guide, worst task (%)", "+.1f"),
+}
+EDGE = (
+    f"Large: the mean over tasks; small: each task. What lies beyond {LIMIT:.0f} % is at the edge."
+)
+SMOKE = "**Smoke: too few seeds or frames for a conclusion**; it only shows that everything runs."
+
+
+def write_task(
+    folder: Path, task: str, rows: Sequence[Row], runs: Sequence[Run], jobs: int
+) -> None:
+    """Write the page of a task with its curves and its ladder.
+
+    Args:
+        folder: of the pages.
+        task: its name.
+        rows: of the table, the best first.
+        runs: all its runs.
+        jobs: number of further runs that were refused or failed.
+    """
+    arms = arms_of(runs)
+    curves = {
+        method: [run.curve for run in arm.runs.values() if run.curve]
+        for (method, name), arm in arms.items()
+        if name == INTACT or (method, name) == (PPO, ALONE)
+    }
+    curves = {method: seeds for method, seeds in curves.items() if seeds}
+    guide = float(np.mean([max(run.guide_returns.values()) for run in _guided(arms)] or [np.nan]))
+    draw_learning_curves(
+        curves,
+        folder / f"{task}.png",
+        guides={GUIDE: guide},
+        title=f"{task}: with its intact guide",
+    )
+    reference = references()[task]
+    finished = sum(run.finished for run in runs)
+    lines = [
+        f"# {task}",
+        *([SMOKE] if all(row["effort"] == "smoke" for row in rows) else []),
+        f"Score 0 is the random guide ({rows[0]['random']:.1f}), score 1 is "
+        f"{rows[0]['reference']:.1f}: {reference.source}. Percentages are of the distance from the "
+        "random guide to the better of PPO and the intact guide.",
+        f"![learning curves]({task}.png)",
+        "## Ladder",
+        markdown_table(rows, LADDER),
+        f"Runs started: {len(runs) + jobs}, finished: {finished}, refused or failed: {jobs}.",
+    ]
+    write_text(folder / f"{task}.md", "\n\n".join(lines) + "\n")
+
+
+def _guided(arms: Mapping[tuple[str, str], Any]) -> list[Run]:
+    """Return the runs with the intact guide whose return in the curve's cases is known."""
+    runs = [run for (_, arm), each in arms.items() if arm == INTACT for run in each.runs.values()]
+    return [run for run in runs if run.guide_returns]
+
+
+def write_all(folder: Path, rows: Sequence[Row]) -> str:
+    """Write the page that holds all tasks, with its picture, and return its text.
+
+    Args:
+        folder: of the pages.
+        rows: of all tasks.
+    """
+    lines = ["# Guide benchmark"]
+    if all(row["effort"] == "smoke" for row in rows):
+        lines.append(SMOKE)
+    summary = summarised(rows)
+    if summary:
+        draw(rows, folder / "all.png")
+        lines += ["![all tasks](all.png)", EDGE, markdown_table(summary, ALL)]
+    counts = Counter(row["verdict"] for row in rows if row["arm"] != ALONE)
+    lines.append(
+        f"{counts['gain']} gains, {counts['even']} even (undecided), {counts['loss']} losses. "
+        "Means are over tasks; score 0 is the random guide, score 1 the reference of the task."
+    )
+    tasks = sorted({row["task"] for row in rows})
+    lines.append("Tasks: " + ", ".join(f"[{task}]({task}.md)" for task in tasks) + ".")
+    text = "\n\n".join(lines) + "\n"
+    write_text(folder / "README.md", text)
+    return text
+
+
+def summarised(rows: Sequence[Row]) -> list[Row]:
+    """Return a row for each arm and method over all tasks, in the order of the arms.
+
+    Args:
+        rows: of all tasks.
+    """
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        if row["arm"] in ARMS:
+            groups.setdefault((row["arm"], row["method"]), []).append(row)
+    return [
+        _summary(arm, method, groups[arm, method])
+        for arm, method in sorted(groups, key=lambda key: (ARMS.index(key[0]), key[1]))
+    ]
+
+
+def _summary(arm: str, method: str, rows: Sequence[Row]) -> Row:
+    """Return the row of one arm and method."""
+    counts = Counter(row["verdict"] for row in rows)
+    lowest = [row["lowest"] for row in rows if not math.isnan(row["lowest"])]
+    return {
+        "arm": arm,
+        "method": method,
+        "tasks": len({row["task"] for row in rows}),
+        "score": float(np.mean([row["score"] for row in rows])),
+        "difference": float(np.mean([row["difference"] for row in rows])),
+        **{name: counts[name] for name in ("gain", "even", "loss")},
+        "worst": min(row["difference"] for row in rows),
+        "lowest": min(lowest, default=math.nan),
+    }

@@ -1,0 +1,251 @@
+"""Rows of the guide benchmark: what a method gave with one guide in one task.
+
+A row stands for all seeds of a method and an arm. Its scores are (return - random) / (reference -
+random): `random` is the return of the task's random guide, and the reference is in references.csv,
+with its source. Rows of others are checked by `check_row` before they join the table.
+"""
+
+import csv
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.promise import (
+    ALONE,
+    INTACT,
+    PPO,
+    RANDOM,
+    Arm,
+    Key,
+    arms_of,
+    guide_of,
+    rows_of_task,
+    scale_of,
+    verdict,
+)
+from coil_rl.report.curves import frames_until, points
+from coil_rl.report.runs import RETURN, Run
+
+REFERENCES = Path(__file__).parent / "references.csv"
+GUIDE = "guide"  # as a reference: the return of the intact guide
+SEEDS = {"standard": 5, "headline": 10}
+ENOUGH = 0.9  # of the frames of a task; batches are complete, so that a run may end earlier
+SAME = 1e-6  # of a score that is computed again
+SCORES = {"score_guide": "guide", "score_ppo": "ppo", "score": "end"}
+NUMBERS = (
+    *("frames", "random", "reference", "guide", "ppo", "end", *SCORES),
+    *("difference", "low", "high", "first", "lowest", "frames_to_guide"),
+    *("failures", "seconds", "guide_calls"),
+)
+KNOWN = ("frames", "random", "reference", "ppo", "end", "score_ppo", "score", "seconds")
+VERSIONS = ("coil-rl", "torch", "torchrl", "gymnasium", "commit")
+COLUMNS = (
+    *("task", "method", "arm", "effort", "seeds", *NUMBERS, "verdict"),
+    *("fingerprint", *VERSIONS),
+)
+VARIES = ("seed", "run_dir", "logger", "existing", "trust", "defaults", "workers")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What the score 1 means in a task.
+
+    Args:
+        frames: of a full run.
+        level: a return, or "guide".
+        source: of the level.
+    """
+
+    frames: int
+    level: str
+    source: str
+
+    def value(self, guide: float) -> float:
+        """Return the reference as a number.
+
+        Args:
+            guide: return of the intact guide.
+        """
+        return guide if self.level == GUIDE else float(self.level)
+
+
+def references() -> dict[str, Reference]:
+    """Return the reference of each task."""
+    with REFERENCES.open(encoding="utf-8", newline="") as file:
+        return {
+            row["task"]: Reference(int(row["frames"]), row["reference"], row["source"])
+            for row in csv.DictReader(file)
+        }
+
+
+def fingerprint(settings: Mapping[str, Any]) -> str:
+    """Return ten hexadecimal digits of a configuration, the same for all seeds.
+
+    Args:
+        settings: the configuration of a run.
+    """
+    text = json.dumps(_without_seeds(settings), sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:10]
+
+
+def _without_seeds(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _without_seeds(each) for key, each in value.items() if key not in VARIES}
+    return [_without_seeds(each) for each in value] if isinstance(value, list) else value
+
+
+def effort(seeds: int, frames: float, reference: Reference) -> str:
+    """Return "smoke", "standard" or "headline".
+
+    Args:
+        seeds: of a row.
+        frames: of its runs.
+        reference: of the task.
+    """
+    if seeds < SEEDS["standard"] or frames < ENOUGH * reference.frames:
+        return "smoke"
+    return "headline" if seeds >= SEEDS["headline"] else "standard"
+
+
+def benchmark_rows(task: str, runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """Return the rows of a task, those with the highest end first; none without plain PPO.
+
+    Args:
+        task: its name in references.csv.
+        runs: its runs; their labels are METHOD_ARM.
+
+    Raises:
+        ValueError: if the task is not in references.csv.
+    """
+    known = references()
+    if task not in known:
+        raise ValueError(f"the task {task} has no reference: add a line to {REFERENCES}")
+    arms = arms_of(runs)
+    if (PPO, ALONE) not in arms:
+        return []
+    compared = {(row["method"], row["arm"]): row for row in rows_of_task(task, runs)}
+    rows = [_row(task, key, arms, compared.get(key, {}), known[task]) for key in arms]
+    return sorted(rows, key=lambda row: -row["end"])
+
+
+def _row(
+    task: str, key: Key, arms: dict[Key, Arm], compared: Mapping[str, Any], reference: Reference
+) -> dict[str, Any]:
+    """Return one row; what a method without a guide does not have is NaN."""
+    arm, alone = arms[key], arms[PPO, ALONE]
+    runs = list(arm.runs.values())
+    row: dict[str, Any] = dict.fromkeys(COLUMNS, math.nan)
+    row |= {name: compared[name] for name in COLUMNS if name in compared}
+    row |= dict(zip(("task", "method", "arm"), (task, *key), strict=True))
+    row["verdict"] = compared.get("verdict", "")
+    row["seeds"] = len(runs)
+    row["ppo"] = float(np.mean([alone.reward(seed) for seed in alone.runs]))
+    row["end"] = float(np.mean([arm.reward(seed) for seed in arm.runs]))
+    row["random"] = guide_of(arms, RANDOM)
+    row["reference"] = reference.value(guide_of(arms, INTACT))
+    row |= _learning(runs)
+    scale = scale_of(arms, alone)
+    row |= {name: 100 * row[name] / scale for name in ("first", "lowest")}
+    row["effort"] = effort(row["seeds"], row["frames"], reference)
+    row |= {name: score(row[of], row) for name, of in SCORES.items()}
+    row["fingerprint"] = fingerprint(runs[0].settings)
+    versions = json.loads((runs[0].folder / "versions.json").read_text())
+    return row | {name: versions[name] for name in VERSIONS}
+
+
+def score(value: float, row: Mapping[str, Any]) -> float:
+    """Return (value - random) / (reference - random).
+
+    Args:
+        value: a return.
+        row: with `random` and `reference`.
+    """
+    distance = float(row["reference"]) - float(row["random"])
+    return (float(value) - float(row["random"])) / distance if distance else math.nan
+
+
+def _learning(runs: Sequence[Run]) -> dict[str, float]:
+    """Return the means over seeds of what learning curves and tables say."""
+    measured = [_of_run(run) for run in runs]
+    result = {name: _mean([each[name] for each in measured]) for name in measured[0]}
+    lowest = [each["lowest"] for each in measured if not math.isnan(each["lowest"])]
+    return result | {"lowest": min(lowest, default=math.nan)}
+
+
+def _of_run(run: Run) -> dict[str, float]:
+    """Return the numbers of one run; returns of the curve's cases relative to its guide."""
+    curve = points(run.curve, RETURN) if run.curve else np.zeros((0, 2))
+    guide = max(run.guide_returns.values(), default=math.nan)
+    last = run.curve[-1] if run.curve else {}
+    table = run.evaluation[run.evaluation["driver"] == run.label]
+    crashed = table[table["actions"] == "deterministic"].get("crashed")
+    return {
+        "frames": last.get("frames", math.nan),
+        "guide_calls": last.get("guide/calls", math.nan),
+        "first": curve[0, 1] - guide if len(curve) else math.nan,
+        "lowest": curve[:, 1].min() - guide if len(curve) else math.nan,
+        "frames_to_guide": frames_until(*curve.T, guide) if len(curve) else math.nan,
+        "failures": math.nan if crashed is None else float(crashed.mean()),
+        "seconds": math.nan if run.seconds is None else run.seconds,
+    }
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Return a mean over the seeds that have a value."""
+    known = [float(value) for value in values if not math.isnan(value)]
+    return float(np.mean(known)) if known else math.nan
+
+
+def check_row(row: Mapping[str, str]) -> None:
+    """Check a row of the table, as it is in the file.
+
+    Args:
+        row: its cells by column.
+
+    Raises:
+        ValueError: if it is not complete, contradicts itself, or belongs to no task.
+    """
+    if tuple(row) != COLUMNS or None in row.values():
+        raise ValueError(f"the columns are {', '.join(row)}; expected: {', '.join(COLUMNS)}")
+    place = ", ".join(row[name] for name in ("task", "method", "arm"))
+    known = references()
+    if row["task"] not in known:
+        raise ValueError(f"{place}: no such task; add it to {REFERENCES.name}")
+    try:
+        numbers = {name: float(row[name]) for name in NUMBERS}
+        seeds = int(row["seeds"])
+    except ValueError as error:
+        raise ValueError(f"{place}: a number is expected ({error})") from error
+    unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
+    if seeds < 1 or unknown:
+        raise ValueError(f"{place}: {', '.join(unknown) or 'seeds'} must be known")
+    _check_numbers(place, row, numbers, known[row["task"]])
+    if not re.fullmatch("[0-9a-f]{10}", row["fingerprint"]):
+        raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")
+    if missing := [name for name in VERSIONS if not row[name]]:
+        raise ValueError(f"{place}: the versions of {', '.join(missing)} are missing")
+
+
+def _check_numbers(
+    place: str, row: Mapping[str, str], numbers: Mapping[str, float], reference: Reference
+) -> None:
+    """Compute again what follows from other numbers of a row."""
+    for name, of in SCORES.items():
+        expected = score(numbers[of], numbers)
+        if not np.isclose(numbers[name], expected, atol=SAME, equal_nan=True):
+            raise ValueError(f"{place}: {name}={row[name]}, but its returns give {expected:.6f}")
+    if reference.level != GUIDE and numbers["reference"] != float(reference.level):
+        raise ValueError(f"{place}: reference={row['reference']}, expected {reference.level}")
+    found = effort(int(row["seeds"]), numbers["frames"], reference)
+    if row["effort"] != found:
+        raise ValueError(f"{place}: effort={row['effort']}, but seeds and frames make it {found}")
+    decided = verdict(numbers["difference"], numbers["low"], numbers["high"])
+    if row["verdict"] != ("" if row["arm"] == ALONE else decided):
+        raise ValueError(f"{place}: verdict={row['verdict']}, but its interval says {decided}")

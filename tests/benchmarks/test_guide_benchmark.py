@@ -1,0 +1,180 @@
+"""The guide benchmark: its rows, their check, its pages, and the tasks of other packages."""
+
+import csv
+import math
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import gymnasium
+import pytest
+from programs import called
+
+from benchmarks.guide_benchmark import __main__ as program
+from benchmarks.guide_benchmark.rows import (
+    COLUMNS,
+    Reference,
+    benchmark_rows,
+    check_row,
+    effort,
+    fingerprint,
+    references,
+)
+from coil_rl.report.runs import read_runs
+
+pytest.importorskip("gymnasium.envs.classic_control")
+ROOT = Path(__file__).parents[2]
+ROWS = ROOT / "docs" / "guide_benchmark" / "rows.csv"
+FOREIGN = ROOT / "benchmarks" / "guide_benchmark" / "conf"
+PACKAGES = {
+    "energy_microgrid": "decisionrl",
+    "inventory": "decisionrl",
+    "serial_inventory": "gym_invmgmt",
+}
+SMALL = [
+    "budget.frames=300",
+    "budget.num_envs=2",
+    "budget.steps=50",
+    "evaluation.cases=2",
+    "evaluation.curve.num_envs=2",
+    "evaluation.curve.points=1",
+]
+IDS = {
+    "mountain_car": "MountainCarContinuous-v0",
+    "cart_pole": "CartPole-v1",
+    "acrobot": "Acrobot-v1",
+    "lunar_lander": "LunarLander-v3",
+    "bipedal": "BipedalWalker-v3",
+    "swimmer": "Swimmer-v5",
+}
+
+
+def table():
+    """Return the rows of the documentation."""
+    with ROWS.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("row", table(), ids=lambda row: f"{row['task']}-{row['method']}")
+def test_row_of_the_table_is_valid(row):
+    check_row(row)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"task": "chess"}, "no such task"),
+        ({"end": "high"}, "a number is expected"),
+        ({"end": "nan"}, "end must be known"),
+        ({"score": "0.99"}, "but its returns give"),
+        ({"effort": "headline"}, "but seeds and frames make it"),
+        ({"verdict": "win"}, "but its interval says"),
+        ({"fingerprint": "mine"}, "ten hexadecimal digits"),
+        ({"torch": ""}, "versions of torch are missing"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
+)
+def test_row_that_contradicts_itself_is_refused(changed, message):
+    row = next(each for each in table() if each["arm"] == "intact")
+    with pytest.raises(ValueError, match=message):
+        check_row(row | changed)
+
+
+def test_row_without_a_column_is_refused():
+    row = dict(table()[0])
+    del row["seconds"]
+    with pytest.raises(ValueError, match="expected: task, method"):
+        check_row(row)
+
+
+def test_effort_needs_both_seeds_and_frames():
+    reference = Reference(frames=1000, level="guide", source="")
+    assert effort(10, 950, reference) == "headline"
+    assert effort(5, 1000, reference) == "standard"
+    assert effort(4, 1000, reference) == effort(10, 500, reference) == "smoke"
+
+
+def test_fingerprint_is_that_of_the_configuration_without_its_seeds():
+    one = {"seed": 0, "env": {"id": "A", "seed": 0}, "list": [{"seed": 0}]}
+    other = {"seed": 1, "env": {"id": "A", "seed": 1}, "list": [{"seed": 1}]}
+    assert fingerprint(one) == fingerprint(other) != fingerprint(one | {"label": "x"})
+
+
+def test_every_task_has_a_reference_and_the_other_way_round():
+    own = {path.stem for path in (ROOT / "conf/experiment/guide_benchmark").glob("*.yaml")}
+    others = {path.stem for path in (FOREIGN / "experiment/guide_benchmark").glob("*.yaml")}
+    assert own | others == set(references())
+    assert others == set(PACKAGES)
+
+
+@pytest.mark.parametrize("task", IDS)
+def test_reference_of_gymnasium_is_its_reward_threshold(task):
+    assert float(references()[task].level) == gymnasium.spec(IDS[task]).reward_threshold
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """One seed of PPO, and of kickstarting with two guides, in one task."""
+    path = tmp_path_factory.mktemp("guide_benchmark")
+    for words in (["+arm=alone", "method=ppo"], ["+arm=intact,random", "method=kickstart"]):
+        called(
+            "train",
+            "-m",
+            "+experiment=guide_benchmark/pendulum",
+            *words,
+            "seed=0",
+            "env.max_steps=15",
+            *SMALL,
+            f"hydra.sweep.dir={path / 'pendulum'}",
+            cwd=path,
+        )
+    return path
+
+
+def test_scores_are_0_for_the_random_guide_and_1_for_the_reference(folder):
+    rows = benchmark_rows("pendulum", read_runs([folder / "pendulum"]))
+    arms = {(row["method"], row["arm"]): row for row in rows}
+    assert set(arms) == {("ppo", "alone"), ("kickstart", "intact"), ("kickstart", "random")}
+    assert arms["kickstart", "intact"]["score_guide"] == pytest.approx(1)
+    assert arms["kickstart", "random"]["score_guide"] == pytest.approx(0)
+    assert math.isnan(arms["ppo", "alone"]["difference"])
+    assert {row["effort"] for row in rows} == {"smoke"}
+    assert all(tuple(row) == COLUMNS for row in rows)
+
+
+def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monkeypatch, capsys):
+    file = tmp_path / "rows.csv"
+    for _ in range(2):  # the second time each row replaces itself
+        words = ["guide_benchmark", str(folder), "--pages", str(tmp_path), "--add", str(file)]
+        monkeypatch.setattr(sys, "argv", words)
+        program.main()
+    with file.open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert len(rows) == 3
+    for row in rows:
+        check_row(row)
+    page = (tmp_path / "README.md").read_text()
+    assert page in capsys.readouterr().out
+    assert "Smoke" in page
+    assert "Runs started: 3, finished: 3" in (tmp_path / "pendulum.md").read_text()
+    assert (tmp_path / "all.png").exists()
+    assert (tmp_path / "pendulum.png").exists()
+
+
+@pytest.mark.parametrize("task", PACKAGES)
+def test_task_of_another_package_trains(task, tmp_path):
+    if find_spec(PACKAGES[task]) is None:
+        pytest.skip(f"{PACKAGES[task]} is not installed")
+    called(
+        "train",
+        "-m",
+        "hydra.searchpath=[pkg://benchmarks.guide_benchmark.conf]",
+        f"+experiment=guide_benchmark/{task}",
+        "+arm=intact",
+        "method=coil",
+        "seed=0",
+        *SMALL,
+        f"hydra.sweep.dir={tmp_path}",
+        cwd=tmp_path,
+    )
+    assert (tmp_path / "coil_intact_seed0" / "evaluation.csv").exists()
