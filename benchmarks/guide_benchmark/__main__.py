@@ -9,11 +9,13 @@ row of the same task, method, arm and configuration is replaced.
 import argparse
 import csv
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from benchmarks.guide_benchmark.pages import write_all, write_task
 from benchmarks.guide_benchmark.rows import benchmark_rows, check_row
+from coil_rl.errors import UserError
 from coil_rl.report import read_runs, write_csv
 from coil_rl.report.runs import failed_jobs
 
@@ -28,8 +30,10 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         rows: that join it.
 
     Raises:
-        ValueError: if a row of the file is not valid.
+        ValueError: if a row is not valid.
     """
+    for row in rows:
+        check_row({name: str(value) for name, value in row.items()})
     if not file.exists():
         return list(rows)
     with file.open(encoding="utf-8", newline="") as table:
@@ -38,6 +42,31 @@ def added(file: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         check_row(row)
     new = {tuple(row[name] for name in SAME) for row in rows}
     return [row for row in known if tuple(row[name] for name in SAME) not in new] + list(rows)
+
+
+def measured(folder: Path, pages: Path) -> list[dict[str, Any]]:
+    """Return the rows of all tasks, and write the page of each.
+
+    Args:
+        folder: with a folder for each task.
+        pages: where to write.
+
+    Raises:
+        ValueError: if a task has no reference, or none a finished run of plain PPO.
+        UserError: if a folder has no runs, or a damaged one.
+    """
+    tasks = [path for path in sorted(folder.iterdir()) if path.is_dir() and path != pages]
+    runs = {path: read_runs([path]) for path in tasks if not path.name.startswith(".")}
+    rows = {path: benchmark_rows(path.name, runs[path]) for path in runs}
+    if not any(rows.values()):
+        raise ValueError(f"{folder} has no task with plain PPO; train it: +arm=alone method=ppo")
+    for path, found in rows.items():
+        if found:
+            pages.mkdir(parents=True, exist_ok=True)
+            write_task(pages, path.name, found, runs[path], failed_jobs([path]))
+        else:
+            print(f"{path.name} is left out: it has no plain PPO; train +arm=alone method=ppo")
+    return list(chain.from_iterable(rows.values()))
 
 
 def main() -> None:
@@ -50,23 +79,14 @@ def main() -> None:
     if not given.folder.is_dir():
         parser.error(f"{given.folder} does not exist; give the folder of the experiments")
     pages = given.pages or given.folder / "pages"
-    pages.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = []
-    for task in sorted(path.name for path in given.folder.iterdir() if path.is_dir()):
-        if task == pages.name:
-            continue
-        runs = read_runs([given.folder / task])
-        found = benchmark_rows(task, runs)
-        if found:
-            write_task(pages, task, found, runs, failed_jobs([given.folder / task]))
-        else:
-            print(f"{task}: no finished run of plain PPO; begin with +arm=alone method=ppo")
-        rows += found
-    if not rows:
-        parser.error(f"{given.folder} has no task with a finished run of plain PPO")
+    try:
+        rows = measured(given.folder, pages)
+        table = added(given.add, rows) if given.add else []
+    except (ValueError, UserError, csv.Error) as error:
+        parser.error(str(error))
     write_csv(rows, pages / "rows.csv")
     if given.add:
-        write_csv(added(given.add, rows), given.add)
+        write_csv(table, given.add)
     print(write_all(pages, rows))
 
 

@@ -213,7 +213,9 @@ def check_row(row: Mapping[str, str]) -> None:
         ValueError: if it is not complete, contradicts itself, or belongs to no task.
     """
     if tuple(row) != COLUMNS or None in row.values():
-        raise ValueError(f"the columns are {', '.join(row)}; expected: {', '.join(COLUMNS)}")
+        raise ValueError(
+            f"the columns are {', '.join(map(str, row))}; expected: {', '.join(COLUMNS)}"
+        )
     place = ", ".join(row[name] for name in ("task", "method", "arm"))
     known = references()
     if row["task"] not in known:
@@ -224,8 +226,10 @@ def check_row(row: Mapping[str, str]) -> None:
     except ValueError as error:
         raise ValueError(f"{place}: a number is expected ({error})") from error
     unknown = [name for name in KNOWN if not math.isfinite(numbers[name])]
-    if seeds < 1 or unknown:
-        raise ValueError(f"{place}: {', '.join(unknown) or 'seeds'} must be known")
+    if unknown:
+        raise ValueError(f"{place}: {', '.join(unknown)} must be known; random needs its arm")
+    if seeds < 1 or numbers["frames"] <= 0 or any(map(math.isinf, numbers.values())):
+        raise ValueError(f"{place}: seeds and frames must be above 0, and no number infinite")
     _check_numbers(place, row, numbers, known[row["task"]])
     if not re.fullmatch("[0-9a-f]{10}", row["fingerprint"]):
         raise ValueError(f"{place}: fingerprint={row['fingerprint']} is not ten hexadecimal digits")

@@ -2,12 +2,14 @@
 
 import csv
 import math
+import shutil
 import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium
 import pytest
+from hydra import compose, initialize_config_module
 from programs import called
 
 from benchmarks.guide_benchmark import __main__ as program
@@ -20,6 +22,7 @@ from benchmarks.guide_benchmark.rows import (
     fingerprint,
     references,
 )
+from coil_rl.config.check import check_parts
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
@@ -31,6 +34,7 @@ PACKAGES = {
     "inventory": "decisionrl",
     "serial_inventory": "gym_invmgmt",
 }
+EXTRAS = {"babyai": "minigrid", "swimmer": "mujoco"}
 SMALL = [
     "budget.frames=300",
     "budget.num_envs=2",
@@ -70,6 +74,8 @@ def test_row_of_the_table_is_valid(row):
         ({"effort": "headline"}, "but seeds and frames make it"),
         ({"verdict": "win"}, "but its interval says"),
         ({"fingerprint": "mine"}, "ten hexadecimal digits"),
+        ({"lowest": "-inf"}, "no number infinite"),
+        ({"seeds": "0"}, "must be above 0"),
         ({"torch": ""}, "versions of torch are missing"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
@@ -85,6 +91,16 @@ def test_row_without_a_column_is_refused():
     del row["seconds"]
     with pytest.raises(ValueError, match="expected: task, method"):
         check_row(row)
+
+
+def test_row_with_a_further_cell_is_refused():
+    with pytest.raises(ValueError, match="expected: task, method"):
+        check_row(table()[0] | {None: ["more"]})
+
+
+def test_table_has_no_row_twice():
+    keys = [tuple(row[name] for name in program.SAME) for row in table()]
+    assert len(keys) == len(set(keys))
 
 
 def test_effort_needs_both_seeds_and_frames():
@@ -159,6 +175,45 @@ def test_program_writes_pages_and_rows_that_join_a_table(folder, tmp_path, monke
     assert "Runs started: 3, finished: 3" in (tmp_path / "pendulum.md").read_text()
     assert (tmp_path / "all.png").exists()
     assert (tmp_path / "pendulum.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "message"),
+    [("chess", "the task chess has no reference"), (None, "has no task with plain PPO")],
+)
+def test_folder_without_results_is_one_sentence(
+    task, message, folder, tmp_path, monkeypatch, capsys
+):
+    if task:
+        shutil.copytree(folder / "pendulum", tmp_path / task)
+    monkeypatch.setattr(sys, "argv", ["guide_benchmark", str(tmp_path)])
+    with pytest.raises(SystemExit) as refused:
+        program.main()
+    assert refused.value.code == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "pages").exists()
+
+
+def jobs(task):
+    """Return arm and method of some jobs of a task: each arm, and each method, at least once."""
+    words = [f"+experiment=guide_benchmark/{task}"]
+    with initialize_config_module("coil_rl.conf", version_base="1.3"):
+        params = compose("train", words, return_hydra_config=True).hydra.sweeper.params
+    arms, methods = (str(params[key]).split(",") for key in ("+arm", "method"))
+    result = [(arm, methods[0]) for arm in arms] + [("intact", each) for each in methods[1:]]
+    tuned = (ROOT / "conf" / "arm" / "tuned" / f"{task}.yaml").exists()
+    return [*result, ("alone", "ppo"), *([(f"tuned/{task}", "tune")] if tuned else [])]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", sorted(set(references()) - set(PACKAGES)))
+def test_every_arm_and_every_method_of_a_task_can_be_started(task, tmp_path):
+    if find_spec(EXTRAS.get(task, "torch")) is None:
+        pytest.skip(f"{EXTRAS[task]} is not installed")
+    for arm, method in jobs(task):
+        words = [f"+experiment=guide_benchmark/{task}", f"+arm={arm}", f"method={method}"]
+        with initialize_config_module("coil_rl.conf", version_base="1.3"):
+            check_parts(compose("train", [*words, f"run_dir={tmp_path}"]))
 
 
 @pytest.mark.parametrize("task", PACKAGES)
