@@ -355,7 +355,7 @@ def agent_label(config: DictConfig) -> str:
     if OmegaConf.is_missing(config, "learner") or config.method.learner != "agent":
         return name
     learner = str(config.learner.get("_target_", "")).rpartition(".")[2].lower()
-    if learner in ("", "ppo"):
+    if learner in ("", "ppo", name):  # the method's own may have its name
         return name
     return learner if name == "ppo" else f"{name}_{learner}"
 

@@ -21,6 +21,7 @@ def composed(*overrides, **options):
         ("method=oil learner=linear", "oil"),
         ("method=dynamic_coil_stochastic", "dynamic_coil_stochastic"),
         ("method=ppo learner=a2c label=mine", "mine"),
+        ("method=ibrl label=${agent_label:}", "ibrl"),
     ],
 )
 def test_label_is_the_method_and_an_unusual_learner(overrides, label):
