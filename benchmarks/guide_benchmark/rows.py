@@ -191,7 +191,7 @@ def _of_run(run: Run) -> dict[str, float]:
         "guide_calls": last.get("guide/calls", math.nan),
         "first": curve[0, 1] - guide if len(curve) else math.nan,
         "lowest": curve[:, 1].min() - guide if len(curve) else math.nan,
-        "frames_to_guide": frames_until(*curve.T, guide) if len(curve) else math.nan,
+        "frames_to_guide": frames_until(curve[:, 0], curve[:, 1], guide),
         "failures": math.nan if crashed is None else float(crashed.mean()),
         "seconds": math.nan if run.seconds is None else run.seconds,
     }
