@@ -32,6 +32,7 @@ FOREIGN = ROOT / "benchmarks" / "guide_benchmark" / "conf"
 PACKAGES = {
     "energy_microgrid": "decisionrl",
     "inventory": "decisionrl",
+    "reactor": "target_gym",
     "serial_inventory": "gym_invmgmt",
 }
 EXTRAS = {"babyai": "minigrid", "swimmer": "mujoco"}
