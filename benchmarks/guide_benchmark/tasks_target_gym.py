@@ -1,6 +1,6 @@
 """A stirred tank reactor of target-gym with its own PID, and the export of results to target-gym.
 
-    python -m pip install jax flax chex optax
+    python -m pip install jax flax chex optax imageio seaborn
     python -m pip install --no-deps target-gym==0.6.1 "gymnax>=1" "do-mpc<6" "casadi<3.8" \
         pygame-ce moviepy proglog decorator python-dotenv imageio-ffmpeg
 
