@@ -31,6 +31,8 @@ Wrapped: Any = gym_wrapper_factory(CSTR)
 class Reactor(Wrapped):
     """The reactor, with a new episode at each reset without a seed, which the wrapper repeats."""
 
+    key: Any
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         """Begin an episode."""
         self.key, _ = jax.random.split(self.key)
