@@ -22,7 +22,6 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import pairwise
 from multiprocessing.connection import Connection, wait
-from statistics import median
 from typing import Any, Protocol
 
 import torch
@@ -32,7 +31,7 @@ from coil_rl.envs.gate import ForeignError
 
 AUTO = "auto"
 SAVED = 2e-3  # seconds; a batched step of this length pays for the messages
-MOST_STEPS, LONGEST = 30, 0.05  # of a timing, in steps and seconds
+LEAST_STEPS, MOST_STEPS, LONGEST = 5, 30, 0.05  # of a timing, in steps and seconds
 PATIENCE = 5.0  # seconds between two messages while processes start, and until one must have ended
 # Signals that are meant for the program: it saves its state, and then ends its processes itself.
 IGNORED = ("SIGINT", "SIGTERM", "SIGHUP", "SIGUSR1")
@@ -338,13 +337,13 @@ def _time(pipe: Connection, make: Callable[[range], Shard], draw: Callable[[], A
             shard.begin_rows({0: 0}, {})
             shard.step_rows([draw()])
             taken: list[float] = []
-            while len(taken) < MOST_STEPS and sum(taken) < LONGEST:
+            while len(taken) < MOST_STEPS and (len(taken) < LEAST_STEPS or sum(taken) < LONGEST):
                 began = time.perf_counter()
                 shard.step_rows([draw()])
                 taken.append(time.perf_counter() - began)
                 if shard.entries_of_rows()["done"].any():
                     shard.begin_rows({0: len(taken)}, {})
-            pipe.send(median(taken))  # other programs may interrupt a few steps
+            pipe.send(min(taken))  # other programs only make a step longer
         except Exception:  # the same fault follows where it is told
             pipe.send(None)
 
