@@ -64,7 +64,7 @@ def ship(run: Path, name: str) -> Path:
 
 
 def _check_paths(node: Any, key: str) -> None:
-    """End the program if a configuration names a place on this machine."""
+    """End the program if a configuration contains a path of this machine."""
     if isinstance(node, Mapping):
         for name, value in node.items():
             _check_paths(value, f"{key}.{name}")

@@ -29,7 +29,39 @@ SEEDS = 2**31  # seeds of drawn episodes are below
 REMEMBERED = 20_000  # steps; a longer episode is not repeated when a state is restored
 
 
-class SeededRows(SeededEnv):
+class RowsInTurn:
+    """Single envs that are stepped one after the other.
+
+    Attributes:
+        rows: `begin(seed)` begins an episode, `step(action)` takes one step, or none if the episode
+            is over; then the row stays as it is, with reward 0.
+    """
+
+    rows: Sequence[Any]
+
+    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
+        """Begin episodes, and take some actions in each.
+
+        Args:
+            seeds: by row.
+            actions: by row, as the rows take them; a row that is missing takes none.
+        """
+        for row, seed in seeds.items():
+            self.rows[row].begin(seed)
+            for action in actions.get(row, ()):
+                self.rows[row].step(action)
+
+    def step_rows(self, actions: Any) -> None:
+        """Take a step in all rows.
+
+        Args:
+            actions: of all rows, as they take them.
+        """
+        for row, action in zip(self.rows, actions, strict=True):
+            row.step(action)
+
+
+class SeededRows(RowsInTurn, SeededEnv):
     """Base of batched envs made of single ones; every episode begins with a seed of its own.
 
     `state_dict` holds the generator and, for each running episode, its seed and actions.
@@ -38,9 +70,8 @@ class SeededRows(SeededEnv):
     20,000 steps, a warning is given, and the env must be reset.
 
     Args:
-        rows: the single envs: `begin(seed)` begins an episode, `step(action)` takes one step, or
-            none if the episode is over; then the row stays as it is, with reward 0. A subclass may
-            have them elsewhere, see `begin_rows`.
+        rows: the single envs, see `RowsInTurn`. A subclass may have some of them elsewhere; then it
+            has its own `begin_rows` and `step_rows`.
         count: B, number of rows.
         seed: of the draw of the episodes' seeds, at least 0.
         first_seed: row i begins all its episodes with the seed `first_seed + i % cases`; None to
@@ -83,27 +114,6 @@ class SeededRows(SeededEnv):
     @abstractmethod
     def _output(self, *, stepped: bool) -> TensorDict:
         """Return the entries of all rows after a reset, or after a step."""
-
-    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, and take some actions in each.
-
-        Args:
-            seeds: by row.
-            actions: by row, as `_decode` returns them; a row that is missing takes none.
-        """
-        for row, seed in seeds.items():
-            self.rows[row].begin(seed)
-            for action in actions.get(row, ()):
-                self.rows[row].step(action)
-
-    def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows.
-
-        Args:
-            actions: of all rows, as `_decode` returns them.
-        """
-        for row, action in zip(self.rows, actions, strict=True):
-            row.step(action)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None or not self.seeds else tensordict.get("_reset", None)

@@ -212,7 +212,7 @@ class GymnasiumEnv(SeededRows):
         super().close(raise_if_closed=raise_if_closed)
 
     def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, see `SeededRows`; the rows are made before the first one."""
+        """Begin episodes, see `RowsInTurn`; the rows are made before the first one."""
         if not self.parts:
             self._place_rows()
         if self.workers is None:
@@ -222,7 +222,7 @@ class GymnasiumEnv(SeededRows):
             self.parts = self.workers.begin(seeds, actions)
 
     def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows, see `SeededRows`."""
+        """Take a step in all rows, see `RowsInTurn`."""
         if self.workers is None:
             self.held.step_rows(actions)
             self.parts = [self.held.entries_of_rows()]

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from coil_rl.envs.env_batch import RowsInTurn
 from coil_rl.envs.gate import (
     LIMIT,
     OWN_LIMITS,
@@ -150,7 +151,7 @@ class Row:
             return fitted_action(name, advice, self.gate.env.action_space)
 
 
-class Rows:
+class Rows(RowsInTurn):
     """Rows that are stepped one after the other in one process; see `coil_rl.envs.workers.Shard`.
 
     Args:
@@ -168,7 +169,7 @@ class Rows:
         like: Env | None = None,
     ) -> None:
         self.info = tuple(info)
-        self.rows = [make_row(numbers[0])]
+        self.rows: list[Row] = [make_row(numbers[0])]
         first = self.rows[0]
         self.like = first.gate.env if like is None else like
         self.entries = entries_of(first.name, self.like, first.dtype)
@@ -192,18 +193,6 @@ class Rows:
         row.entries = self.entries
         if row.gate.env is not self.like:
             _check_same_spaces(row.name, row.number, row.gate.env, self.like)
-
-    def begin_rows(self, seeds: Mapping[int, int], actions: Mapping[int, Sequence[Any]]) -> None:
-        """Begin episodes, and take some actions in each."""
-        for row, seed in seeds.items():
-            self.rows[row].begin(seed)
-            for action in actions.get(row, ()):
-                self.rows[row].step(action)
-
-    def step_rows(self, actions: Any) -> None:
-        """Take a step in all rows."""
-        for row, action in zip(self.rows, actions, strict=True):
-            row.step(action)
 
     def entries_of_rows(self) -> Entries:
         """Return the entries of all rows, [rows, ...], and their rewards."""

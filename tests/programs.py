@@ -28,6 +28,15 @@ TINY = [
 ]
 
 # The smallest run of any experiment in the cone world.
+# One arm of an experiment on tasks of Gymnasium.
+TINY_ARM = [
+    "budget.frames=300",
+    "budget.num_envs=2",
+    "budget.steps=50",
+    "evaluation.cases=2",
+    "evaluation.curve.num_envs=2",
+    "evaluation.curve.points=1",
+]
 TINY_SWEEP = [
     "track=generated",
     "track.train.count=2",

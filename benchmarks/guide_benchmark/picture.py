@@ -75,5 +75,5 @@ def _draw_panel(
 
 
 def _marker(stroke: style.Stroke) -> str:
-    """Return a marker that tells a colour from its second use."""
+    """Return a circle, or a diamond where the colour is used a second time."""
     return "o" if stroke.linestyle == "-" else "D"

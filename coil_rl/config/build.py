@@ -346,7 +346,7 @@ def build_disturbances(config: DictConfig, cases: str) -> list[Transform]:
 
 
 def disturbances(config: DictConfig, cases: str) -> dict[str, Any]:
-    """Return the nodes of what disturbs the env in a set of cases, by name.
+    """Return the nodes of the delays and noise of the env in a set of cases, by name.
 
     They are `disturb` with the overrides of the training or of the evaluation; null leaves one out.
     """

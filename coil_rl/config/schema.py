@@ -259,7 +259,18 @@ class ListenConfig(DrivingConfig):
 
 
 @dataclass
-class ReplayConfig(ProgramConfig):
+class PolicyConfig(ProgramConfig):
+    """Configuration that programs share which use policies outside of their envs."""
+
+    seed: Seed = 0
+    device: str = "cpu"
+    threads: Threads = 1
+    trust: list[str] = field(default_factory=list)
+    run_dir: str = MISSING
+
+
+@dataclass
+class ReplayConfig(PolicyConfig):
     """Configuration of `coil-replay`."""
 
     recording: Any = MISSING
@@ -270,30 +281,20 @@ class ReplayConfig(ProgramConfig):
     preset: dict[str, Any] = MISSING
     env: dict[str, Any] = MISSING
     guide: dict[str, Any] = field(default_factory=dict)
-    seed: Seed = 0
-    device: str = "cpu"
-    threads: Threads = 1
-    trust: list[str] = field(default_factory=list)
-    run_dir: str = MISSING
 
 
 @dataclass
-class ExportConfig(ProgramConfig):
+class ExportConfig(PolicyConfig):
     """Configuration of `coil-export`."""
 
     run: str = MISSING
     policy: WhichPolicy = "handed_over"
     observations: Annotated[int, Field(ge=1, le=1_000_000)] = 1_000
     meanings: dict[str, Any] = field(default_factory=dict)
-    seed: Seed = 0
-    device: str = "cpu"
-    threads: Threads = 1
-    trust: list[str] = field(default_factory=list)
-    run_dir: str = MISSING
 
 
 @dataclass
-class DriveConfig(ProgramConfig):
+class DriveConfig(PolicyConfig):
     """Configuration of `coil-drive`."""
 
     run: str | None = None
@@ -310,11 +311,6 @@ class DriveConfig(ProgramConfig):
     simulation: dict[str, Any] = field(default_factory=dict)
     ros: dict[str, Any] = field(default_factory=dict)
     lift_after: Annotated[float | None, Field(ge=0)] = None
-    seed: Seed = 0
-    device: str = "cpu"
-    threads: Threads = 1
-    trust: list[str] = field(default_factory=list)
-    run_dir: str = MISSING
 
 
 @dataclass

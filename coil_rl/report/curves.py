@@ -71,18 +71,29 @@ def draw_learning_curves(
             _draw_spread(axes, runs[label], curves[label], colour)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
-        # Their names are beside the plot, where no curve is.
-        for (name, value), colour in zip((guides or {}).items(), cycle(style.GUIDES), strict=False):
-            axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
-            axes.annotate(
-                f"{name}\n{value:.1f}",
-                (1, value),
-                (4, 0),
-                xycoords=("axes fraction", "data"),
-                textcoords="offset points",
-                va="center",
-                color=colour,
-            )
+        draw_guides(axes, guides or {})
+
+
+def draw_guides(axes: Axes, guides: Mapping[str, float]) -> None:
+    """Draw the returns of guides as dashed lines.
+
+    Their names are beside the plot, where no curve is.
+
+    Args:
+        axes: with curves, whose limits are set.
+        guides: return by name.
+    """
+    for (name, value), colour in zip(guides.items(), cycle(style.GUIDES), strict=False):
+        axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
+        axes.annotate(
+            f"{name}\n{value:.1f}",
+            (1, value),
+            (4, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            color=colour,
+        )
 
 
 def _is_few(seeds: Sequence[Rows]) -> bool:

@@ -71,7 +71,7 @@ class DriveLog:
             self._end(problem)
 
     def __call__(self, moment: Moment) -> None:
-        """Write what happened at a moment."""
+        """Write a scan, the command that followed, and why the car stands, if it does."""
         if self.problem:
             return
         time = max(0, round((moment.now + self.epoch) * 1e9)) if math.isfinite(moment.now) else 0

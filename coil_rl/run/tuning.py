@@ -146,7 +146,7 @@ class Tuner:
 
     @property
     def converged(self) -> bool:
-        """Whether further generations would change nothing."""
+        """Whether CMA-ES says that its search has ended."""
         return bool(self.cma.should_stop())
 
     def may_go_on(self) -> bool:

@@ -92,7 +92,7 @@ def _row(entry: Entry, tables: Sequence[pd.DataFrame], calls: float = 0) -> dict
 def _learned_row(
     entry: Entry, tables: Sequence[pd.DataFrame], runs: Sequence[Run], reasons: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the row of what learned."""
+    """Return the row of a trained policy in the table."""
     last = [run.curve[-1] for run in runs]
     seconds = [run.seconds for run in runs if run.seconds is not None]
     notes = [f"a seed failed: {reasons[0]}"] if reasons else []

@@ -3,7 +3,6 @@
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from matplotlib.ticker import EngFormatter
 from coil_rl.config.python import Named
 from coil_rl.config.written import key_of
 from coil_rl.report import markdown_table, style
-from coil_rl.report.curves import RETURNS, mean_curve, points
+from coil_rl.report.curves import RETURNS, draw_guides, mean_curve, points
 from coil_rl.report.runs import RETURN, Run
 from coil_rl.worth.arms import ARMS, TUNE
 from coil_rl.worth.outcome import Outcome
@@ -155,17 +154,7 @@ def draw(outcome: Outcome, lines: Mapping[str, float], cases: int | None, path: 
             axes.plot(frames, mean, lw=1.8, **look)
         axes.margins(x=0.02)
         axes.set_xlim(left=0)
-        for (name, value), colour in zip(lines.items(), cycle(style.GUIDES), strict=False):
-            axes.axhline(value, color=colour, ls=style.DASHED, lw=1.3, zorder=1.5)
-            axes.annotate(
-                f"{name}\n{value:.1f}",
-                (1, value),
-                (4, 0),
-                xycoords=("axes fraction", "data"),
-                textcoords="offset points",
-                va="center",
-                color=colour,
-            )
+        draw_guides(axes, lines)
 
 
 def guide_lines(outcome: Outcome) -> dict[str, float]:

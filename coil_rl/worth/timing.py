@@ -128,7 +128,7 @@ def measure(config: DictConfig, overhead: float) -> Pace:
 
 
 def _length(env: EnvBase, policy: TensorDictModuleBase) -> float:
-    """Return the mean number of steps of an episode, if it is not longer than what is tried."""
+    """Return the mean number of steps of an episode; one that does not end counts as `LONGEST`."""
     rows = env.batch_size.numel()
     steps = torch.zeros(rows)
     for _, running in itertools.islice(episodes(env, policy), LONGEST):

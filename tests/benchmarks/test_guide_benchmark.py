@@ -10,7 +10,7 @@ from pathlib import Path
 import gymnasium
 import pytest
 from hydra import compose, initialize_config_module
-from programs import called
+from programs import TINY_ARM, called
 
 from benchmarks.guide_benchmark import __main__ as program
 from benchmarks.guide_benchmark.rows import (
@@ -36,14 +36,6 @@ PACKAGES = {
     "serial_inventory": "gym_invmgmt",
 }
 EXTRAS = {"babyai": "minigrid", "swimmer": "mujoco"}
-SMALL = [
-    "budget.frames=300",
-    "budget.num_envs=2",
-    "budget.steps=50",
-    "evaluation.cases=2",
-    "evaluation.curve.num_envs=2",
-    "evaluation.curve.points=1",
-]
 IDS = {
     "mountain_car": "MountainCarContinuous-v0",
     "cart_pole": "CartPole-v1",
@@ -141,7 +133,7 @@ def folder(tmp_path_factory):
             *words,
             "seed=0",
             "env.max_steps=15",
-            *SMALL,
+            *TINY_ARM,
             f"hydra.sweep.dir={path / 'pendulum'}",
             cwd=path,
         )
@@ -229,7 +221,7 @@ def test_task_of_another_package_trains(task, tmp_path):
         "+arm=intact",
         "method=coil",
         "seed=0",
-        *SMALL,
+        *TINY_ARM,
         f"hydra.sweep.dir={tmp_path}",
         cwd=tmp_path,
     )

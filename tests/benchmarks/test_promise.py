@@ -3,21 +3,13 @@
 import json
 
 import pytest
-from programs import called
+from programs import TINY_ARM, called
 
 from benchmarks import promise
 from coil_rl.report.runs import read_runs
 
 pytest.importorskip("gymnasium.envs.classic_control")
-SMALL = [
-    "env.max_steps=15",
-    "budget.frames=300",
-    "budget.num_envs=2",
-    "budget.steps=50",
-    "evaluation.cases=2",
-    "evaluation.curve.num_envs=2",
-    "evaluation.curve.points=1",
-]
+SMALL = ["env.max_steps=15", *TINY_ARM]
 
 
 @pytest.mark.parametrize(
